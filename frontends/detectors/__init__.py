@@ -1,0 +1,1 @@
+"""Detectors that turn raw scans into landmark observations."""

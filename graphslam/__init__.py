@@ -1,0 +1,35 @@
+"""graphslam: globally consistent maps with an uncertainty you can trust.
+
+The verbs (``load``, ``run``, ``compare``, ``simulate`` …) are looked up lazily, so that ``import graphslam`` costs
+nothing heavy and never imports gtsam, Open3D or matplotlib.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+# verb -> module that holds it
+_VERBS = {
+    "load": "graphslam.app.verbs",
+    "run": "graphslam.app.verbs",
+    "compare": "graphslam.app.verbs",
+    "join": "graphslam.app.verbs",
+    "solve": "graphslam.app.verbs",
+    "simulate": "graphslam.app.verbs",
+    "open_run": "graphslam.app.verbs",
+}
+
+__all__ = ["__version__", *_VERBS]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _VERBS:
+        return getattr(importlib.import_module(_VERBS[name]), name)
+    raise AttributeError(f"module 'graphslam' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

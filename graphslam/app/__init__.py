@@ -1,0 +1,1 @@
+"""Storey 6: pipeline, run folder, verbs and the command line."""

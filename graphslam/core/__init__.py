@@ -1,0 +1,1 @@
+"""Storey 0: geometry, Gaussians, sensor records and the submap contract. Imports nothing above it."""

@@ -1,0 +1,90 @@
+"""The one exception tree.
+
+A message says what went wrong, where (file, record), what was found and what was wanted. Libraries raise;
+only the command line catches :class:`GraphSlamError`, prints its one line and exits 1.
+"""
+
+from __future__ import annotations
+
+
+class GraphSlamError(Exception):
+    """Base of every error this project raises on purpose."""
+
+
+class DataError(GraphSlamError):
+    """A recorded file or stream holds something we cannot use.
+
+    Parameters
+    ----------
+    what : str
+        What is wrong, in words.
+    where : str, optional
+        File, and record or line inside it.
+    got, wanted : object, optional
+        The offending value and what would have been accepted.
+    """
+
+    def __init__(self, what: str, *, where: str | None = None, got: object = None, wanted: object = None) -> None:
+        self.what, self.where, self.got, self.wanted = what, where, got, wanted
+        parts = [f"{where}: {what}" if where else what]
+        if got is not None:
+            parts.append(f"got {got}")
+        if wanted is not None:
+            parts.append(f"wanted {wanted}")
+        super().__init__("; ".join(parts))
+
+
+class FormatError(DataError):
+    """A file is of an unknown format or version, truncated, or corrupt."""
+
+
+class MissingDataError(DataError):
+    """A file, stream or data set that was asked for is not there."""
+
+
+class CovarianceError(DataError):
+    """A covariance or information matrix is not finite, not symmetric or not positive definite."""
+
+
+class UnknownNameError(GraphSlamError):
+    """A card, front end, solver, joiner or world of that name is not registered."""
+
+    def __init__(self, kind: str, name: str, known: object = ()) -> None:
+        names = ", ".join(sorted(str(k) for k in known)) if known else "none"  # type: ignore[attr-defined]
+        super().__init__(f"unknown {kind} {name!r}; known: {names}")
+        self.kind, self.name = kind, name
+
+
+class ConfigError(GraphSlamError):
+    """A configuration file or option has an unknown key or an impossible value."""
+
+
+class GeometryError(DataError):
+    """A pose or a shape is impossible (non-finite, zero quaternion, wrong dimension)."""
+
+
+class EvidenceReusedError(GraphSlamError):
+    """A measurement was about to be spent twice (see :mod:`graphslam.graph.ledger`)."""
+
+
+class IndeterminateError(GraphSlamError):
+    """A system does not constrain some variables.
+
+    Parameters
+    ----------
+    message : str
+    variables : sequence of str
+        Names of the unconstrained variables.
+    """
+
+    def __init__(self, message: str, variables: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.variables = variables
+
+
+class SolverError(GraphSlamError):
+    """A solver failed, or was asked for something that its state cannot give."""
+
+
+class RunFolderError(GraphSlamError):
+    """A run folder cannot be written, read or resumed."""

@@ -1,0 +1,205 @@
+"""Gaussians in moment and in information form, and the chi-square numbers that judge them.
+
+Moment form is dense and carries a mean; information form is sparse and carries ``(Λ, η)`` with ``Λ x = η``
+(Combined SLAM eq. 13). Headings are components that live on the circle: functions that take differences or means
+accept ``angular``, the indices of those components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from scipy import stats
+
+from graphslam.core.errors import CovarianceError
+from graphslam.core.geometry import Array, ArrayLike, circular_mean, wrap_angle
+
+
+def check_covariance(
+    cov: ArrayLike, *, what: str = "covariance", where: str | None = None, dim: int | None = None
+) -> Array:
+    """Return a symmetric positive-definite copy of ``cov`` ``(n, n)``, or say exactly what is wrong with it.
+
+    Asymmetry at the level of rounding (1e-6 relative) is averaged away; more is refused, because GTSAM would
+    silently read one triangle only.
+
+    Raises
+    ------
+    CovarianceError
+    """
+    P = np.array(cov, dtype=np.float64)
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or (dim is not None and P.shape[0] != dim):
+        wanted = f"({dim}, {dim})" if dim is not None else "a square matrix"
+        raise CovarianceError(f"{what} has the wrong shape", where=where, got=P.shape, wanted=wanted)
+    if not np.all(np.isfinite(P)):
+        i, j = np.argwhere(~np.isfinite(P))[0]
+        raise CovarianceError(
+            f"{what} is not finite", where=where, got=f"{P[i, j]} at ({i}, {j})", wanted="finite numbers"
+        )
+    scale = np.sqrt(np.abs(np.diag(P)))
+    bound = 1e-6 * np.maximum(np.outer(scale, scale), 1e-300)
+    if np.any(np.abs(P - P.T) > bound):
+        i, j = np.argwhere(np.abs(P - P.T) > bound)[0]
+        raise CovarianceError(
+            f"{what} is not symmetric",
+            where=where,
+            got=f"{P[i, j]} and {P[j, i]} at ({i}, {j})",
+            wanted="a symmetric matrix",
+        )
+    P = 0.5 * (P + P.T)
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        low = float(np.linalg.eigvalsh(P)[0])
+        raise CovarianceError(
+            f"{what} is not positive definite", where=where, got=f"smallest eigenvalue {low:.3g}", wanted="> 0"
+        ) from None
+    return P
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussian:
+    """A Gaussian in moment form.
+
+    Parameters
+    ----------
+    mean : (n,)
+    covariance : (n, n)
+        Symmetric positive definite.
+    angular : tuple of int
+        Components that are angles [rad].
+    """
+
+    mean: Array
+    covariance: Array
+    angular: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        mean = np.asarray(self.mean, dtype=np.float64)
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "covariance", check_covariance(self.covariance, dim=len(mean)))
+
+    def difference(self, x: ArrayLike) -> Array:
+        """``x - mean`` with angular components wrapped."""
+        d = np.asarray(x, dtype=np.float64) - self.mean
+        for i in self.angular:
+            d[..., i] = wrap_angle(d[..., i])
+        return d
+
+    def mahalanobis2(self, x: ArrayLike) -> float:
+        """``(x - mean)ᵀ Σ⁻¹ (x - mean)`` (Combined SLAM eq. 18)."""
+        d = self.difference(x)
+        return float(d @ np.linalg.solve(self.covariance, d))
+
+    def marginal(self, indices: ArrayLike) -> Gaussian:
+        """Marginal of the components ``indices`` in that order."""
+        ix = np.asarray(indices, dtype=np.intp)
+        angular = tuple(int(k) for k in np.flatnonzero(np.isin(ix, self.angular)))
+        return Gaussian(self.mean[ix], self.covariance[np.ix_(ix, ix)], angular)
+
+    def to_information(self) -> Information:
+        """Information form of the same Gaussian."""
+        L = np.linalg.inv(self.covariance)
+        L = 0.5 * (L + L.T)
+        return Information(sp.csc_matrix(L), L @ self.mean)
+
+    def kl_from(self, other: Gaussian) -> float:
+        """Kullback–Leibler divergence ``KL(self ‖ other)`` in nats."""
+        n = len(self.mean)
+        d = other.difference(self.mean)
+        sign_s, logdet_s = np.linalg.slogdet(self.covariance)
+        sign_o, logdet_o = np.linalg.slogdet(other.covariance)
+        assert sign_s > 0
+        assert sign_o > 0
+        trace = np.trace(np.linalg.solve(other.covariance, self.covariance))
+        return float(0.5 * (trace + d @ np.linalg.solve(other.covariance, d) - n + logdet_o - logdet_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """A Gaussian in sparse information form: ``matrix`` ``(n, n)`` CSC and ``vector`` ``(n,)`` with ``Λ x = η``."""
+
+    matrix: sp.csc_matrix
+    vector: Array
+
+    def factor(self) -> spla.SuperLU:
+        """Sparse factorisation with a symmetric fill-reducing ordering.
+
+        Raises
+        ------
+        CovarianceError
+            If the matrix is singular.
+        """
+        try:
+            return spla.splu(
+                sp.csc_matrix(self.matrix),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise CovarianceError(f"information matrix cannot be factorised ({error})", got=self.matrix.shape) from None
+
+    def mean(self) -> Array:
+        """State ``x = Λ⁻¹ η`` (Combined SLAM eq. 13)."""
+        return np.asarray(self.factor().solve(self.vector))
+
+    def covariance_block(self, indices: ArrayLike) -> Array:
+        """Joint covariance of the components ``indices`` by sparse solves (Algorithm 1); never the whole inverse."""
+        ix = np.asarray(indices, dtype=np.intp)
+        E = np.zeros((self.matrix.shape[0], len(ix)))
+        E[ix, np.arange(len(ix))] = 1.0
+        block = self.factor().solve(E)[ix]
+        return np.asarray(0.5 * (block + block.T))
+
+    def to_gaussian(self, angular: tuple[int, ...] = ()) -> Gaussian:
+        """Dense moment form."""
+        P = np.linalg.inv(self.matrix.toarray())
+        return Gaussian(P @ self.vector, 0.5 * (P + P.T), angular)
+
+
+def moment_match(
+    weights: ArrayLike, means: ArrayLike, covariances: ArrayLike, angular: tuple[int, ...] = ()
+) -> Gaussian:
+    """Mixture → single Gaussian by moment matching (Combined SLAM eq. 7–8).
+
+    Parameters
+    ----------
+    weights : (m,)
+        Non-negative; normalised here.
+    means : (m, n)
+    covariances : (m, n, n) or (n, n)
+    angular : tuple of int
+        Components averaged on the circle, with wrapped differences.
+    """
+    w = np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    X = np.asarray(means, dtype=np.float64)
+    mean = w @ X
+    for i in angular:
+        mean[i] = circular_mean(X[:, i], w)  # eq. 7 on the circle
+    D = X - mean
+    for i in angular:
+        D[:, i] = wrap_angle(D[:, i])
+    C = np.asarray(covariances, dtype=np.float64)
+    within = C if C.ndim == 2 else np.einsum("m,mij->ij", w, C)
+    Q = within + (w[:, None] * D).T @ D  # eq. 8: within + between
+    return Gaussian(mean, 0.5 * (Q + Q.T), angular)
+
+
+def chi2_quantile(probability: float, dof: float) -> float:
+    """Quantile of the chi-square distribution."""
+    return float(stats.chi2.ppf(probability, dof))
+
+
+def chi2_mean_bounds(dof: float, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Two-sided bounds of the *mean* of ``runs`` independent chi-square values of ``dof`` each.
+
+    An estimator whose mean NEES lies below the lower bound is pessimistic; above the upper, over-confident.
+    """
+    a = (1.0 - confidence) / 2.0
+    n = dof * runs
+    return float(stats.chi2.ppf(a, n) / runs), float(stats.chi2.ppf(1.0 - a, n) / runs)

@@ -1,0 +1,128 @@
+"""A sensor log: named streams on one clock, with truth where it is known, and the count of what was dropped."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.records import Stream
+from graphslam.core.trajectory import Trajectory
+
+
+@dataclass
+class DropCounter:
+    """Counts records that were read and not used, with the reason: nothing is lost silently."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def drop(self, stream: str, reason: str, n: int = 1) -> None:
+        """Count ``n`` records of ``stream`` dropped for ``reason``."""
+        if n:
+            self.counts[f"{stream}: {reason}"] += int(n)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a simulator or a surveyor knows.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        True base poses, in the frame of the first base.
+    landmark_ids : (n,) int64
+    landmarks : (n, dim)
+        True positions in the same frame.
+    """
+
+    trajectory: Trajectory
+    landmark_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorLog:
+    """Named sensor streams on one clock.
+
+    Parameters
+    ----------
+    name : str
+    streams : mapping of str to Stream
+    truth : Truth or None
+    read, dropped : mapping of str to int
+        Records read per stream, and records dropped per "stream: reason".
+    meta : mapping
+        What else a report should print (source, noise figures, seed …); JSON-serialisable.
+    """
+
+    name: str
+    streams: Mapping[str, Stream]
+    truth: Truth | None = None
+    read: Mapping[str, int] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, stream: str) -> Any:
+        try:
+            return self.streams[stream]
+        except KeyError:
+            raise MissingDataError(
+                f"log has no stream {stream!r}", where=self.name, wanted=", ".join(self.streams)
+            ) from None
+
+    def __contains__(self, stream: str) -> bool:
+        return stream in self.streams
+
+    def of_type(self, kind: type) -> str | None:
+        """Name of the first stream of that record type, or None."""
+        return next((name for name, s in self.streams.items() if isinstance(s, kind)), None)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """First and last stamp over all streams [s]."""
+        spans = [(s.times[0], s.times[-1]) for s in self.streams.values() if len(s.times)]
+        if not spans:
+            raise MissingDataError("log is empty", where=self.name)
+        return float(min(a for a, _ in spans)), float(max(b for _, b in spans))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from first to last stamp."""
+        a, b = self.interval
+        return b - a
+
+    def slice(self, t_start: float, t_end: float) -> SensorLog:
+        """Records with ``t_start <= t <= t_end``."""
+        cut = {}
+        for name, s in self.streams.items():
+            i, j = np.searchsorted(s.times, t_start, "left"), np.searchsorted(s.times, t_end, "right")
+            cut[name] = s.take(slice(int(i), int(j)))
+        return replace(self, streams=cut)
+
+    def events(self) -> Iterator[tuple[float, str, int]]:
+        """Merge the streams in time order: yields (time, stream, record index); ties in order of the streams' names."""
+        names = sorted(self.streams)
+        times = np.concatenate([self.streams[n].times for n in names])
+        which = np.concatenate([np.full(len(self.streams[n].times), k) for k, n in enumerate(names)])
+        index = np.concatenate([np.arange(len(self.streams[n].times)) for n in names])
+        for k in np.lexsort((which, times)):
+            yield float(times[k]), names[which[k]], int(index[k])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{n}</td><td>{type(s).__name__}</td><td>{len(s.times)}</td>"
+            f"<td>{(s.times[0] if len(s.times) else float('nan')):.2f}</td>"
+            f"<td>{(s.times[-1] if len(s.times) else float('nan')):.2f}</td></tr>"
+            for n, s in self.streams.items()
+        )
+        drops = "".join(f"<li>{k}: {v}</li>" for k, v in self.dropped.items())
+        return (
+            f"<b>SensorLog {self.name}</b>, {self.duration:.1f} s, truth {'known' if self.truth else 'unknown'}"
+            f"<table><tr><th>stream</th><th>kind</th><th>records</th><th>from s</th><th>to s</th></tr>{rows}</table>"
+            + (f"dropped:<ul>{drops}</ul>" if drops else "")
+        )

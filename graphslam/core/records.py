@@ -1,0 +1,291 @@
+"""Sensor streams as arrays with their calibration.
+
+Every record has ``times`` ``(n,)`` [s], strictly increasing in one clock per log. Constructors validate; readers that
+meet bad records drop them with :meth:`graphslam.core.log.DropCounter.drop` *before* they build a stream.
+Extrinsics are ``T_base_sensor``: ``(3,)`` in 2-D, ``(7,)`` in 3-D.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+
+IDENTITY2 = np.zeros(3)
+
+
+@runtime_checkable
+class Stream(Protocol):
+    """What a :class:`~graphslam.core.log.SensorLog` needs of a stream."""
+
+    @property
+    def times(self) -> Array: ...
+
+    def take(self, index: Any) -> Self:
+        """The records ``index`` (slice, mask or integer array) as a stream of the same kind."""
+        ...
+
+
+def check_times(times: Any, n: int | None = None, *, where: str | None = None) -> Array:
+    """Validate stamps ``(n,)``: finite, strictly increasing.
+
+    Raises
+    ------
+    DataError
+        Names the first offending record.
+    """
+    t = np.ascontiguousarray(times, dtype=np.float64)
+    if t.ndim != 1 or (n is not None and len(t) != n):
+        raise DataError("stamps have the wrong shape", where=where, got=t.shape, wanted=f"({n},)" if n else "(n,)")
+    if not np.all(np.isfinite(t)):
+        k = int(np.flatnonzero(~np.isfinite(t))[0])
+        raise DataError(f"stamp of record {k} is not finite", where=where, got=t[k], wanted="seconds")
+    bad = np.flatnonzero(np.diff(t) <= 0)
+    if len(bad):
+        k = int(bad[0]) + 1
+        raise DataError(
+            f"time does not increase at record {k}",
+            where=where,
+            got=f"{t[k]:.6f} after {t[k - 1]:.6f}",
+            wanted="strictly increasing stamps",
+        )
+    return t
+
+
+def _array(x: Any, shape: tuple[int, ...], name: str) -> Array:
+    a = np.ascontiguousarray(x, dtype=np.float64)
+    if len(a.shape) != len(shape) or any(w not in (-1, g) for g, w in zip(a.shape, shape)):
+        raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shape)
+    return a
+
+
+def _finite(a: Array, name: str) -> Array:
+    if not np.all(np.isfinite(a)):
+        k = int(np.argwhere(~np.isfinite(a))[0][0])
+        raise DataError(f"{name} of record {k} is not finite", got=a[k], wanted="finite numbers")
+    return a
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserScans:
+    """Planar laser scans.
+
+    Parameters
+    ----------
+    times : (n,)
+    ranges : (n, m)
+        Metres, float32 or float64; ``nan`` or ≥ ``max_range`` means no return.
+    bearings : (m,)
+        Beam directions in the sensor frame, radians, counter-clockwise, strictly increasing.
+    max_range : float
+        Ranges at or above it are "no return".
+    T_base_sensor : (3,)
+    """
+
+    times: Array
+    ranges: npt.NDArray[np.floating[Any]]
+    bearings: Array
+    max_range: float
+    T_base_sensor: Array = field(default_factory=lambda: IDENTITY2.copy())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times, len(self.ranges)))
+        object.__setattr__(self, "bearings", check_times(self.bearings, self.ranges.shape[1], where="beam bearings"))
+        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
+
+    def take(self, index: Any) -> LaserScans:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], ranges=self.ranges[index])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AckermannGeometry:
+    """Car-like vehicle; base = middle of the rear axle.
+
+    Parameters
+    ----------
+    wheelbase : float
+        L, rear to front axle [m].
+    encoder_offset : float
+        H, rear-axle centre to the wheel whose speed is measured, positive left [m]; 0 if speed is that of the centre.
+    model : {"rear-axle", "front-steer"}
+        ``rear-axle``: v is the speed of the rear axle, φ̇ = v tan(α)/L. ``front-steer``: v is the speed of the
+        front wheel and the base moves along it, x' = x + v dt cos(α + φ), φ' = φ + v dt sin(α)/L (the classic
+        steering-model simulator of Combined SLAM, section B).
+    """
+
+    wheelbase: float
+    encoder_offset: float = 0.0
+    model: str = "rear-axle"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringControls:
+    """Speed and steering of a car-like vehicle, held constant from each stamp to the next (zero-order hold).
+
+    Parameters
+    ----------
+    times : (n,)
+    speed : (n,)
+        Wheel speed [m/s].
+    steering : (n,)
+        Steering angle [rad], positive left.
+    geometry : AckermannGeometry
+    """
+
+    times: Array
+    speed: Array
+    steering: Array
+    geometry: AckermannGeometry
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        n = len(self.times)
+        for name in ("speed", "steering"):
+            object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
+
+    def take(self, index: Any) -> SteeringControls:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], speed=self.speed[index], steering=self.steering[index])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Odometry:
+    """Motion between stamps: record k is ``T_body(k-1)_body(k)``; record 0 is identity.
+
+    Parameters
+    ----------
+    times : (n,)
+    increments : (n, 3) or (n, 7)
+    covariances : (n, d, d)
+        Right tangent at the later pose. Nothing enters a graph without a covariance.
+    """
+
+    times: Array
+    increments: Array
+    covariances: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        object.__setattr__(self, "increments", _finite(_array(self.increments, (n, -1), "increments"), "increment"))
+        d = 3 if self.increments.shape[1] == 3 else 6
+        object.__setattr__(
+            self, "covariances", _finite(_array(self.covariances, (n, d, d), "covariances"), "covariance")
+        )
+
+    def take(self, index: Any) -> Odometry:
+        """See :class:`Stream`."""
+        return replace(
+            self, times=self.times[index], increments=self.increments[index], covariances=self.covariances[index]
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gps:
+    """Position fixes in a local metric frame (x east, y north[, z up]).
+
+    Parameters
+    ----------
+    times : (n,)
+    positions : (n, 2) or (n, 3)
+    sigma : (n,)
+        Standard deviation of each coordinate [m].
+    lever : (2,) or (3,)
+        Antenna in the base frame [m].
+    """
+
+    times: Array
+    positions: Array
+    sigma: Array
+    lever: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        object.__setattr__(self, "positions", _finite(_array(self.positions, (n, -1), "positions"), "position"))
+        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
+        object.__setattr__(self, "lever", _array(self.lever, (self.positions.shape[1],), "lever"))
+        if np.any(self.sigma <= 0):
+            k = int(np.flatnonzero(self.sigma <= 0)[0])
+            raise DataError(f"GPS sigma of record {k} is not positive", got=self.sigma[k], wanted="> 0 m")
+
+    def take(self, index: Any) -> Gps:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], positions=self.positions[index], sigma=self.sigma[index])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkObservations:
+    """Range-bearing observations of point landmarks, several per scan (ragged).
+
+    Parameters
+    ----------
+    times : (n,)
+        Scan stamps; a scan may be empty.
+    offsets : (n + 1,) int64
+        Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
+    ranges, bearings : (q,)
+        Metres, radians in the sensor frame.
+    sigmas : (q, 2)
+        Standard deviations of range [m] and bearing [rad].
+    ids : (q,) int64 or None
+        Known identity; -1 where unknown; None if the sensor gives none.
+    max_range : float
+    field_of_view : (2,)
+        Least and greatest bearing [rad].
+    T_base_sensor : (3,)
+    """
+
+    times: Array
+    offsets: npt.NDArray[np.int64]
+    ranges: Array
+    bearings: Array
+    sigmas: Array
+    ids: npt.NDArray[np.int64] | None = None
+    max_range: float = np.inf
+    field_of_view: tuple[float, float] = (-np.pi, np.pi)
+    T_base_sensor: Array = field(default_factory=lambda: IDENTITY2.copy())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
+        q = len(self.ranges)
+        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
+            raise DataError(
+                "offsets do not partition the observations", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
+            )
+        object.__setattr__(self, "offsets", offsets)
+        for name, shape in (("ranges", (q,)), ("bearings", (q,)), ("sigmas", (q, 2))):
+            object.__setattr__(self, name, _finite(_array(getattr(self, name), shape, name), name))
+        if q and np.any(self.sigmas <= 0):
+            k = int(np.argwhere(self.sigmas <= 0)[0][0])
+            raise DataError(f"sigma of observation {k} is not positive", got=self.sigmas[k], wanted="> 0")
+        if self.ids is not None:
+            object.__setattr__(self, "ids", np.ascontiguousarray(self.ids, dtype=np.int64))
+        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
+
+    def scan(self, k: int) -> slice:
+        """Rows of scan k."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def take(self, index: Any) -> LandmarkObservations:
+        """See :class:`Stream`."""
+        keep = np.arange(len(self.times))[index]
+        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
+        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
+        return replace(
+            self,
+            times=self.times[keep],
+            offsets=offsets,
+            ranges=self.ranges[r],
+            bearings=self.bearings[r],
+            sigmas=self.sigmas[r],
+            ids=None if self.ids is None else self.ids[r],
+        )

@@ -1,0 +1,248 @@
+"""SE(3) on arrays; conventions in :mod:`graphslam.core.geometry`.
+
+A pose is ``(..., 7)``: x, y, z, qx, qy, qz, qw. Tangents are rotation first, then translation (GTSAM's Pose3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.errors import GeometryError
+from graphslam.core.geometry import Array, ArrayLike
+
+_SMALL = 1e-4
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrices ``(..., 3, 3)``: ``skew(v) w = v × w``."""
+    a = np.asarray(v, dtype=np.float64)
+    out = np.zeros(a.shape[:-1] + (3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = a[..., 2], -a[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -a[..., 1], a[..., 0]
+    return out
+
+
+def quat_normalize(q: ArrayLike) -> Array:
+    """Unit quaternions ``(..., 4)`` (xyzw) with w ≥ 0.
+
+    Raises
+    ------
+    GeometryError
+        Where a quaternion is zero or not finite.
+    """
+    a = np.asarray(q, dtype=np.float64)
+    n = np.linalg.norm(a, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(n)) or np.any(n < 1e-12):
+        raise GeometryError(
+            "quaternion of zero or non-finite length",
+            got=a[np.ravel(~(n[..., 0] >= 1e-12)).argmax()] if a.ndim == 2 else a,
+            wanted="a unit quaternion (x, y, z, w)",
+        )
+    a = a / n
+    return np.where(a[..., 3:] < 0, -a, a)
+
+
+def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Hamilton product of quaternions ``(..., 4)`` in xyzw order."""
+    a, b = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    v = aw * bv + bw * av + np.cross(av, bv)
+    w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    return np.concatenate([v, w], -1)
+
+
+def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Rotate vectors ``(..., 3)`` by unit quaternions ``(..., 4)``."""
+    a, u = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    t = 2.0 * np.cross(a[..., :3], u)
+    return u + a[..., 3:] * t + np.cross(a[..., :3], t)
+
+
+def quat_to_matrix(q: ArrayLike) -> Array:
+    """Rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
+    a = np.asarray(q, dtype=np.float64)
+    x, y, z, w = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def matrix_to_quat(R: ArrayLike) -> Array:
+    """Unit quaternions ``(..., 4)`` of rotation matrices ``(..., 3, 3)``; the largest component is computed first."""
+    m = np.asarray(R, dtype=np.float64)
+    d = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
+    tr = d.sum(-1)
+    # four equivalent formulas; each is accurate where its leading component is large
+    q = np.empty(m.shape[:-2] + (4, 4))
+    q[..., 3, 3] = 1 + tr
+    q[..., 3, 0] = m[..., 2, 1] - m[..., 1, 2]
+    q[..., 3, 1] = m[..., 0, 2] - m[..., 2, 0]
+    q[..., 3, 2] = m[..., 1, 0] - m[..., 0, 1]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[..., i, i] = 1 + 2 * d[..., i] - tr
+        q[..., i, j] = m[..., i, j] + m[..., j, i]
+        q[..., i, k] = m[..., i, k] + m[..., k, i]
+        q[..., i, 3] = m[..., k, j] - m[..., j, k]
+    lead = np.concatenate([1 + 2 * d - tr[..., None], (1 + tr)[..., None]], -1).argmax(-1)
+    best = np.take_along_axis(q, lead[..., None, None], axis=-2)[..., 0, :]
+    return quat_normalize(best)
+
+
+def so3_exp(omega: ArrayLike) -> Array:
+    """Rotation vector ``(..., 3)`` → unit quaternion ``(..., 4)``."""
+    v = np.asarray(omega, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    small = angle < _SMALL
+    s = np.where(small, 0.5 - angle**2 / 48.0, np.sin(angle / 2.0) / np.where(small, 1.0, angle))
+    return np.concatenate([s * v, np.cos(angle / 2.0)], -1)
+
+
+def so3_log(q: ArrayLike) -> Array:
+    """Unit quaternion ``(..., 4)`` → rotation vector ``(..., 3)`` of angle ≤ π; accurate near 0 and near π."""
+    a = np.asarray(q, dtype=np.float64)
+    a = np.where(a[..., 3:] < 0, -a, a)
+    s = np.linalg.norm(a[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(s, a[..., 3:])
+    small = s < _SMALL
+    k = np.where(small, 2.0 + s**2 / 3.0, angle / np.where(small, 1.0, s))
+    return k * a[..., :3]
+
+
+def _coefficients(omega: Array) -> tuple[Array, Array]:
+    """``(1 - cos)/φ²`` and ``(φ - sin)/φ³`` with series near zero; each with two trailing axes."""
+    t2 = np.sum(omega**2, axis=-1)[..., None, None]
+    t = np.sqrt(t2)
+    small = t < 1e-3
+    safe = np.where(small, 1.0, t)
+    a = np.where(small, 0.5 - t2 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe**2)
+    b = np.where(small, 1.0 / 6.0 - t2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    return a, b
+
+
+def so3_left_jacobian(omega: ArrayLike) -> Array:
+    """``J_l`` ``(..., 3, 3)``: ``Exp(ω + δ) ≈ Exp(J_l δ) Exp(ω)``; also the V matrix of SE(3)."""
+    w = np.asarray(omega, dtype=np.float64)
+    W = skew(w)
+    a, b = _coefficients(w)
+    return np.eye(3) + a * W + b * (W @ W)
+
+
+def so3_left_jacobian_inverse(omega: ArrayLike) -> Array:
+    """Inverse of :func:`so3_left_jacobian`, closed form."""
+    w = np.asarray(omega, dtype=np.float64)
+    W = skew(w)
+    t = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = t < 1e-3
+    safe = np.where(small, 1.0, t)
+    half = safe / 2.0
+    c = np.where(small, 1.0 / 12.0 + t**2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
+    return np.eye(3) - 0.5 * W + c * (W @ W)
+
+
+def se3_compose(T_ab: ArrayLike, T_bc: ArrayLike) -> Array:
+    """``T_ac`` from ``T_ab`` and ``T_bc``, each ``(..., 7)``."""
+    a, b = np.asarray(T_ab, dtype=np.float64), np.asarray(T_bc, dtype=np.float64)
+    t = a[..., :3] + quat_rotate(a[..., 3:], b[..., :3])
+    return np.concatenate([t, quat_normalize(quat_multiply(a[..., 3:], b[..., 3:]))], -1)
+
+
+def se3_inverse(T_ab: ArrayLike) -> Array:
+    """``T_ba`` of ``T_ab`` ``(..., 7)``."""
+    a = np.asarray(T_ab, dtype=np.float64)
+    q = a[..., 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.concatenate([-quat_rotate(q, a[..., :3]), q], -1)
+
+
+def se3_between(T_wa: ArrayLike, T_wb: ArrayLike) -> Array:
+    """``T_ab = T_wa⁻¹ T_wb``."""
+    return se3_compose(se3_inverse(T_wa), T_wb)
+
+
+def se3_transform(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
+    """Points ``(..., 3)`` in frame b to frame a."""
+    a = np.asarray(T_ab, dtype=np.float64)
+    return a[..., :3] + quat_rotate(a[..., 3:], points_b)
+
+
+def se3_exp(xi: ArrayLike) -> Array:
+    """Exponential map: tangent ``(..., 6)`` (rotation, translation) → pose ``(..., 7)``."""
+    v = np.asarray(xi, dtype=np.float64)
+    t = (so3_left_jacobian(v[..., :3]) @ v[..., 3:, None])[..., 0]
+    return np.concatenate([t, so3_exp(v[..., :3])], -1)
+
+
+def se3_log(T: ArrayLike) -> Array:
+    """Logarithm: pose ``(..., 7)`` → tangent ``(..., 6)``; inverse of :func:`se3_exp`."""
+    p = np.asarray(T, dtype=np.float64)
+    w = so3_log(p[..., 3:])
+    rho = (so3_left_jacobian_inverse(w) @ p[..., :3, None])[..., 0]
+    return np.concatenate([w, rho], -1)
+
+
+def se3_adjoint(T: ArrayLike) -> Array:
+    """Adjoint ``(..., 6, 6)``: ``T Exp(ξ) = Exp(Ad_T ξ) T``, rotation first."""
+    p = np.asarray(T, dtype=np.float64)
+    R = quat_to_matrix(p[..., 3:])
+    out = np.zeros(p.shape[:-1] + (6, 6))
+    out[..., :3, :3] = R
+    out[..., 3:, 3:] = R
+    out[..., 3:, :3] = skew(p[..., :3]) @ R
+    return out
+
+
+def se3_right_jacobian(xi: ArrayLike) -> Array:
+    """``J_r`` ``(..., 6, 6)``: ``Exp(ξ + δ) ≈ Exp(ξ) Exp(J_r δ)`` (Barfoot & Furgale 2014, with rotation first)."""
+    v = -np.asarray(xi, dtype=np.float64)  # J_r(ξ) = J_l(-ξ)
+    w, rho = v[..., :3], v[..., 3:]
+    J = so3_left_jacobian(w)
+    W, P = skew(w), skew(rho)
+    t = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = t < 1e-2
+    s = np.where(small, 1.0, t)
+    sin, cos = np.sin(s), np.cos(s)
+    a = np.where(small, 1 / 6 - t**2 / 120, (s - sin) / s**3)
+    b = np.where(small, 1 / 24 - t**2 / 720, (s**2 + 2 * cos - 2) / (2 * s**4))
+    c = np.where(small, 1 / 120 - t**2 / 2520, (2 * s - 3 * sin + s * cos) / (2 * s**5))
+    Q = (
+        0.5 * P
+        + a * (W @ P + P @ W + W @ P @ W)
+        + b * (W @ W @ P + P @ W @ W - 3 * W @ P @ W)
+        + c * (W @ P @ W @ W + W @ W @ P @ W)
+    )
+    out = np.zeros(v.shape[:-1] + (6, 6))
+    out[..., :3, :3] = J
+    out[..., 3:, 3:] = J
+    out[..., 3:, :3] = Q
+    return out
+
+
+def matrix_to_pose(M: ArrayLike) -> Array:
+    """Homogeneous matrices ``(..., 4, 4)`` or ``(..., 3, 4)`` → poses ``(..., 7)``."""
+    m = np.asarray(M, dtype=np.float64)
+    return np.concatenate([m[..., :3, 3], matrix_to_quat(m[..., :3, :3])], -1)
+
+
+def pose_to_matrix(T: ArrayLike) -> Array:
+    """Poses ``(..., 7)`` → homogeneous matrices ``(..., 4, 4)``."""
+    p = np.asarray(T, dtype=np.float64)
+    out = np.zeros(p.shape[:-1] + (4, 4))
+    out[..., :3, :3] = quat_to_matrix(p[..., 3:])
+    out[..., :3, 3] = p[..., :3]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def align_se3(points: ArrayLike, reference: ArrayLike, *, scale: bool = False) -> tuple[Array, float]:
+    """Transform ``T_reference_points`` (7,) and scale that take points ``(n, 3)`` onto reference (Umeyama 1991)."""
+    p, q = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    mp, mq = p.mean(0), q.mean(0)
+    U, D, Vt = np.linalg.svd((q - mq).T @ (p - mp) / len(p))
+    S = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = U @ S @ Vt
+    k = float(np.trace(np.diag(D) @ S) / np.mean(np.sum((p - mp) ** 2, 1))) if scale else 1.0
+    return np.concatenate([mq - k * R @ mp, matrix_to_quat(R)]), k

@@ -1,0 +1,242 @@
+"""The contract between front ends and back ends: a submap is a frozen value.
+
+A submap is a small map in the frame of its first pose, with a Gaussian over where it ends and over the landmarks in
+it. Node k+1 of a graph is the end of submap k (Combined SLAM B5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from graphslam.core.errors import CovarianceError, GeometryError
+from graphslam.core.gaussian import check_covariance
+from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.trajectory import Trajectory
+
+
+class DensePayload(Protocol):
+    """An evidence grid, seen from here: core knows no grid."""
+
+    def save(self, path: Any) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkMap:
+    """Joint Gaussian over ``[exit pose, landmark_1, …]`` in the base frame.
+
+    In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame, and the residual is that of Combined SLAM
+    eq. 15 with the heading wrapped. In 3-D the pose block is the right tangent at the exit.
+
+    Parameters
+    ----------
+    ids : (n,) int64
+        Global landmark identities; -1 = not associated. An id may stand twice (two entries that turned out to be one
+        landmark).
+    exit_pose : (3,) or (7,)
+        ``T_start_end``.
+    positions : (n, dim)
+    covariance : (d + n·dim, …) or None
+    information : sparse, same shape, or None
+        Exactly one of the two is given.
+    """
+
+    ids: npt.NDArray[np.int64]
+    exit_pose: Array
+    positions: Array
+    covariance: Array | None = None
+    information: sp.csc_matrix | None = None
+
+    def __post_init__(self) -> None:
+        ids = np.ascontiguousarray(self.ids, dtype=np.int64)
+        pose = np.ascontiguousarray(self.exit_pose, dtype=np.float64)
+        dim = {3: 2, 7: 3}.get(pose.shape[0] if pose.ndim == 1 else -1)
+        if dim is None:
+            raise GeometryError("exit pose has the wrong shape", got=pose.shape, wanted="(3,) or (7,)")
+        positions = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(-1, dim)
+        if len(positions) != len(ids):
+            raise GeometryError("landmark ids and positions differ in number", got=len(positions), wanted=len(ids))
+        if not (np.all(np.isfinite(pose)) and np.all(np.isfinite(positions))):
+            raise GeometryError("landmark map is not finite", got=pose, wanted="finite poses and positions")
+        n = (3 if dim == 2 else 6) + positions.size
+        if (self.covariance is None) == (self.information is None):
+            raise CovarianceError(
+                "a landmark map carries either a covariance or an information matrix",
+                got="both" if self.covariance is not None else "none",
+            )
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", check_covariance(self.covariance, what="submap covariance", dim=n))
+        else:
+            info = sp.csc_matrix(self.information)
+            if info.shape != (n, n):
+                raise CovarianceError("submap information has the wrong shape", got=info.shape, wanted=(n, n))
+            if not np.all(np.isfinite(info.data)):
+                raise CovarianceError("submap information is not finite", wanted="finite numbers")
+            object.__setattr__(self, "information", info)
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "exit_pose", pose)
+        object.__setattr__(self, "positions", positions)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return 2 if len(self.exit_pose) == 3 else 3
+
+    @property
+    def mean(self) -> Array:
+        """``[exit pose, landmarks…]`` as one vector (2-D only)."""
+        return np.concatenate([self.exit_pose, self.positions.ravel()])
+
+    def dense_covariance(self) -> Array:
+        """Joint covariance, inverted from the information matrix where that is what is stored."""
+        if self.covariance is not None:
+            return self.covariance
+        assert self.information is not None
+        try:
+            P = np.linalg.inv(self.information.toarray())
+        except np.linalg.LinAlgError:
+            raise CovarianceError("submap information matrix is singular", wanted="positive definite") from None
+        return 0.5 * (P + P.T)
+
+    def dense_information(self) -> Array:
+        """Joint information matrix, inverted from the covariance where that is what is stored."""
+        if self.information is not None:
+            return np.asarray(self.information.toarray())
+        assert self.covariance is not None
+        L = np.linalg.inv(self.covariance)
+        return np.asarray(0.5 * (L + L.T))
+
+    def subset(self, keep: npt.ArrayLike) -> LandmarkMap:
+        """Marginal over the exit pose and the landmarks ``keep`` (mask or integer indices)."""
+        k = np.arange(len(self))[np.asarray(keep)]
+        d = 3 if self.dim == 2 else 6
+        ix = np.concatenate([np.arange(d), (d + self.dim * k[:, None] + np.arange(self.dim)).ravel()]).astype(np.intp)
+        return LandmarkMap(
+            ids=self.ids[k],
+            exit_pose=self.exit_pose,
+            positions=self.positions[k],
+            covariance=self.dense_covariance()[np.ix_(ix, ix)],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """A re-entry into an earlier submap that the front end found.
+
+    Parameters
+    ----------
+    target : int
+        Key of the earlier submap.
+    T_target_here : (3,) or (7,)
+        Base of this submap in the target's base frame.
+    covariance : (d, d)
+        Right tangent.
+    fitness : float
+        Registration fitness in [0, 1].
+    support : float
+        Share of particle weight that took this match; the null match has the rest.
+    """
+
+    target: int
+    T_target_here: Array
+    covariance: Array
+    fitness: float
+    support: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Submap:
+    """A local map in the frame of its first pose.
+
+    Parameters
+    ----------
+    key : int
+    interval : (t_start, t_end)
+        Seconds.
+    exit_pose : (3,) or (7,)
+        ``T_start_end``.
+    exit_covariance : (d, d)
+        Right tangent at the exit, GTSAM order.
+    landmarks : LandmarkMap or None
+    trajectory : Trajectory or None
+        ``T_start_body(t)``.
+    grid, cloud : payload or None
+        In the base frame.
+    matches : tuple of Match
+    uses : frozenset of str
+        Streams whose information is already inside.
+    report : mapping
+        What the front end says of this map: why it ended, honesty figures, counts. JSON-serialisable.
+    """
+
+    key: int
+    interval: tuple[float, float]
+    exit_pose: Array
+    exit_covariance: Array
+    landmarks: LandmarkMap | None = None
+    trajectory: Trajectory | None = None
+    grid: DensePayload | None = None
+    cloud: Array | None = None
+    matches: tuple[Match, ...] = ()
+    uses: frozenset[str] = frozenset()
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        d = 3 if len(self.exit_pose) == 3 else 6
+        object.__setattr__(self, "exit_pose", np.ascontiguousarray(self.exit_pose, dtype=np.float64))
+        object.__setattr__(
+            self,
+            "exit_covariance",
+            check_covariance(self.exit_covariance, what=f"exit covariance of submap {self.key}", dim=d),
+        )
+        t0, t1 = self.interval
+        if not t1 > t0:
+            raise GeometryError(f"interval of submap {self.key} is empty", got=self.interval, wanted="t_end > t_start")
+
+    @classmethod
+    def from_landmarks(
+        cls, key: int, landmarks: LandmarkMap, *, interval: tuple[float, float] | None = None, **rest: Any
+    ) -> Submap:
+        """A landmark submap; its exit is derived from the joint Gaussian. Without a clock the interval is [k, k+1]."""
+        P = landmarks.dense_covariance()
+        d = 3 if landmarks.dim == 2 else 6
+        exit_cov = P[:d, :d]
+        if landmarks.dim == 2:
+            exit_cov = vector_to_tangent_covariance(landmarks.exit_pose, exit_cov)
+        return cls(
+            key=key,
+            interval=interval or (float(key), float(key + 1)),
+            exit_pose=landmarks.exit_pose,
+            exit_covariance=exit_cov,
+            landmarks=landmarks,
+            **rest,
+        )
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return 2 if len(self.exit_pose) == 3 else 3
+
+    def with_ids(self, ids: npt.ArrayLike) -> Submap:
+        """The same submap with its landmarks identified as ``ids`` ``(n,)``."""
+        if self.landmarks is None:
+            raise GeometryError(f"submap {self.key} has no landmarks to identify")
+        return replace(self, landmarks=replace(self.landmarks, ids=np.asarray(ids, dtype=np.int64)))
+
+    def _repr_html_(self) -> str:
+        s = np.sqrt(np.diag(self.exit_covariance))
+        n = 0 if self.landmarks is None else len(self.landmarks)
+        facts = "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in self.report.items())
+        return (
+            f"<b>Submap {self.key}</b> [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
+            f"exit {np.array2string(self.exit_pose, precision=3)} σ {np.array2string(s, precision=4)}"
+            f"<table>{facts}</table>"
+        )

@@ -1,0 +1,118 @@
+"""Times, poses and covariances of a path, in two or three dimensions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_compose, se2_exp, se2_log, se2_transform
+from graphslam.core.records import check_times
+
+Index = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A path ``T_frame_body(t)``.
+
+    Parameters
+    ----------
+    times : (n,)
+        Strictly increasing [s].
+    poses : (n, 3) or (n, 7)
+    covariances : (n, d, d) or None
+        Right tangent, GTSAM order; d = 3 or 6.
+    """
+
+    times: Array
+    poses: Array
+    covariances: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times, len(self.poses), where="trajectory"))
+        poses = np.ascontiguousarray(self.poses, dtype=np.float64)
+        if poses.ndim != 2 or poses.shape[1] not in (3, 7):
+            raise GeometryError("trajectory poses have the wrong shape", got=poses.shape, wanted="(n, 3) or (n, 7)")
+        if not np.all(np.isfinite(poses)):
+            k = int(np.argwhere(~np.isfinite(poses))[0][0])
+            raise GeometryError(f"trajectory pose {k} is not finite", got=poses[k])
+        object.__setattr__(self, "poses", poses)
+        if self.covariances is not None:
+            d = 3 if poses.shape[1] == 3 else 6
+            C = np.ascontiguousarray(self.covariances, dtype=np.float64)
+            if C.shape != (len(poses), d, d):
+                raise GeometryError(
+                    "trajectory covariances have the wrong shape", got=C.shape, wanted=(len(poses), d, d)
+                )
+            object.__setattr__(self, "covariances", C)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return 2 if self.poses.shape[1] == 3 else 3
+
+    @property
+    def positions(self) -> Array:
+        """``(n, dim)``."""
+        return self.poses[:, : self.dim]
+
+    def _bracket(self, t: ArrayLike, max_gap: float | None) -> tuple[Index, Index, Array]:
+        q = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        if len(self) == 0 or np.any((q < self.times[0]) | (q > self.times[-1])):
+            span = f"[{self.times[0]:.3f}, {self.times[-1]:.3f}]" if len(self) else "an empty trajectory"
+            raise DataError("time outside the trajectory", got=f"[{q.min():.3f}, {q.max():.3f}]", wanted=span)
+        j = np.clip(np.searchsorted(self.times, q, side="right"), 1, max(len(self) - 1, 1))
+        i = j - 1
+        if len(self) == 1:
+            j = i
+        span_s = self.times[j] - self.times[i]
+        u = np.where(span_s > 0, (q - self.times[i]) / np.where(span_s > 0, span_s, 1.0), 0.0)
+        if max_gap is not None and np.any((span_s > max_gap) & (u > 0) & (u < 1)):
+            raise DataError(
+                "time falls in a gap of the trajectory", got=f"{span_s.max():.3f} s", wanted=f"≤ {max_gap} s"
+            )
+        return np.asarray(i), np.asarray(j), np.asarray(u, dtype=np.float64)
+
+    def interpolate(self, t: ArrayLike, *, max_gap: float | None = None) -> Array:
+        """Poses at times ``t`` ``(q,)`` along the geodesic between neighbours, position *and* heading.
+
+        Raises
+        ------
+        DataError
+            Outside the trajectory, or (with ``max_gap``) inside a gap longer than it.
+        """
+        i, j, u = self._bracket(t, max_gap)
+        a, b = self.poses[i], self.poses[j]
+        if self.dim == 2:
+            return se2_compose(a, se2_exp(u[:, None] * se2_log(se2_between(a, b))))
+        return se3.se3_compose(a, se3.se3_exp(u[:, None] * se3.se3_log(se3.se3_between(a, b))))
+
+    def interpolate_covariance(self, t: ArrayLike) -> Array:
+        """Covariances ``(q, d, d)`` at ``t``, linear between neighbours (an upper bound inside a submap's step)."""
+        if self.covariances is None:
+            raise DataError("trajectory has no covariances", wanted="covariances")
+        i, j, u = self._bracket(t, None)
+        w = u[:, None, None]
+        return (1.0 - w) * self.covariances[i] + w * self.covariances[j]
+
+    def points(self, lever: ArrayLike) -> Array:
+        """World positions ``(n, dim)`` of a point fixed in the body at ``lever`` ``(dim,)``."""
+        if self.dim == 2:
+            return se2_transform(self.poses, np.broadcast_to(lever, (len(self), 2)))
+        return se3.se3_transform(self.poses, np.broadcast_to(lever, (len(self), 3)))
+
+    def transformed(self, T_new_frame: ArrayLike) -> Trajectory:
+        """The same path in another frame; right-tangent covariances do not change."""
+        f = se2_compose if self.dim == 2 else se3.se3_compose
+        return replace(self, poses=f(np.broadcast_to(T_new_frame, self.poses.shape), self.poses))
+
+    def length(self) -> float:
+        """Length of the path [m]."""
+        return float(np.sum(np.linalg.norm(np.diff(self.positions, axis=0), axis=1))) if len(self) > 1 else 0.0

@@ -1,0 +1,1 @@
+"""Storey 4: consistency (NEES, CI) and trajectory errors."""

@@ -1,0 +1,77 @@
+"""A landmark submap as one measurement of global quantities (Combined SLAM B6, eq. 15), in plain numpy.
+
+Two parametrisations share one residual: the *vector* form perturbs (x, y, θ) of a pose in the world frame, as the
+paper and its information filter do; the *tangent* form perturbs on the right, as GTSAM does. They differ by the
+rotation of the position part, so ``J_tangent = J_vector · blkdiag(R(θ), 1)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.geometry import Array, rotation2, wrap_angle
+
+
+def predict_submap(start: Array, end: Array, landmarks: Array) -> Array:
+    """``H(X)`` of eq. 15: what a submap starting at ``start`` (3,) would report.
+
+    Parameters
+    ----------
+    start, end : (3,)
+        World poses x_k and x_{k+1}.
+    landmarks : (n, 2)
+        World positions.
+
+    Returns
+    -------
+    (3 + 2n,)
+        ``[R(θ_s)ᵀ (p_e - p_s); wrap(θ_e - θ_s); R(θ_s)ᵀ (f_1 - p_s); …]``.
+    """
+    R = rotation2(start[2])
+    out = np.empty(3 + 2 * len(landmarks))
+    out[:2] = (end[:2] - start[:2]) @ R  # row vector times R is Rᵀ v
+    out[2] = wrap_angle(end[2] - start[2])
+    out[3:] = ((landmarks - start[:2]) @ R).ravel()
+    return out
+
+
+def submap_residual(start: Array, end: Array, landmarks: Array, z: Array) -> Array:
+    """``H(X) - z`` with the heading wrapped, ``(3 + 2n,)``."""
+    r = predict_submap(start, end, landmarks) - z
+    r[2] = wrap_angle(r[2])
+    return r
+
+
+def submap_jacobians(start: Array, end: Array, landmarks: Array, *, tangent: bool) -> tuple[Array, Array, Array]:
+    """Jacobians of :func:`predict_submap`.
+
+    Parameters
+    ----------
+    tangent : bool
+        With respect to the right tangents of the poses (GTSAM) instead of their (x, y, θ) vectors.
+
+    Returns
+    -------
+    J_start : (3 + 2n, 3)
+    J_end : (3 + 2n, 3)
+        Only its first three rows are non-zero.
+    J_landmark : (2, 2)
+        The same ``R(θ_s)ᵀ`` for every landmark, in that landmark's own two rows.
+    """
+    n = len(landmarks)
+    Rt = rotation2(start[2]).T
+    p = np.empty((1 + n, 2))
+    p[0] = end[:2] - start[:2]
+    p[1:] = landmarks - start[:2]
+    q = p @ Rt.T  # everything in the start frame
+    dq = np.stack([q[:, 1], -q[:, 0]], -1)  # d(Rᵀ v)/dθ_s = Rᵀ rotated by -90°
+    J_start = np.zeros((3 + 2 * n, 3))
+    A = -np.eye(2) if tangent else -Rt
+    J_start[0:2, :2], J_start[0:2, 2] = A, dq[0]
+    J_start[2, 2] = -1.0
+    J_start[3:, :2] = np.tile(A, (n, 1))
+    J_start[3:, 2] = dq[1:].ravel()
+    J_end = np.zeros((3 + 2 * n, 3))
+    J_end[:2, :2] = Rt @ rotation2(end[2]) if tangent else Rt
+    J_end[2, 2] = 1.0
+    return J_start, J_end, Rt

@@ -1,0 +1,1 @@
+"""Storey 3: classical submap joiners (EIF in sequence and by binary tree, EKF) and landmark association."""

@@ -1,0 +1,35 @@
+"""Shared fixtures: recorded data, seeded randomness."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+
+matplotlib.use("Agg")
+
+
+def data_root() -> Path | None:
+    """Folder of recorded data (GRAPHSLAM_DATA), or None."""
+    value = os.environ.get("GRAPHSLAM_DATA")
+    return Path(value) if value and Path(value).is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Recorded data; skips with the reason where it is missing (in CI it is there, so a skip there is a failure)."""
+    root = data_root()
+    if root is None:
+        if os.environ.get("CI"):
+            pytest.fail("GRAPHSLAM_DATA is not set or not a folder, and this is CI")
+        pytest.skip("recorded data not found: set GRAPHSLAM_DATA to the folder that holds victoria_park_raw/ etc.")
+    return root
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Generator seeded by the test's name: independent of order."""
+    return np.random.default_rng(list(request.node.nodeid.encode()))

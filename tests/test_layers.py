@@ -1,0 +1,96 @@
+"""The storeys of the house: a module imports only from its own package or from a lower storey."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+STOREY = {
+    "graphslam.core": 0,
+    "graphslam.evidence": 1,
+    "graphslam.registration": 1,
+    "graphslam.graph": 2,
+    "frontends": 2,
+    "graphslam.solve": 3,
+    "graphslam.join": 3,
+    "graphslam.maps": 4,
+    "graphslam.evaluate": 4,
+    "graphslam.io": 4,
+    "graphslam.sim": 4,
+    "graphslam.plots": 5,
+    "graphslam.app": 6,
+}
+# third-party packages and the only places that may import them
+CONFINED = {
+    "gtsam": ("graphslam/graph/", "graphslam/solve/", "graphslam/io/g2o"),
+    "matplotlib": ("graphslam/plots/",),
+    "typer": ("graphslam/app/",),
+    "open3d": (),
+}
+FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])
+
+
+def package_of(module: str) -> str | None:
+    parts = module.split(".")
+    if parts[0] == "frontends":
+        return "frontends"
+    return ".".join(parts[:2]) if parts[0] == "graphslam" and len(parts) > 1 else None
+
+
+def imports(path: Path) -> list[str]:
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            found += [f"{node.module}.{a.name}" for a in node.names]
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_module_imports_only_own_package_or_below(path: Path) -> None:
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    own = package_of(module)
+    if own is None:  # graphslam/__init__.py offers the verbs lazily and imports nothing of ours
+        assert not [i for i in imports(path) if i.startswith(("graphslam", "frontends"))]
+        return
+    for name in imports(path):
+        target = package_of(name)
+        if target in STOREY and target != own:
+            assert STOREY[target] < STOREY[own], (
+                f"{module} (storey {STOREY[own]}) imports {name} (storey {STOREY[target]})"
+            )
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_heavy_packages_stay_in_their_rooms(path: Path) -> None:
+    rel = str(path.relative_to(ROOT))
+    for name in imports(path):
+        top = name.split(".")[0]
+        if top in CONFINED:
+            assert rel.startswith(CONFINED[top]), f"{rel} imports {name}"
+        if top == "numba":
+            assert path.name == "kernels.py" or path.name.endswith("_kernels.py"), f"{rel} imports numba"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_file_outgrows_a_head(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 420
+
+
+def test_every_package_has_a_storey() -> None:
+    packages = {package_of(".".join(p.relative_to(ROOT).with_suffix("").parts)) for p in FILES} - {None}
+    assert {p for p in packages if p != "graphslam.__init__"} <= set(STOREY)
+
+
+def test_importing_graphslam_imports_nothing_heavy() -> None:
+    heavy = ("gtsam", "open3d", "matplotlib", "numba", "scipy")
+    code = f"import sys, graphslam; print([m for m in {heavy} if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
