@@ -1,0 +1,109 @@
+"""Files that are either whole or not there, and npz archives that are either read fully or refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from graphslam.core.errors import FormatError, MissingDataError
+
+
+@contextmanager
+def atomic_open(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
+    """Write to a temporary name in the same folder; rename on success, remove on failure.
+
+    A reader, or a run that was killed, sees the old file or the new one, never half of one.
+    """
+    target = Path(path)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})) as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes files private; ours are as any other
+        temporary.replace(target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
+    """Write arrays as a compressed npz, atomically. The same arrays give the same bytes."""
+    for name, value in arrays.items():
+        if np.asarray(value).dtype.hasobject:
+            raise FormatError(f"array {name!r} holds Python objects", where=str(path), wanted="numbers or strings")
+    with atomic_open(path) as stream:
+        np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})  # type: ignore[arg-type]
+
+
+def read_npz(path: str | os.PathLike[str], *, fmt: str) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
+
+    Raises
+    ------
+    MissingDataError
+        No such file.
+    FormatError
+        Truncated, corrupt, holding pickled objects, or of another format.
+    """
+    where = str(path)
+    if not Path(path).is_file():
+        raise MissingDataError("no such file", where=where)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError, NotImplementedError) as error:
+        raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None
+    except AttributeError:  # np.load gives a bare array for a .npy
+        raise FormatError("not an npz archive", where=where) from None
+    check_format(str(arrays.get("format", "none")), fmt, where=where)
+    return arrays
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write JSON atomically; NaN and infinities are refused, because JSON has none."""
+    try:
+        text = json.dumps(value, indent=1, sort_keys=False, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"cannot be written as JSON ({error})", where=str(path)) from None
+    with atomic_open(path, "w") as stream:
+        stream.write(text + "\n")
+
+
+def read_json(path: str | os.PathLike[str], *, fmt: str) -> dict[str, Any]:
+    """Read a JSON object whose key ``format`` says ``fmt``.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    where = str(path)
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingDataError("no such file", where=where) from None
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"not JSON, or truncated ({error})", where=where) from None
+    if not isinstance(value, dict):
+        raise FormatError("not a JSON object", where=where, got=type(value).__name__)
+    check_format(str(value.get("format", "none")), fmt, where=where)
+    return value
+
+
+def check_format(got: str, wanted: str, *, where: str) -> None:
+    """Refuse a file of another format or version."""
+    if got != wanted:
+        raise FormatError("unknown format", where=where, got=repr(got), wanted=repr(wanted))

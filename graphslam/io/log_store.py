@@ -1,0 +1,217 @@
+"""A sensor log on disk: a folder with ``log.json`` and one npz per stream (format ``graphslam.log/1``).
+
+``log.json`` holds name, meta, counts and the list of streams (name, kind, file, records); ``truth.npz`` holds the
+truth where it is known. Every number comes back bit for bit. Nothing is pickled; ``log.json`` is written last, so a
+folder without it is an unfinished log.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import DataError, FormatError, GraphSlamError
+from graphslam.core.log import SensorLog, Truth
+from graphslam.core.records import AckermannGeometry, Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.atomic import read_json, read_npz, write_json, write_npz
+
+LOG_FORMAT = "graphslam.log/1"
+STREAM_FORMAT = "graphslam.stream/1"
+TRUTH_FORMAT = "graphslam.truth/1"
+INDEX_NAME = "log.json"
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+
+Arrays = Mapping[str, Any]
+
+# kind -> (class, arrays stored under the field's own name); what is not a plain array is packed below
+_FIELDS: dict[str, tuple[type, tuple[str, ...]]] = {
+    "laser-scans": (LaserScans, ("times", "ranges", "bearings", "T_base_sensor")),
+    "steering-controls": (SteeringControls, ("times", "speed", "steering")),
+    "odometry": (Odometry, ("times", "increments", "covariances")),
+    "gps": (Gps, ("times", "positions", "sigma", "lever")),
+    "landmark-observations": (
+        LandmarkObservations,
+        ("times", "offsets", "ranges", "bearings", "sigmas", "T_base_sensor"),
+    ),
+}
+
+
+def _extra_arrays(stream: Any) -> dict[str, Any]:
+    """Fields that are no arrays, as arrays."""
+    match stream:
+        case LaserScans():
+            return {"max_range": np.float64(stream.max_range)}
+        case SteeringControls():
+            g = stream.geometry
+            return {
+                "wheelbase": np.float64(g.wheelbase),
+                "encoder_offset": np.float64(g.encoder_offset),
+                "model": np.str_(g.model),
+            }
+        case LandmarkObservations():
+            extra = {"max_range": np.float64(stream.max_range), "field_of_view": np.array(stream.field_of_view)}
+            return extra if stream.ids is None else {**extra, "ids": stream.ids}
+        case _:
+            return {}
+
+
+def _extra_fields(kind: str, a: Arrays) -> dict[str, Any]:
+    """Inverse of :func:`_extra_arrays`."""
+    if kind == "laser-scans":
+        return {"max_range": float(a["max_range"])}
+    if kind == "steering-controls":
+        geometry = AckermannGeometry(
+            wheelbase=float(a["wheelbase"]), encoder_offset=float(a["encoder_offset"]), model=str(a["model"])
+        )
+        return {"geometry": geometry}
+    if kind == "landmark-observations":
+        low, high = (float(v) for v in a["field_of_view"])
+        return {"max_range": float(a["max_range"]), "field_of_view": (low, high), "ids": a.get("ids")}
+    return {}
+
+
+def _kind_of(stream: Any, where: str) -> str:
+    for kind, (cls, _) in _FIELDS.items():
+        if type(stream) is cls:
+            return kind
+    raise FormatError("stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=_FIELDS)
+
+
+def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
+    """Write ``log`` into ``folder`` (made if missing; an older log there is replaced).
+
+    Raises
+    ------
+    FormatError
+        A stream's name is no file name, its kind is unknown, or ``meta`` is not JSON.
+    """
+    root = Path(folder)
+    root.mkdir(parents=True, exist_ok=True)
+    (root / INDEX_NAME).unlink(missing_ok=True)  # from here to the last line the folder is no log
+    entries = []
+    for name, stream in log.streams.items():
+        where = f"{root}, stream {name!r}"
+        if not _SAFE_NAME.fullmatch(name) or name.lower() == "truth":
+            raise FormatError("stream name is no file name", where=where, wanted="letters, digits, _ . - (not truth)")
+        kind = _kind_of(stream, where)
+        arrays = {f: getattr(stream, f) for f in _FIELDS[kind][1]}
+        header = {"format": STREAM_FORMAT, "kind": kind}
+        write_npz(root / f"{name}.npz", {**header, **arrays, **_extra_arrays(stream)})
+        entries.append({"name": name, "kind": kind, "file": f"{name}.npz", "records": len(stream.times)})
+    if log.truth is not None:
+        write_npz(root / "truth.npz", _truth_arrays(log.truth))
+    index = {
+        "format": LOG_FORMAT,
+        "name": log.name,
+        "streams": entries,
+        "truth": "truth.npz" if log.truth is not None else None,
+        "read": {k: int(v) for k, v in log.read.items()},
+        "dropped": {k: int(v) for k, v in log.dropped.items()},
+        "meta": dict(log.meta),
+    }
+    write_json(root / INDEX_NAME, index)
+    return root
+
+
+def load_log(folder: str | os.PathLike[str]) -> SensorLog:
+    """Read a log written by :func:`save_log`.
+
+    Raises
+    ------
+    MissingDataError
+        No such folder, no ``log.json`` in it, or a listed file is not there.
+    FormatError
+        Unknown format or kind, truncated or corrupt file, or a record that its own class refuses; names the file.
+    """
+    root = Path(folder)
+    index_path = root / INDEX_NAME
+    index = read_json(index_path, fmt=LOG_FORMAT)
+    where = str(index_path)
+    streams = {}
+    for entry in _get(index, "streams", list, where):
+        name, file, kind, records = (_get(entry, k, t, where) for k, t in _ENTRY)
+        path = _inside(root, file, where)
+        arrays = read_npz(path, fmt=STREAM_FORMAT)
+        if kind not in _FIELDS or str(arrays.get("kind")) != kind:
+            raise FormatError(
+                "unknown stream kind", where=str(path), got=f"{arrays.get('kind')} listed as {kind!r}", wanted=kind
+            )
+        streams[name] = _build(str(path), lambda a=arrays, k=kind: _stream(k, a))  # type: ignore[misc]
+        if len(streams[name].times) != records:
+            raise FormatError("wrong number of records", where=str(path), got=len(streams[name].times), wanted=records)
+    truth = None
+    if index.get("truth") is not None:
+        path = _inside(root, _get(index, "truth", str, where), where)
+        truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT)))
+    return SensorLog(
+        name=_get(index, "name", str, where),
+        streams=streams,
+        truth=truth,
+        read=_get(index, "read", dict, where),
+        dropped=_get(index, "dropped", dict, where),
+        meta=_get(index, "meta", dict, where),
+    )
+
+
+_ENTRY: tuple[tuple[str, type], ...] = (("name", str), ("file", str), ("kind", str), ("records", int))
+
+
+def _stream(kind: str, arrays: Arrays) -> Any:
+    cls, names = _FIELDS[kind]
+    return cls(**{n: arrays[n] for n in names}, **_extra_fields(kind, arrays))
+
+
+def _truth_arrays(truth: Truth) -> dict[str, Any]:
+    t = truth.trajectory
+    arrays = {
+        "format": TRUTH_FORMAT,
+        "times": t.times,
+        "poses": t.poses,
+        "landmark_ids": truth.landmark_ids,
+        "landmarks": truth.landmarks,
+    }
+    return arrays if t.covariances is None else {**arrays, "covariances": t.covariances}
+
+
+def _truth(a: Arrays) -> Truth:
+    return Truth(
+        trajectory=Trajectory(a["times"], a["poses"], a.get("covariances")),
+        landmark_ids=a["landmark_ids"],
+        landmarks=a["landmarks"],
+    )
+
+
+def _build(where: str, make: Callable[[], Any]) -> Any:
+    """Run a constructor on what a file held; whatever it does not like is the file's fault."""
+    try:
+        return make()
+    except FormatError:
+        raise
+    except KeyError as error:
+        raise FormatError(f"array {error} is missing", where=where) from None
+    except (DataError, ValueError, TypeError, IndexError, AttributeError) as error:
+        if isinstance(error, DataError) and error.where == where:
+            raise
+        raise FormatError(f"holds an impossible record ({error})", where=where) from error
+    except GraphSlamError:
+        raise
+
+
+def _get(mapping: Any, key: str, kind: type, where: str) -> Any:
+    value = mapping.get(key) if isinstance(mapping, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise FormatError(f"key {key!r} is missing or of the wrong type", where=where, wanted=kind.__name__)
+    return value
+
+
+def _inside(root: Path, file: str, where: str) -> Path:
+    """A file name of the index, which must not lead out of the folder."""
+    if not _SAFE_NAME.fullmatch(file):
+        raise FormatError("file name leads out of the log", where=where, got=repr(file), wanted="a plain file name")
+    return root / file

@@ -1,0 +1,100 @@
+"""Trajectories as TUM text: one line ``t x y z qx qy qz qw`` per pose, seconds and metres.
+
+2-D poses are embedded in the plane z = 0 (the rotation about z is the heading).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.core import se3
+from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.atomic import atomic_open
+
+# Files in the wild print quaternions with as few as three digits.
+_NORM_TOLERANCE = 1e-2
+
+
+def embed_plane(poses: Array) -> Array:
+    """Poses ``(n, 3)`` of the plane as ``(n, 7)``: z = 0, rotation about z."""
+    half = poses[:, 2] / 2.0
+    out = np.zeros((len(poses), 7))
+    out[:, :2] = poses[:, :2]
+    out[:, 5], out[:, 6] = np.sin(half), np.cos(half)
+    return out
+
+
+def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write a trajectory, atomically; 17 digits, so stamps and positions come back bit for bit."""
+    poses = embed_plane(trajectory.poses) if trajectory.dim == 2 else trajectory.poses
+    rows = np.column_stack([trajectory.times, poses])
+    with atomic_open(path, "w") as stream:
+        stream.write("# t x y z qx qy qz qw\n")
+        np.savetxt(stream, rows, fmt="%.17g")
+
+
+def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Trajectory:
+    """Read a trajectory.
+
+    Parameters
+    ----------
+    path : path
+        Lines that are empty or start with ``#`` are skipped.
+    dim : 2, 3 or None
+        None: 2 if every pose has z = 0 and rotates about z only, else 3.
+
+    Raises
+    ------
+    MissingDataError
+        No such file.
+    FormatError
+        Wrong number of columns, not a number, not finite, no unit quaternion, time not increasing, or poses out of
+        the plane with ``dim=2``; names the line.
+    """
+    where = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise MissingDataError("no such file", where=where) from None
+    except UnicodeDecodeError:
+        raise FormatError("not a text file", where=where) from None
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) != 8:
+            raise FormatError(
+                "wrong number of columns", where=f"{where}:{number}", got=len(fields), wanted="t x y z qx qy qz qw"
+            )
+        try:
+            rows.append([float(f) for f in fields])
+        except ValueError as error:
+            raise FormatError(f"not a number ({error})", where=f"{where}:{number}") from None
+        lines.append(number)
+    data = np.array(rows).reshape(-1, 8)
+    _refuse(~np.all(np.isfinite(data), axis=1), "not finite", where, lines, rows)
+    norm = np.linalg.norm(data[:, 4:], axis=1)
+    _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
+    _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "time does not increase", where, lines, data[:, 0])
+    off_plane = np.any(data[:, 3:6] != 0.0, axis=1)
+    if dim is None:
+        dim = 3 if np.any(off_plane) or not len(data) else 2
+    if dim == 3:
+        quat = se3.quat_normalize(data[:, 4:]) if len(data) else data[:, 4:]
+        return Trajectory(data[:, 0], np.column_stack([data[:, 1:4], quat]))
+    _refuse(off_plane, "pose leaves the plane z = 0", where, lines, rows)
+    heading = wrap_angle(2.0 * np.arctan2(data[:, 6], data[:, 7]))
+    return Trajectory(data[:, 0], np.column_stack([data[:, 1:3], heading]))
+
+
+def _refuse(bad: np.ndarray, what: str, where: str, lines: list[int], got: object) -> None:
+    if np.any(bad):
+        k = int(np.flatnonzero(bad)[0])
+        raise FormatError(what, where=f"{where}:{lines[k]}", got=got[k])  # type: ignore[index]
