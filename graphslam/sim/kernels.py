@@ -6,9 +6,21 @@ import math
 
 import numba
 
+from graphslam.core.geometry import Array
+
 
 @numba.njit(cache=True, error_model="numpy")
-def follow_route_kernel(route, look_ahead, speed, dt, wheelbase, max_steering, max_step, poses, steering):
+def follow_route_kernel(
+    route: Array,
+    look_ahead: float,
+    speed: float,
+    dt: float,
+    wheelbase: float,
+    max_steering: float,
+    max_step: float,
+    poses: Array,
+    steering: Array,
+) -> None:
     """Drive a front-steered vehicle after a carrot on a closed polyline.
 
     route : (m, 2) closed polyline (first point not repeated), densely sampled against ``look_ahead``.

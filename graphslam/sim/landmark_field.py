@@ -29,6 +29,12 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.sim.vehicle import follow_route, offset_from_route, wavy_loop
 
 
+_POSITIVE = (
+    *("lap_length", "laps", "wheelbase", "speed", "control_rate", "max_steering", "steering_rate", "look_ahead"),
+    *("max_range", "scan_rate", "sigma_speed", "sigma_steering", "sigma_range", "sigma_bearing", "gps_sigma"),
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkFieldConfig:
     """World, vehicle, sensors and noise of the landmark field; the defaults are world ``A``."""
@@ -103,15 +109,11 @@ class LandmarkFieldConfig:
             value = tuple(float(v) for v in getattr(self, name))
             self._require(name, len(value) == n and all(map(math.isfinite, value)), f"{n} finite numbers")
             object.__setattr__(self, name, value)
-        positive = (
-            "lap_length laps wheelbase speed control_rate max_steering steering_rate look_ahead max_range "
-            "scan_rate sigma_speed sigma_steering sigma_range sigma_bearing gps_sigma"
-        ).split()
-        for name in positive:
+        for name in _POSITIVE:
             self._require(name, getattr(self, name) > 0, "> 0")
         for name in ("route_waves", "landmarks", "min_range", "clutter_rate", "noise_scale", "gps_rate"):
             self._require(name, getattr(self, name) >= 0, "≥ 0")
-        for name in positive + ["clutter_rate", "noise_scale", "gps_rate", "lateral_max"]:
+        for name in [*_POSITIVE, "clutter_rate", "noise_scale", "gps_rate", "lateral_max"]:
             self._require(name, math.isfinite(getattr(self, name)), "a finite number")
         self._require("route_amplitude", 0 <= self.route_amplitude < 1, "in [0, 1)")
         self._require("lateral_min", 0 <= self.lateral_min <= self.lateral_max, "in [0, lateral_max]")
