@@ -28,7 +28,6 @@ from graphslam.core.records import AckermannGeometry, Gps, LandmarkObservations,
 from graphslam.core.trajectory import Trajectory
 from graphslam.sim.vehicle import follow_route, offset_from_route, wavy_loop
 
-
 _POSITIVE = (
     *("lap_length", "laps", "wheelbase", "speed", "control_rate", "max_steering", "steering_rate", "look_ahead"),
     *("max_range", "scan_rate", "sigma_speed", "sigma_steering", "sigma_range", "sigma_bearing", "gps_sigma"),

@@ -1,0 +1,252 @@
+"""Is an estimator honest about its own error? NEES, consistency index, coverage: each with two-sided bounds.
+
+Combined SLAM (2012): ``D² = (x - x̂)ᵀ P⁻¹ (x - x̂)`` (eq. 18), consistent if ``D² < χ²_{n,1-α}`` (eq. 19), index
+``CI = D²/χ²_{n,1-α}`` (eq. 20). ``CI < 1`` alone is a weak test: with three degrees of freedom it passes an
+estimator whose covariance is 2.6 times too small, and it never complains of a pessimistic one. The verdict here
+therefore rests on the *mean* NEES over independent runs and its two-sided χ² bounds; CI is reported beside it.
+
+Poses are judged by their right-tangent error ``ξ = Log(T_est⁻¹ T_true)`` in GTSAM's order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg as sla
+import scipy.sparse as sp
+from scipy import stats
+
+from graphslam.core import se3
+from graphslam.core.errors import CovarianceError, DataError
+from graphslam.core.gaussian import check_covariance, chi2_mean_bounds, chi2_quantile
+from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_log, wrap_angle
+
+Unit = Literal["run", "value"]
+Verdict = Literal["consistent", "over-confident", "pessimistic"]
+
+
+def pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
+    """Right-tangent errors ``Log(T_est⁻¹ T_true)`` ``(..., 3)`` or ``(..., 6)`` of poses ``(..., 3)`` or ``(..., 7)``."""
+    e, t = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if e.shape[-1] != t.shape[-1] or e.shape[-1] not in (3, 7):
+        raise DataError("poses of estimate and truth differ in kind", got=(e.shape, t.shape), wanted="(..., 3) or 7")
+    return se2_log(se2_between(e, t)) if e.shape[-1] == 3 else se3.se3_log(se3.se3_between(e, t))
+
+
+def vector_pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
+    """Errors ``truth - estimate`` of the vectors (x, y, θ), heading wrapped: the form of Combined SLAM eq. 15."""
+    d = np.asarray(truth, dtype=np.float64) - np.asarray(estimate, dtype=np.float64)
+    d[..., 2] = wrap_angle(d[..., 2])
+    return d
+
+
+def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
+    """``D² = eᵀ P⁻¹ e`` (eq. 18) for errors ``(..., n)`` and covariances ``(..., n, n)``.
+
+    Raises
+    ------
+    CovarianceError
+        Where a covariance is not symmetric positive definite; names the first.
+    """
+    e, P = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    if P.shape[-2:] != (e.shape[-1], e.shape[-1]):
+        raise CovarianceError("covariance does not fit the error", got=P.shape, wanted=(*e.shape, e.shape[-1]))
+    flat = P.reshape(-1, *P.shape[-2:])
+    asymmetric = np.abs(flat - np.swapaxes(flat, -1, -2)).max(axis=(-1, -2), initial=0.0) > 1e-6 * np.abs(flat).max(
+        axis=(-1, -2), initial=1e-300
+    )
+    try:
+        if np.any(asymmetric) or not np.all(np.isfinite(flat)):
+            raise np.linalg.LinAlgError
+        L = np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        for k, one in enumerate(flat):
+            check_covariance(one, what=f"covariance {k}")
+        raise
+    y = np.linalg.solve(L, e[..., None])[..., 0]
+    return np.asarray(np.sum(y**2, axis=-1))
+
+
+def joint_nees(
+    error: ArrayLike, *, covariance: ArrayLike | None = None, information: sp.spmatrix | sp.sparray | None = None
+) -> float:
+    """NEES of one whole map: error ``(n,)`` with its dense covariance, or its sparse information matrix.
+
+    Raises
+    ------
+    CovarianceError
+    """
+    e = np.asarray(error, dtype=np.float64)
+    if (covariance is None) == (information is None):
+        raise CovarianceError("a joint NEES needs either a covariance or an information matrix")
+    if information is not None:
+        d2 = float(e @ (sp.csr_array(information) @ e))
+        if not d2 >= 0:
+            raise CovarianceError("information matrix is not positive semi-definite", got=f"eᵀ Λ e = {d2:.3g}")
+        return d2
+    c = sla.cho_factor(check_covariance(covariance, dim=len(e)), lower=True)  # type: ignore[arg-type]
+    return float(e @ sla.cho_solve(c, e))
+
+
+def consistency_index(d2: ArrayLike, dof: ArrayLike, *, confidence: float = 0.95) -> Array:
+    """``CI = D² / χ²_{n,1-α}`` (eq. 20), α = 1 - confidence. A perfect estimator has mean ``n/χ²``, not 1."""
+    return np.asarray(d2, dtype=np.float64) / stats.chi2.ppf(confidence, np.asarray(dof, dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Consistency:
+    """NEES values with everything that is needed to judge them.
+
+    Parameters
+    ----------
+    quantity : str
+        What was judged: "pose", "landmark", "joint" …
+    nees : (runs, k)
+        One row per independent run; nan where a value is missing.
+    dof : (runs, k)
+        Degrees of freedom n of each value.
+    gauge : str
+        How the frame was fixed, e.g. "first base fixed".
+    confidence : float
+        Of the two-sided bounds, and 1 - α of CI and coverage.
+    unit : {"run", "value"}
+        What is independent. ``run`` (default): values of one run may be correlated in any way (all features of a
+        map turn with its heading), so a run counts once. ``value``: all values are independent (local maps).
+    """
+
+    quantity: str
+    nees: Array
+    dof: Array
+    gauge: str
+    confidence: float = 0.95
+    unit: Unit = "run"
+
+    def __post_init__(self) -> None:
+        d2 = np.asarray(self.nees, dtype=np.float64)
+        d2 = d2.reshape(-1, 1) if d2.ndim < 2 else d2
+        dof = np.broadcast_to(np.asarray(self.dof, dtype=np.float64), d2.shape)
+        known = np.isfinite(d2)
+        if d2.ndim != 2 or not np.all(np.any(known, axis=1)) or not len(d2):
+            raise DataError("NEES needs runs with at least one value each", where=self.quantity, got=d2.shape)
+        if np.any(d2[known] < 0) or np.any(np.isinf(d2)):
+            raise DataError("NEES is negative or infinite", where=self.quantity, wanted="≥ 0, or nan where missing")
+        if np.any(dof[known] < 1):
+            raise DataError("degrees of freedom are not positive", where=self.quantity, got=float(dof[known].min()))
+        if not 0 < self.confidence < 1:
+            raise DataError(
+                "confidence is no probability", where=self.quantity, got=self.confidence, wanted="in (0, 1)"
+            )
+        if self.unit not in ("run", "value"):
+            raise DataError("unknown unit", where=self.quantity, got=self.unit, wanted="run or value")
+        object.__setattr__(self, "nees", d2)
+        object.__setattr__(self, "dof", dof)
+
+    @property
+    def runs(self) -> int:
+        """Number of independent runs."""
+        return len(self.nees)
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return int(np.sum(np.isfinite(self.nees)))
+
+    @property
+    def dimension(self) -> float:
+        """Degrees of freedom of a value; their mean where they differ."""
+        return float(np.mean(self.dof[np.isfinite(self.nees)]))
+
+    @property
+    def mean_normalised(self) -> float:
+        """Mean of ``D²/n``: 1 for an honest estimator, above it over-confident, below it pessimistic."""
+        if self.unit == "value":
+            known = np.isfinite(self.nees)
+            return float(np.sum(self.nees[known]) / np.sum(self.dof[known]))
+        return float(np.mean(np.nanmean(self.nees / self.dof, axis=1)))
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Two-sided bounds of :attr:`mean_normalised` for an honest estimator.
+
+        Values inside a run are taken as fully correlated with ``unit="run"``: then the mean over a run is
+        distributed as one ``χ²_n/n``. With any weaker correlation the bounds are wide, never narrow.
+        """
+        known = np.isfinite(self.nees)
+        if self.unit == "value":
+            total = float(np.sum(self.dof[known]))
+            low, high = chi2_mean_bounds(total, 1, self.confidence)
+            return low / total, high / total
+        n = float(np.min(self.dof[known]))
+        low, high = chi2_mean_bounds(n, self.runs, self.confidence)
+        return low / n, high / n
+
+    @property
+    def verdict(self) -> Verdict:
+        """``over-confident`` above the bounds, ``pessimistic`` below, else ``consistent``."""
+        low, high = self.bounds
+        m = self.mean_normalised
+        return "over-confident" if m > high else "pessimistic" if m < low else "consistent"
+
+    @property
+    def index(self) -> Array:
+        """Consistency index of each value ``(runs, k)`` (eq. 20)."""
+        return consistency_index(self.nees, self.dof, confidence=self.confidence)
+
+    @property
+    def coverage(self) -> float:
+        """Share of values inside their ``confidence`` region (eq. 19)."""
+        known = np.isfinite(self.nees)
+        return float(np.mean(self.index[known] < 1.0))
+
+    @property
+    def coverage_bounds(self) -> tuple[float, float]:
+        """Two-sided binomial bounds of :attr:`coverage` for an honest estimator, by number of independent units."""
+        n = self.runs if self.unit == "run" else self.count
+        a = (1.0 - self.confidence) / 2.0
+        binom = stats.binom(n, self.confidence)
+        return float(binom.ppf(a) / n), float(binom.ppf(1.0 - a) / n)
+
+    def curve(self) -> tuple[Array, Array, Array]:
+        """Mean over the runs of ``D²/n`` per column, with its lower and upper bounds, each ``(k,)``.
+
+        Columns are usually submaps: is the estimator still honest there? Only runs that have a value count.
+        """
+        runs = np.sum(np.isfinite(self.nees), axis=0)
+        if np.any(runs == 0):
+            raise DataError("a column has no value", where=self.quantity, got=int(np.argmin(runs)))
+        mean = np.nanmean(self.nees / self.dof, axis=0)
+        n = np.where(np.isfinite(self.nees), self.dof, np.inf).min(axis=0)
+        a = (1.0 - self.confidence) / 2.0
+        low, high = (stats.chi2.ppf(q, n * runs) / (n * runs) for q in (a, 1.0 - a))
+        return mean, low, high
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of a table: the figures and, always, gauge, dimension, runs and confidence."""
+        low, high = self.bounds
+        index = self.index[np.isfinite(self.nees)]
+        return {
+            "quantity": self.quantity,
+            "nees_over_n": self.mean_normalised,
+            "low": low,
+            "high": high,
+            "verdict": self.verdict,
+            "ci_mean": float(np.mean(index)),
+            "ci_median": float(np.median(index)),
+            "ci_honest": float(self.dimension / chi2_quantile(self.confidence, self.dimension)),
+            "coverage": self.coverage,
+            "dimension": self.dimension,
+            "runs": self.runs,
+            "values": self.count,
+            "unit": self.unit,
+            "confidence": self.confidence,
+            "gauge": self.gauge,
+        }
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><td>{k}</td><td>{f'{v:.4g}' if isinstance(v, float) else v}</td></tr>"
+            for k, v in self.as_row().items()
+        )
+        return f"<table>{cells}</table>"

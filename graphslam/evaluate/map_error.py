@@ -1,0 +1,143 @@
+"""Metric error of a map against its truth, with the gauge stated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_between, se2_compose, se2_transform, wrap_angle
+from graphslam.evaluate.statistics import ErrorStatistics
+
+Gauge = Literal["first-base", "rigid"]
+Index = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapError:
+    """Errors of landmarks or poses.
+
+    Parameters
+    ----------
+    quantity : str
+    gauge : {"first-base", "rigid"}
+        ``first-base``: both are in the frame of the first base; nothing is fitted. ``rigid``: the estimate was moved
+        onto the truth by least squares first, without scale.
+    T_truth_estimate : (3,) or (7,)
+        The transform that was applied; identity for ``first-base``.
+    errors : (n,)
+        Distances [m].
+    heading_errors : (n,) or None
+        Rotation angles [rad], poses only.
+    unmatched : int
+        Estimates without a truth.
+    """
+
+    quantity: str
+    gauge: Gauge
+    T_truth_estimate: Array
+    errors: Array
+    heading_errors: Array | None = None
+    unmatched: int = 0
+
+    @property
+    def statistics(self) -> ErrorStatistics:
+        """Of the distances [m]."""
+        return ErrorStatistics.of(self.errors)
+
+    @property
+    def heading_statistics(self) -> ErrorStatistics:
+        """Of the absolute rotation angles [rad]."""
+        if self.heading_errors is None:
+            raise DataError(f"{self.quantity} have no heading")
+        return ErrorStatistics.of(np.abs(self.heading_errors))
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of a table."""
+        row = {"quantity": self.quantity, "gauge": self.gauge, "unmatched": self.unmatched}
+        return {**row, **self.statistics.as_dict()}
+
+
+def match_ids(ids: ArrayLike, truth_ids: ArrayLike) -> tuple[Index, Index]:
+    """Indices ``(i, j)`` with ``ids[i] == truth_ids[j]``; negative ids match nothing.
+
+    An id may stand more than once among the estimates, not among the truth.
+    """
+    a, b = np.asarray(ids, dtype=np.int64), np.asarray(truth_ids, dtype=np.int64)
+    order = np.argsort(b, kind="stable")
+    s = b[order]
+    if len(s) and np.any(np.diff(s) == 0):
+        raise DataError("a true landmark stands twice", got=int(s[1:][np.diff(s) == 0][0]), wanted="unique ids")
+    if not len(s):
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    at = np.minimum(np.searchsorted(s, a), len(s) - 1)
+    i = np.flatnonzero((s[at] == a) & (a >= 0))
+    return i, order[at[i]]
+
+
+def fit_gauge(points: Array, truth: Array, gauge: Gauge) -> Array:
+    """``T_truth_estimate`` for points ``(n, 2)`` or ``(n, 3)``: identity, or the rigid least-squares fit."""
+    dim = points.shape[1]
+    if gauge == "first-base":
+        return np.zeros(3) if dim == 2 else np.array([0.0, 0, 0, 0, 0, 0, 1])
+    if gauge != "rigid":
+        raise DataError("unknown gauge", got=gauge, wanted="first-base or rigid")
+    if len(points) < dim:
+        raise DataError("too few points to align", got=len(points), wanted=f"at least {dim}")
+    return align_se2(points, truth) if dim == 2 else se3.align_se3(points, truth)[0]
+
+
+def landmark_error(
+    ids: ArrayLike,
+    positions: ArrayLike,
+    truth_ids: ArrayLike,
+    truth_positions: ArrayLike,
+    *,
+    gauge: Gauge = "first-base",
+) -> MapError:
+    """Distances of estimated landmarks ``(n, dim)`` to the true ones of the same id.
+
+    Raises
+    ------
+    DataError
+        No landmark has a truth, or too few for an alignment.
+    """
+    p, q = np.asarray(positions, dtype=np.float64), np.asarray(truth_positions, dtype=np.float64)
+    i, j = match_ids(ids, truth_ids)
+    if not len(i):
+        raise DataError("no landmark has a truth of the same id", got=len(p), wanted="common ids")
+    T = fit_gauge(p[i], q[j], gauge)
+    moved = se2_transform(T, p[i]) if p.shape[1] == 2 else se3.se3_transform(T, p[i])
+    return MapError(
+        quantity="landmarks",
+        gauge=gauge,
+        T_truth_estimate=T,
+        errors=np.linalg.norm(moved - q[j], axis=1),
+        unmatched=len(p) - len(i),
+    )
+
+
+def pose_map_error(poses: ArrayLike, truth: ArrayLike, *, gauge: Gauge = "first-base") -> MapError:
+    """Distances and rotation angles between poses ``(n, 3)`` or ``(n, 7)`` and true ones, row by row."""
+    p, q = np.asarray(poses, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if p.shape != q.shape or p.ndim != 2 or p.shape[1] not in (3, 7):
+        raise DataError("poses and truth differ in shape", got=(p.shape, q.shape), wanted="(n, 3) or (n, 7) each")
+    dim = 2 if p.shape[1] == 3 else 3
+    T = fit_gauge(p[:, :dim], q[:, :dim], gauge)
+    if dim == 2:
+        d = se2_between(se2_compose(T, p), q)
+        angle = np.abs(wrap_angle(d[:, 2]))
+    else:
+        d = se3.se3_between(se3.se3_compose(np.broadcast_to(T, p.shape), p), q)
+        angle = np.linalg.norm(se3.so3_log(d[:, 3:]), axis=1)
+    return MapError(
+        quantity="poses",
+        gauge=gauge,
+        T_truth_estimate=T,
+        errors=np.linalg.norm(d[:, :dim], axis=1),
+        heading_errors=angle,
+    )

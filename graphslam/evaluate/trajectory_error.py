@@ -1,0 +1,279 @@
+"""Absolute and relative error of a trajectory (Sturm et al. 2012), in two and three dimensions.
+
+ATE: distance between corresponding positions after a stated alignment. RPE: error of the motion over a stated
+distance or time, ``E_ij = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j)`` with R the reference and P the estimate; it needs no alignment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, ArrayLike, align_se2, rotation2, se2_between, se2_compose, se2_inverse
+from graphslam.core.records import check_times
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.statistics import ErrorStatistics
+
+Alignment = Literal["none", "origin", "se", "sim"]
+Index = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrajectoryError:
+    """ATE or RPE with what is needed to repeat it.
+
+    Parameters
+    ----------
+    kind : {"ATE", "RPE"}
+    alignment : {"none", "origin", "se", "sim"}
+    times : (n,)
+        Stamp of each error in the reference's clock; of the first pose of the pair for RPE.
+    translation : (n,)
+        [m].
+    rotation : (n,)
+        Absolute angle [rad].
+    T_ref_est : (3,) or (7,)
+        Alignment that was applied after scaling.
+    scale : float
+        1 unless ``sim``.
+    pairs : int
+        Associated poses.
+    delta : (float, str) or None
+        RPE only: distance [m] or time [s] of the pairs.
+    """
+
+    kind: Literal["ATE", "RPE"]
+    alignment: Alignment
+    times: Array
+    translation: Array
+    rotation: Array
+    T_ref_est: Array
+    scale: float
+    pairs: int
+    delta: tuple[float, str] | None = None
+
+    @property
+    def statistics(self) -> ErrorStatistics:
+        """Of the translation part [m]."""
+        return ErrorStatistics.of(self.translation)
+
+    @property
+    def rotation_statistics(self) -> ErrorStatistics:
+        """Of the rotation part [rad]."""
+        return ErrorStatistics.of(self.rotation)
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of a table."""
+        delta = {} if self.delta is None else {"delta": self.delta[0], "delta_unit": self.delta[1]}
+        rot = {f"rotation_{k}": v for k, v in self.rotation_statistics.as_dict().items() if k != "count"}
+        head = {"kind": self.kind, "alignment": self.alignment, "pairs": self.pairs, "scale": self.scale}
+        return {**head, **delta, **self.statistics.as_dict(), **rot}
+
+
+def associate(reference_times: ArrayLike, times: ArrayLike, *, max_diff: float = 0.01) -> tuple[Index, Index]:
+    """Pairs ``(i, j)`` of stamps that are each other's nearest, not more than ``max_diff`` [s] apart.
+
+    Mutual, so no pose is used twice; in order of time.
+    """
+    r, t = check_times(reference_times, where="reference"), check_times(times, where="estimate")
+    if not len(r) or not len(t):
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    i = _nearest(r, t)
+    j = _nearest(t, r)
+    k = np.arange(len(t))
+    good = (j[i] == k) & (np.abs(r[i] - t) <= max_diff)
+    return i[good], k[good]
+
+
+def _nearest(sorted_times: Array, query: Array) -> Index:
+    after = np.clip(np.searchsorted(sorted_times, query), 1, max(len(sorted_times) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(sorted_times) - 1)
+    later = np.abs(sorted_times[after] - query) < np.abs(query - sorted_times[before])
+    return np.where(later, after, before)
+
+
+def fit_alignment(reference: Array, estimate: Array, alignment: Alignment) -> tuple[Array, float]:
+    """``T_ref_est`` and scale that take estimated poses onto reference poses, row by row.
+
+    ``none``; ``origin``: the first poses coincide, heading included; ``se``: rigid least squares on positions;
+    ``sim``: with scale (Umeyama 1991).
+
+    Raises
+    ------
+    DataError
+        Fewer than three pairs, or positions without extent, for a fit.
+    """
+    planar = reference.shape[1] == 3
+    if alignment == "none":
+        return (np.zeros(3) if planar else np.array([0.0, 0, 0, 0, 0, 0, 1])), 1.0
+    if alignment == "origin":
+        if planar:
+            return se2_compose(reference[0], se2_inverse(estimate[0])), 1.0
+        return se3.se3_compose(reference[0], se3.se3_inverse(estimate[0])), 1.0
+    if alignment not in ("se", "sim"):
+        raise DataError("unknown alignment", got=alignment, wanted="none, origin, se or sim")
+    dim = 2 if planar else 3
+    q, p = reference[:, :dim], estimate[:, :dim]
+    if len(p) < 3:
+        raise DataError("too few associated poses to align", got=len(p), wanted="at least 3")
+    spread = np.linalg.svd(p - p.mean(0), compute_uv=False)
+    if spread[dim - 2] < 1e-9 * max(1.0, float(np.abs(p).max())):
+        raise DataError("the positions do not determine a rotation", got="a point" if planar else "a point or a line")
+    if not planar:
+        return se3.align_se3(p, q, scale=alignment == "sim")
+    T = align_se2(p, q)
+    if alignment == "se":
+        return T, 1.0
+    # least squares scale for the optimal rotation, which does not depend on it
+    dp, dq = p - p.mean(0), q - q.mean(0)
+    turned = dp @ rotation2(T[2]).T
+    scale = float(np.sum(turned * dq) / np.sum(dp**2))
+    return np.array([*(q.mean(0) - scale * rotation2(T[2]) @ p.mean(0)), T[2]]), scale
+
+
+def _pair(
+    reference: Trajectory, estimate: Trajectory, alignment: Alignment, max_diff: float
+) -> tuple[Array, Array, Array, Array, float]:
+    """Stamps, reference poses, aligned estimated poses, alignment and scale."""
+    if reference.dim != estimate.dim:
+        raise DataError("trajectories differ in dimension", got=estimate.dim, wanted=reference.dim)
+    i, j = associate(reference.times, estimate.times, max_diff=max_diff)
+    if not len(i):
+        raise DataError(
+            "no stamps of estimate and reference agree",
+            got=f"{len(estimate)} and {len(reference)} poses",
+            wanted=f"stamps within {max_diff} s of each other",
+        )
+    ref, est = reference.poses[i], estimate.poses[j].copy()
+    T, scale = fit_alignment(ref, est, alignment)
+    est[:, : reference.dim] *= scale
+    compose = se2_compose if reference.dim == 2 else se3.se3_compose
+    return reference.times[i], ref, compose(np.broadcast_to(T, est.shape), est), T, scale
+
+
+def _size(error: Array) -> tuple[Array, Array]:
+    """Length and absolute angle of error poses ``(n, 3)`` or ``(n, 7)``."""
+    if error.shape[1] == 3:
+        return np.linalg.norm(error[:, :2], axis=1), np.abs(error[:, 2])
+    return np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(se3.so3_log(error[:, 3:]), axis=1)
+
+
+def ate(
+    estimate: Trajectory, reference: Trajectory, *, alignment: Alignment = "se", max_diff: float = 0.01
+) -> TrajectoryError:
+    """Absolute trajectory error.
+
+    Parameters
+    ----------
+    estimate, reference : Trajectory
+    alignment : {"none", "origin", "se", "sim"}
+        See :func:`fit_alignment`.
+    max_diff : float
+        Stamps farther apart than this are no pair [s].
+
+    Raises
+    ------
+    DataError
+        No pairs, or too few for the alignment.
+    """
+    times, ref, est, T, scale = _pair(reference, estimate, alignment, max_diff)
+    between = se2_between if reference.dim == 2 else se3.se3_between
+    translation, rotation = _size(between(ref, est))
+    return TrajectoryError(
+        kind="ATE",
+        alignment=alignment,
+        times=times,
+        translation=translation,
+        rotation=rotation,
+        T_ref_est=T,
+        scale=scale,
+        pairs=len(times),
+    )
+
+
+def delta_pairs(progress: Array, delta: float, *, tolerance: float, all_pairs: bool) -> tuple[Index, Index]:
+    """Pairs ``i < j`` whose ``progress`` (path length or time, ``(n,)``, non-decreasing) differs by ``delta``.
+
+    For each i the j whose difference is nearest to ``delta``, kept if within ``tolerance``. With
+    ``all_pairs=False`` the pairs do not overlap: the next one starts where the last one ended.
+    """
+    n = len(progress)
+    i = np.arange(n - 1)
+    want = progress[i] + delta
+    after = np.clip(np.searchsorted(progress, want), i + 1, n - 1)
+    before = np.maximum(after - 1, i + 1)
+    j = np.where(np.abs(progress[before] - want) <= np.abs(progress[after] - want), before, after)
+    good = np.abs(progress[j] - want) <= tolerance
+    if all_pairs:
+        return i[good], j[good]
+    chain, k = [], 0
+    while k < n - 1:
+        if good[k]:
+            chain.append(k)
+            k = int(j[k])
+        else:
+            k += 1
+    c = np.array(chain, dtype=np.intp)
+    return c, j[c]
+
+
+def rpe(
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    delta: float = 1.0,
+    unit: Literal["m", "s"] = "m",
+    relative_tolerance: float = 0.1,
+    all_pairs: bool = True,
+    scale: bool = False,
+    max_diff: float = 0.01,
+) -> TrajectoryError:
+    """Relative pose error over ``delta`` metres of the *reference's* path, or over ``delta`` seconds.
+
+    Parameters
+    ----------
+    relative_tolerance : float
+        A pair may miss ``delta`` by this fraction of it.
+    all_pairs : bool
+        Every pose starts a pair (overlapping), instead of a chain.
+    scale : bool
+        Correct the estimate's scale first (monocular methods).
+
+    Raises
+    ------
+    DataError
+        No poses, or no pairs ``delta`` apart.
+    """
+    if not delta > 0:
+        raise DataError("RPE needs a positive delta", got=delta, wanted="> 0")
+    alignment: Alignment = "sim" if scale else "none"
+    times, ref, est, T, s = _pair(reference, estimate, alignment, max_diff)
+    if unit == "m":
+        steps = np.linalg.norm(np.diff(ref[:, : reference.dim], axis=0), axis=1)
+        progress = np.concatenate([[0.0], np.cumsum(steps)])
+    elif unit == "s":
+        progress = times - times[0]
+    else:
+        raise DataError("unknown unit of delta", got=unit, wanted="m or s")
+    i, j = delta_pairs(progress, delta, tolerance=relative_tolerance * delta, all_pairs=all_pairs)
+    if not len(i):
+        raise DataError(f"no two poses are {delta} {unit} apart", got=f"{progress[-1]:.3f} {unit} in all")
+    between = se2_between if reference.dim == 2 else se3.se3_between
+    translation, rotation = _size(between(between(ref[i], ref[j]), between(est[i], est[j])))
+    return TrajectoryError(
+        kind="RPE",
+        alignment=alignment,
+        times=times[i],
+        translation=translation,
+        rotation=rotation,
+        T_ref_est=T,
+        scale=s,
+        pairs=len(i),
+        delta=(float(delta), unit),
+    )
