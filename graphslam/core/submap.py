@@ -44,6 +44,9 @@ class LandmarkMap:
     covariance : (d + n·dim, …) or None
     information : sparse, same shape, or None
         Exactly one of the two is given.
+    sightings : (q, 2) int64 or None
+        Which observation (index in the log's observation stream) saw which landmark of this map: for audits of the
+        association; no solver reads it.
     """
 
     ids: npt.NDArray[np.int64]
@@ -51,6 +54,7 @@ class LandmarkMap:
     positions: Array
     covariance: Array | None = None
     information: sp.csc_matrix | None = None
+    sightings: npt.NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         ids = np.ascontiguousarray(self.ids, dtype=np.int64)
@@ -78,6 +82,11 @@ class LandmarkMap:
             if not np.all(np.isfinite(info.data)):
                 raise CovarianceError("submap information is not finite", wanted="finite numbers")
             object.__setattr__(self, "information", info)
+        if self.sightings is not None:
+            rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
+            if len(rows) and (rows[:, 1].min() < 0 or rows[:, 1].max() >= len(ids)):
+                raise GeometryError("sightings name a landmark that is not in the map", got=rows[:, 1].max())
+            object.__setattr__(self, "sightings", rows)
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "exit_pose", pose)
         object.__setattr__(self, "positions", positions)

@@ -1,0 +1,112 @@
+"""Configuration of the RBPF-EKF front end. Every default is for the simulated landmark field of Combined SLAM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from frontends.detectors.trees import TreeDetectorConfig
+from frontends.motion import MotionNoise
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeBearingNoise:
+    """σ_r = range_sigma + range_slope · r, σ_β = bearing_sigma; without it the log's own sigmas are used."""
+
+    range_sigma: float
+    """Constant part of the range σ [m]."""
+    range_slope: float = 0.0
+    """Part of the range σ proportional to range [m/m]."""
+    bearing_sigma: float
+    """σ of the bearing [rad]."""
+
+    def __post_init__(self) -> None:
+        if not (self.range_sigma > 0 and self.range_slope >= 0 and self.bearing_sigma > 0):
+            raise ConfigError(f"range-bearing noise must be positive, got {self}")
+
+    def variances(self, ranges: Array) -> Array:
+        """``(q, 2)`` variances of range and bearing."""
+        s = self.range_sigma + self.range_slope * ranges
+        return np.stack([s**2, np.full_like(s, self.bearing_sigma**2)], -1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoppingConfig:
+    """When a submap ends (Combined SLAM B8). Each criterion names itself in the submap's report."""
+
+    num_features: int = 30
+    """(iii) the standard particle holds this many confirmed features."""
+    time_max: float = 8.0
+    """(i) TIME_max [s]: a submap without any feature for TIME_max · min(1, ε/σ) ends."""
+    min_ancestors: int = 0
+    """(ii) diversity: end when the particles descend from this many or fewer of the first ones; 0 = off."""
+    max_resamplings: int = 0
+    """(ii) diversity: end at this many resamplings; 0 = off."""
+    max_distance: float = 40.0
+    """End after this many metres driven: local accuracy, and the smoother's linear cost."""
+    max_scans: int = 400
+    """End after this many scans (a vehicle that stands still gathers no distance)."""
+    min_scans: int = 20
+    """No criterion counts before this many scans."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfEkfConfig:
+    """FastSLAM local maps, summarised as one Gaussian each."""
+
+    particles: int = 40
+    """Number of particles N."""
+    proposal: Literal["2.0", "1.0"] = "2.0"
+    """FastSLAM 2.0 (EKF proposal, measurement in the proposal) or 1.0 (motion prior)."""
+    association: Literal["likelihood", "known"] = "likelihood"
+    """Per-particle maximum likelihood, or the identities in the log."""
+    gate: float = 11.8
+    """χ² gate of an association (2 dof: 99.7 %)."""
+    gate_new: float = 30.0
+    """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
+    confirm_hits: int = 3
+    """A feature is provisional until it has been seen this often."""
+    drop_misses: int = 5
+    """A provisional feature goes after this many scans in which it should have been seen and was not."""
+    drop_scans: int = 10
+    """A provisional feature goes if it is not confirmed this many scans after its birth."""
+    max_range: float = 45.0
+    """Observations beyond are not used [m]."""
+    ess_fraction: float = 0.5
+    """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    """Noise of the dead-reckoning increments."""
+    noise: RangeBearingNoise | None = None
+    """Observation noise in the filter; None: the log's sigmas."""
+    smoothing_noise: RangeBearingNoise | None = None
+    """Observation noise in the smoothing; None: as in the filter."""
+    min_hits: int = 1
+    """Landmarks handed over were seen at least this often under the winning association."""
+    trim: float = 0.0
+    """After a Huber pass, observations with d² above this are dropped and counted; 0 = keep all, plain least squares."""
+    handover: Literal["smoothed", "moments"] = "smoothed"
+    """``smoothed``: Gauss-Newton under the winning association, Laplace covariance; ``moments``: B3 (paper mode)."""
+    moment_inflation: bool = False
+    """Paper mode only: multiply the between-particle part by 1 + 40/N."""
+    stopping: StoppingConfig = field(default_factory=StoppingConfig)
+    """When a submap ends."""
+    detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
+    """Tree detector, used when the log holds raw scans instead of landmark observations."""
+
+    def __post_init__(self) -> None:
+        if self.particles < 1:
+            raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
+        if self.proposal not in ("1.0", "2.0"):
+            raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
+        if self.association not in ("likelihood", "known"):
+            raise ConfigError(f"association = {self.association!r}; known: likelihood, known")
+        if self.handover not in ("smoothed", "moments"):
+            raise ConfigError(f"handover = {self.handover!r}; known: smoothed, moments")
+        if not 0 < self.gate <= self.gate_new:
+            raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
+        if not 0 < self.ess_fraction <= 1:
+            raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")

@@ -1,0 +1,138 @@
+"""The particle set of one submap: flat arrays, one compiled call per scan, resampling and ancestry."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.landmarks.config import RbpfEkfConfig
+from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
+from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.core.geometry import Array
+
+Ints = npt.NDArray[np.int64]
+
+
+class ParticleSet:
+    """N particles ``<w, S, μ_1, Σ_1, …>`` (Combined SLAM eq. 4) with their association (eq. 9).
+
+    Parameters
+    ----------
+    config : RbpfEkfConfig
+    sensor : (3,)
+        ``T_base_sensor``.
+    field_of_view : (2,)
+        Bearings of the sensor [rad].
+    miss_range : float
+        A provisional feature nearer than this and inside the field of view should be seen [m].
+    rng : numpy Generator
+        This submap's branch of the seed tree.
+    """
+
+    def __init__(
+        self,
+        config: RbpfEkfConfig,
+        sensor: Array,
+        field_of_view: tuple[float, float],
+        miss_range: float,
+        rng: np.random.Generator,
+    ) -> None:
+        n = config.particles
+        self.config, self.sensor, self.rng = config, sensor, rng
+        self.pose = np.zeros((n, 3))
+        self.log_weight = np.zeros(n)
+        self.weights = np.full(n, 1.0 / n)
+        self.ancestor = np.arange(n)
+        self.count = np.zeros(n, dtype=np.int64)
+        self.mean, self.cov = np.zeros((n, 32, 2)), np.zeros((n, 32, 3))
+        self.hits, self.misses, self.born = (np.zeros((n, 32), dtype=np.int32) for _ in range(3))
+        self.assoc = np.full((n, 256), IGNORED, dtype=np.int32)
+        self.path = np.zeros((n, 64, 3))
+        self.scans = 0
+        self.observations = 0
+        self.resamplings = 0
+        self.min_ess = float(n)
+        margin = np.deg2rad(1.0)  # at the edge of the scan a trunk is cut off and not reported
+        self._cfg = np.zeros(CFG_LENGTH)
+        self._cfg[:] = (
+            1.0 if config.proposal == "2.0" else 0.0,
+            config.gate,
+            config.gate_new,
+            config.confirm_hits,
+            config.drop_misses,
+            config.drop_scans,
+            miss_range,
+            field_of_view[0] + margin,
+            field_of_view[1] - margin,
+        )
+
+    def _make_room(self, n_obs: int) -> None:
+        """Grow the arrays before the kernel would run out of slots, observations or scans."""
+        while self.count.max() + n_obs > self.mean.shape[1]:
+            pad = self.mean.shape[1]
+            grow = ((0, 0), (0, pad))
+            self.mean = np.pad(self.mean, (*grow, (0, 0)))
+            self.cov = np.pad(self.cov, (*grow, (0, 0)))
+            self.hits, self.misses, self.born = (np.pad(a, grow) for a in (self.hits, self.misses, self.born))
+        while self.observations + n_obs > self.assoc.shape[1]:
+            self.assoc = np.pad(self.assoc, ((0, 0), (0, self.assoc.shape[1])), constant_values=IGNORED)
+        if self.scans >= self.path.shape[1]:
+            self.path = np.pad(self.path, ((0, 0), (0, self.path.shape[1]), (0, 0)))
+
+    def step(self, u: Array, Q: Array, observations: Array, known: Ints) -> None:
+        """One scan: motion, association, weights, maps; then resampling if the effective size is low.
+
+        Parameters
+        ----------
+        u, Q : (3,), (3, 3)
+            Increment since the last scan and its right-tangent covariance.
+        observations : (q, 4)
+            Range, bearing and their variances.
+        known : (q,)
+            Slots in known-association mode, else -1.
+        """
+        n_obs = len(observations)
+        highest = int(known.max()) + 1 if n_obs else 0
+        self._make_room(max(n_obs, highest - int(self.count.max())))
+        fastslam_step(
+            self.pose, self.log_weight, self.mean, self.cov, self.hits, self.misses, self.born, self.count, self.assoc,
+            self.path, self.scans, self.observations, observations, known, u, Q,
+            self.rng.standard_normal((len(self.pose), 3)), self.sensor, self._cfg,
+        )  # fmt: skip
+        self.scans += 1
+        self.observations += n_obs
+        self.log_weight -= self.log_weight.max()
+        self.weights = normalise_log_weights(self.log_weight)
+        ess = effective_sample_size(self.weights)
+        self.min_ess = min(self.min_ess, ess)
+        uniform = self.rng.random()  # drawn every scan, so a branch that resamples less sees the same stream
+        if ess < self.config.ess_fraction * len(self.pose):
+            self._resample(systematic_resample(self.weights, uniform))
+
+    def _resample(self, survivors: Ints) -> None:
+        m, t, q = int(self.count.max()), self.scans, self.observations
+        self.pose, self.ancestor, self.count = self.pose[survivors], self.ancestor[survivors], self.count[survivors]
+        for a in (self.mean, self.cov, self.hits, self.misses, self.born):
+            a[:, :m] = a[survivors, :m]
+        self.assoc[:, :q] = self.assoc[survivors, :q]
+        self.path[:, :t] = self.path[survivors, :t]
+        self.log_weight[:] = 0.0
+        self.weights[:] = 1.0 / len(self.weights)
+        self.resamplings += 1
+
+    @property
+    def best(self) -> int:
+        """Index of the standard particle, the one of highest weight (B4); the first of equals."""
+        return int(np.argmax(self.weights))
+
+    @property
+    def ancestors(self) -> int:
+        """Number of distinct particles of the submap's start that still have descendants."""
+        return len(np.unique(self.ancestor))
+
+    def pose_std(self) -> Array:
+        """Weighted standard deviation of x, y, θ over the particles ``(3,)``."""
+        d = self.pose - self.pose[self.best]
+        d[:, 2] = np.arctan2(np.sin(d[:, 2]), np.cos(d[:, 2]))
+        mean = self.weights @ d
+        return np.asarray(np.sqrt(self.weights @ (d - mean) ** 2))

@@ -1,0 +1,280 @@
+"""RBPF-EKF local maps: FastSLAM decides the association, one smoothing makes the Gaussian (Combined SLAM section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.detectors.trees import detect_trees
+from frontends.landmarks.config import RbpfEkfConfig
+from frontends.landmarks.filter import ParticleSet
+from frontends.landmarks.stopping import Stopping
+from frontends.landmarks.summarise import Association, Smoothed, moment_matched, smooth, winning_association
+from frontends.motion import steering_odometry
+from graphslam.core.errors import CovarianceError, MissingDataError
+from graphslam.core.gaussian import Gaussian
+from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.submap import LandmarkMap, Submap
+from graphslam.core.trajectory import Trajectory
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A log made ready for the filter: observations that count, increments between scans, names of the streams used."""
+
+    observations: LandmarkObservations
+    original: Ints  # index of each observation in the stream before the unused ones were dropped
+    rows: Array  # (q, 4) range, bearing, filter variances
+    smoothing_variances: Array  # (q, 2)
+    odometry: Odometry
+    t_start: float
+    uses: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class RbpfEkf:
+    """The front end ``rbpf-ekf``.
+
+    Needs a stream of :class:`SteeringControls` and one of :class:`LandmarkObservations` or, with the tree detector,
+    of :class:`LaserScans`.
+    """
+
+    config: RbpfEkfConfig = field(default_factory=RbpfEkfConfig)
+    name: ClassVar[str] = "rbpf-ekf"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`."""
+        prepared = self.prepare(log, drops if drops is not None else DropCounter())
+        times = prepared.observations.times
+        if after is None:
+            key, scan, t_start = 0, 0, prepared.t_start
+        else:
+            t_start = after.interval[1]
+            key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
+        while scan < len(times):
+            submap, scan = self._build(prepared, key, scan, t_start, seed.child(key))
+            yield submap
+            key, t_start = key + 1, submap.interval[1]
+
+    def prepare(self, log: SensorLog, drops: DropCounter) -> Prepared:
+        """Detect, drop what cannot be used (counted), and integrate the controls between scans."""
+        c = self.config
+        controls_name = log.of_type(SteeringControls)
+        if controls_name is None:
+            raise MissingDataError(
+                "no speed and steering to dead-reckon from", where=log.name, wanted="SteeringControls"
+            )
+        controls: SteeringControls = log[controls_name]
+        stream = log.of_type(LandmarkObservations)
+        if stream is not None:
+            observations: LandmarkObservations = log[stream]
+        else:
+            stream = log.of_type(LaserScans)
+            if stream is None:
+                raise MissingDataError(
+                    "no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans"
+                )
+            observations = detect_trees(log[stream], c.detector)
+        early = int(np.searchsorted(observations.times, controls.times[0], side="left"))
+        if early:
+            drops.drop(stream, "before the first control", early)
+        scans = observations.take(slice(early, None))
+        first_row = int(observations.offsets[early])
+        usable = scans.ranges <= c.max_range
+        drops.drop(stream, f"observations beyond {c.max_range:g} m", int((~usable).sum()))
+        if c.association == "known":
+            if scans.ids is None:
+                raise MissingDataError("known association needs identities", where=f"{log.name}/{stream}", wanted="ids")
+            unknown = usable & (scans.ids < 0)
+            drops.drop(stream, "observations without identity", int(unknown.sum()))
+            usable &= ~unknown
+        scans, kept = _only(scans, usable)
+        if len(scans.times) == 0:
+            raise MissingDataError("no scan to work on", where=f"{log.name}/{stream}")
+        own = scans.sigmas**2
+        filter_var = own if c.noise is None else c.noise.variances(scans.ranges)
+        smooth_var = filter_var if c.smoothing_noise is None else c.smoothing_noise.variances(scans.ranges)
+        t_start = float(min(controls.times[0], scans.times[0]))
+        stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
+        odometry = steering_odometry(controls, stamps, c.motion)
+        if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
+            odometry = odometry.take(slice(1, None))
+        rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
+        return Prepared(
+            scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({controls_name, stream})
+        )
+
+    def _build(self, data: Prepared, key: int, first: int, t_start: float, seed: SeedTree) -> tuple[Submap, int]:
+        """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
+        c, obs = self.config, data.observations
+        miss_range = 0.9 * min(c.max_range, obs.max_range)
+        particles = ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, seed.generator())
+        mean_var = data.rows[:, 2:].mean(axis=0) if len(data.rows) else np.ones(2)
+        epsilon = np.sqrt([mean_var[0], mean_var[0], mean_var[1]])
+        stopping = Stopping(c.stopping, c.confirm_hits, epsilon)
+        slots: dict[int, int] = {}
+        ended, scan = None, first
+        previous = t_start
+        while ended is None and scan < len(obs.times):
+            rows = obs.scan(scan)
+            known = self._known_slots(obs, rows, slots)
+            u, Q = data.odometry.increments[scan], data.odometry.covariances[scan]
+            particles.step(u, Q, data.rows[rows], known)
+            ended = stopping.reason(particles, float(obs.times[scan]) - previous, u, rows.stop - rows.start)
+            previous = float(obs.times[scan])
+            scan += 1
+        report: dict[str, Any] = {"ended": ended or "end-of-log"}
+        return self._summarise(data, particles, key, first, scan, t_start, slots, report), scan
+
+    def _known_slots(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
+        """Slot of every observation in known-association mode (first sighting opens one), else -1."""
+        n = rows.stop - rows.start
+        if self.config.association != "known" or obs.ids is None:
+            return np.full(n, -1, dtype=np.int64)
+        return np.array([slots.setdefault(int(i), len(slots)) for i in obs.ids[rows]], dtype=np.int64)
+
+    def _summarise(
+        self,
+        data: Prepared,
+        particles: ParticleSet,
+        key: int,
+        first: int,
+        last: int,
+        t_start: float,
+        slots: dict[int, int],
+        report: dict[str, Any],
+    ) -> Submap:
+        c, obs = self.config, data.observations
+        association = winning_association(particles, c.min_hits)
+        offset = int(obs.offsets[first])
+        rows = offset + association.observation
+        scan_of = np.searchsorted(obs.offsets, rows, side="right") - 1 - first
+        best = particles.best
+        z = np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]])
+        span = slice(first, last)
+        smoothed = smooth(
+            particles.path[best, : last - first],
+            particles.mean[best, association.slots],
+            data.odometry.increments[span],
+            data.odometry.covariances[span],
+            scan_of,
+            association.landmark,
+            z,
+            obs.T_base_sensor,
+            trim=c.trim,
+            min_hits=c.min_hits,
+        )
+        slot_of = association.slots[smoothed.landmark_kept]
+        paper, dropped = _paper_gaussian(particles, association, smoothed, c.moment_inflation)
+        report |= _honesty(smoothed, paper)
+        report |= {
+            "handover": c.handover,
+            "scans": last - first,
+            "observations": int(particles.observations),
+            "used": int(smoothed.kept.sum()),
+            "not_associated": int(particles.observations - len(association.observation)),
+            "trimmed": int(len(smoothed.kept) - smoothed.kept.sum()),
+            "resamplings": particles.resamplings,
+            "min_ess": round(particles.min_ess, 3),
+            "ancestors": particles.ancestors,
+            "dropped_particles": dropped,
+            "chi2": smoothed.chi2,
+            "dof": smoothed.dof,
+            "chi2_odometry": float(smoothed.parts[0]),
+            "chi2_range": float(smoothed.parts[1]),
+            "chi2_bearing": float(smoothed.parts[2]),
+            "converged": smoothed.converged,
+        }
+        gaussian = smoothed.gaussian
+        if c.handover == "moments":
+            if paper is None:
+                raise CovarianceError(f"submap {key}: no particle holds the common features, nothing to moment-match")
+            gaussian = paper
+        by_slot = {s: i for i, s in slots.items()}
+        ids = np.array([by_slot.get(int(s), -1) for s in slot_of], dtype=np.int64)
+        lm_index = (np.cumsum(smoothed.landmark_kept) - 1)[association.landmark[smoothed.kept]]
+        landmarks = LandmarkMap(
+            ids=ids,
+            exit_pose=gaussian.mean[:3],
+            positions=gaussian.mean[3:].reshape(-1, 2),
+            covariance=gaussian.covariance,
+            sightings=np.column_stack([data.original[rows[smoothed.kept]], lm_index]),
+        )
+        trajectory = _trajectory(t_start, obs.times[span], smoothed)
+        if c.handover == "moments":  # the path's end is the Gaussian's
+            cov = trajectory.covariances
+            assert cov is not None
+            cov[-1] = vector_to_tangent_covariance(gaussian.mean[:3], gaussian.covariance[:3, :3])
+            trajectory.poses[-1] = gaussian.mean[:3]
+        return Submap.from_landmarks(
+            key,
+            landmarks,
+            interval=(t_start, float(obs.times[last - 1])),
+            trajectory=trajectory,
+            uses=data.uses,
+            report=report,
+        )
+
+
+def _only(scans: LandmarkObservations, keep: npt.NDArray[np.bool_]) -> tuple[LandmarkObservations, Ints]:
+    """The observations ``keep`` (all scans stay) and their indices."""
+    rows = np.flatnonzero(keep)
+    before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
+    cut = replace(
+        scans,
+        offsets=before[scans.offsets],
+        ranges=scans.ranges[rows],
+        bearings=scans.bearings[rows],
+        sigmas=scans.sigmas[rows],
+        ids=None if scans.ids is None else scans.ids[rows],
+    )
+    return cut, rows.astype(np.int64)
+
+
+def _paper_gaussian(
+    particles: ParticleSet, association: Association, smoothed: Smoothed, inflate: bool
+) -> tuple[Gaussian | None, int]:
+    """Moment-matched Gaussian over the landmarks that the smoothed map holds, and particles dropped on the way."""
+    keep = smoothed.landmark_kept
+    used = keep[association.landmark]
+    rank = np.cumsum(keep) - 1
+    same = Association(association.slots[keep], association.observation[used], rank[association.landmark[used]])
+    try:
+        return moment_matched(particles, same, inflate=inflate)
+    except (CovarianceError, ZeroDivisionError):  # every particle was dropped
+        return None, len(particles.pose)
+
+
+def _honesty(smoothed: Smoothed, paper: Gaussian | None) -> dict[str, Any]:
+    """How far the particle Gaussian (B3) is from the smoothed one: Mahalanobis distance²/n, KL, pose variance ratio."""
+    if paper is None:
+        return {"moment_d2_per_dof": None, "moment_kl": None, "moment_pose_variance_ratio": None}
+    s = smoothed.gaussian
+    ratio = np.diag(paper.covariance)[:3] / np.diag(s.covariance)[:3]
+    return {
+        "moment_d2_per_dof": paper.mahalanobis2(s.mean) / len(s.mean),
+        "moment_kl": s.kl_from(paper),
+        "moment_pose_variance_ratio": [float(r) for r in ratio],
+    }
+
+
+def _trajectory(t_start: float, times: Array, smoothed: Smoothed) -> Trajectory:
+    """Path in the base frame; the base itself stands first, exactly known, unless the first scan is the base."""
+    if t_start < times[0]:
+        return Trajectory(
+            np.concatenate([[t_start], times]),
+            np.concatenate([np.zeros((1, 3)), smoothed.poses]),
+            np.concatenate([np.zeros((1, 3, 3)), smoothed.pose_covariances]),
+        )
+    return Trajectory(times, smoothed.poses.copy(), smoothed.pose_covariances.copy())

@@ -1,0 +1,279 @@
+"""Compiled Gauss-Newton smoothing of one submap: all poses and landmarks under a given association.
+
+The normal equations are a block-tridiagonal chain of poses with an arrow of landmark columns. Poses are eliminated
+from the base towards the exit, so that what remains is the information matrix of {exit pose, landmarks}: exactly the
+marginal that the submap hands over. Cost is poses × landmarks²; nothing of size poses² is formed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from frontends.landmarks.kernels import observe
+
+_TWO_PI = 2.0 * math.pi
+
+
+@numba.njit(cache=True, inline="always")
+def _wrap(a):
+    return math.pi - (math.pi - a) % _TWO_PI
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _inverse3(A):
+    """Inverse of a symmetric 3×3 matrix by cofactors."""
+    out = np.empty((3, 3))
+    out[0, 0] = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
+    out[0, 1] = A[0, 2] * A[2, 1] - A[0, 1] * A[2, 2]
+    out[0, 2] = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    out[1, 1] = A[0, 0] * A[2, 2] - A[0, 2] * A[2, 0]
+    out[1, 2] = A[0, 2] * A[1, 0] - A[0, 0] * A[1, 2]
+    out[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    det = A[0, 0] * out[0, 0] + A[0, 1] * out[0, 1] + A[0, 2] * out[0, 2]
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= det
+            out[j, i] = out[i, j]
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _odometry_residual(a, b, u, e):
+    """``e = u⁻¹ ∘ (a⁻¹ ∘ b)`` as (x, y, θ), and the between pose a⁻¹ ∘ b in e[3:6]."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    bx, by, bt = c * dx + s * dy, -s * dx + c * dy, _wrap(b[2] - a[2])
+    c, s = math.cos(u[2]), math.sin(u[2])
+    dx, dy = bx - u[0], by - u[1]
+    e[0], e[1], e[2] = c * dx + s * dy, -s * dx + c * dy, _wrap(bt - u[2])
+    e[3], e[4], e[5] = bx, by, bt
+
+
+@numba.njit(cache=True, error_model="numpy")
+def smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts):
+    """Objective Σ rᵀ Σ⁻¹ r; fills d2 per observation and parts = (odometry, range, bearing) shares."""
+    e = np.empty(6)
+    h = np.empty(12)
+    base = np.zeros(3)
+    parts[:] = 0.0
+    for k in range(len(poses)):
+        _odometry_residual(base if k == 0 else poses[k - 1], poses[k], u[k], e)
+        for r in range(3):
+            for q in range(3):
+                parts[0] += e[r] * W[k, r, q] * e[q]
+    total = parts[0]
+    for o in range(len(ob)):
+        k, j = ob_pose[o], ob_lm[o]
+        observe(
+            poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
+        )
+        n0, n1 = ob[o, 0] - h[0], _wrap(ob[o, 1] - h[1])
+        a, b = n0 * n0 / ob[o, 2], n1 * n1 / ob[o, 3]
+        d2[o] = a + b
+        parts[1] += weight[o] * a
+        parts[2] += weight[o] * b
+        total += weight[o] * d2[o]
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl):
+    """Normal equations: A (T,3,3), B (T,3,3) coupling k to k+1, C (T,3,2L), H (2L,2L), right-hand sides g, gl."""
+    A[:] = 0.0
+    B[:] = 0.0
+    C[:] = 0.0
+    H[:] = 0.0
+    g[:] = 0.0
+    gl[:] = 0.0
+    e = np.empty(6)
+    h = np.empty(12)
+    base = np.zeros(3)
+    Jb = np.zeros((3, 3))
+    Ad = np.zeros((3, 3))
+    for k in range(len(poses)):
+        _odometry_residual(base if k == 0 else poses[k - 1], poses[k], u[k], e)
+        c, s = math.cos(e[2]), math.sin(e[2])
+        Jb[0, 0], Jb[0, 1], Jb[0, 2] = c, -s, 0.0
+        Jb[1, 0], Jb[1, 1], Jb[1, 2] = s, c, 0.0
+        Jb[2, 0], Jb[2, 1], Jb[2, 2] = 0.0, 0.0, 1.0
+        M = Jb.T @ W[k]
+        r = e[:3].copy()
+        A[k] += M @ Jb
+        g[k] -= M @ r
+        if k > 0:
+            # ∂e/∂ξ_{k-1} = -J_b Ad(between⁻¹)
+            c, s = math.cos(e[5]), math.sin(e[5])
+            ix, iy = -c * e[3] - s * e[4], s * e[3] - c * e[4]
+            Ad[0, 0], Ad[0, 1], Ad[0, 2] = c, s, iy
+            Ad[1, 0], Ad[1, 1], Ad[1, 2] = -s, c, -ix
+            Ad[2, 0], Ad[2, 1], Ad[2, 2] = 0.0, 0.0, 1.0
+            Ja = -Jb @ Ad
+            Ma = Ja.T @ W[k]
+            A[k - 1] += Ma @ Ja
+            B[k - 1] += Ma @ Jb
+            g[k - 1] -= Ma @ r
+    for o in range(len(ob)):
+        if weight[o] == 0.0:
+            continue
+        k, j = ob_pose[o], ob_lm[o]
+        observe(
+            poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
+        )
+        n0, n1 = ob[o, 0] - h[0], _wrap(ob[o, 1] - h[1])
+        w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
+        for r_ in range(3):
+            a0, a1 = h[2 + r_] * w0, h[5 + r_] * w1
+            g[k, r_] += a0 * n0 + a1 * n1
+            for q in range(3):
+                A[k, r_, q] += a0 * h[2 + q] + a1 * h[5 + q]
+            for q in range(2):
+                C[k, r_, 2 * j + q] += a0 * h[8 + q] + a1 * h[10 + q]
+        for r_ in range(2):
+            a0, a1 = h[8 + r_] * w0, h[10 + r_] * w1
+            gl[2 * j + r_] += a0 * n0 + a1 * n1
+            for q in range(2):
+                H[2 * j + r_, 2 * j + q] += a0 * h[8 + q] + a1 * h[10 + q]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _eliminate(A, B, C, H, g, gl, last_seen, Ainv):
+    """Eliminate poses 0 … T-2 forwards. Columns of C beyond ``last_seen[k]`` are still zero at pose k."""
+    T, n = len(A), H.shape[0]
+    G = np.empty((3, n))
+    for k in range(T - 1):
+        Ai = _inverse3(A[k])
+        Ainv[k] = Ai
+        w = last_seen[k]
+        GB = Ai @ B[k]
+        gg = Ai @ g[k]
+        for r in range(3):
+            for q in range(w):
+                G[r, q] = Ai[r, 0] * C[k, 0, q] + Ai[r, 1] * C[k, 1, q] + Ai[r, 2] * C[k, 2, q]
+        A[k + 1] -= B[k].T @ GB
+        g[k + 1] -= B[k].T @ gg
+        for r in range(3):
+            for q in range(w):
+                C[k + 1, r, q] -= B[k, 0, r] * G[0, q] + B[k, 1, r] * G[1, q] + B[k, 2, r] * G[2, q]
+        for r in range(w):
+            c0, c1, c2 = C[k, 0, r], C[k, 1, r], C[k, 2, r]
+            gl[r] -= c0 * gg[0] + c1 * gg[1] + c2 * gg[2]
+            if c0 != 0.0 or c1 != 0.0 or c2 != 0.0:
+                for q in range(w):
+                    H[r, q] -= c0 * G[0, q] + c1 * G[1, q] + c2 * G[2, q]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _reduced(A, C, H):
+    """Information matrix of {exit pose, landmarks} after the elimination."""
+    T, n = len(A), H.shape[0]
+    M = np.empty((3 + n, 3 + n))
+    M[:3, :3] = A[T - 1]
+    M[:3, 3:] = C[T - 1]
+    M[3:, :3] = C[T - 1].T
+    M[3:, 3:] = H
+    return 0.5 * (M + M.T)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def smooth_kernel(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, max_iterations, tolerance):
+    """Damped Gauss-Newton over poses (T,3) and landmarks (L,2), both changed in place; base pose fixed at identity.
+
+    u (T,3), W (T,3,3): odometry increments and their information. ob_pose, ob_lm (q,), ob (q,4), weight (q,).
+    Returns (objective, iterations, converged). Converged: relative decrease below ``tolerance``.
+    """
+    T, n = len(poses), 2 * len(landmarks)
+    A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
+    H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
+    last_seen = seen_columns(T, n, ob_pose, ob_lm)
+    d2, parts = np.empty(len(ob)), np.empty(3)
+    cost = smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts)
+    new_poses, new_lm = np.empty_like(poses), np.empty_like(landmarks)
+    step = np.empty((T, 3))
+    rhs = np.empty(3 + n)
+    for iteration in range(max_iterations):
+        _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl)
+        _eliminate(A, B, C, H, g, gl, last_seen, Ainv)
+        rhs[:3] = g[T - 1]
+        rhs[3:] = gl
+        x = np.linalg.solve(_reduced(A, C, H), rhs)
+        step[T - 1] = x[:3]
+        for k in range(T - 2, -1, -1):
+            v = g[k] - B[k] @ step[k + 1]
+            for q in range(last_seen[k]):
+                for r in range(3):
+                    v[r] -= C[k, r, q] * x[3 + q]
+            step[k] = Ainv[k] @ v
+        scale = 1.0
+        for _ in range(12):
+            for k in range(T):
+                c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+                dx, dy = scale * step[k, 0], scale * step[k, 1]
+                new_poses[k, 0] = poses[k, 0] + c * dx - s * dy
+                new_poses[k, 1] = poses[k, 1] + s * dx + c * dy
+                new_poses[k, 2] = _wrap(poses[k, 2] + scale * step[k, 2])
+            for j in range(len(landmarks)):
+                new_lm[j, 0] = landmarks[j, 0] + scale * x[3 + 2 * j]
+                new_lm[j, 1] = landmarks[j, 1] + scale * x[4 + 2 * j]
+            new_cost = smoothing_cost(new_poses, new_lm, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts)
+            if new_cost <= cost * (1.0 + 1e-12):
+                break
+            scale *= 0.5
+        if not new_cost <= cost * (1.0 + 1e-12):
+            return cost, iteration + 1, False
+        gain = cost - new_cost
+        cost = new_cost
+        poses[:] = new_poses
+        landmarks[:] = new_lm
+        if gain <= tolerance * max(cost, 1e-9):
+            return cost, iteration + 1, True
+    return cost, max_iterations, False
+
+
+@numba.njit(cache=True)
+def seen_columns(T, n, ob_pose, ob_lm):
+    """last_seen[k]: number of leading landmark columns that poses 0 … k touch (landmarks come in order of sighting)."""
+    out = np.zeros(T, np.int64)
+    for o in range(len(ob_pose)):
+        w = 2 * ob_lm[o] + 2
+        if w > out[ob_pose[o]]:
+            out[ob_pose[o]] = w
+    for k in range(1, T):
+        if out[k - 1] > out[k]:
+            out[k] = out[k - 1]
+    return np.minimum(out, n)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def smoothed_covariances(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor):
+    """Laplace covariances at the optimum, Gauss-Newton Hessian.
+
+    Returns the joint covariance (3 + 2L, …) of {exit pose (right tangent), landmarks} and the marginal covariances
+    (T, 3, 3) of every pose (right tangent), by the backward recursion of the same elimination.
+    """
+    T, n = len(poses), 2 * len(landmarks)
+    A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
+    H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
+    last_seen = seen_columns(T, n, ob_pose, ob_lm)
+    _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl)
+    _eliminate(A, B, C, H, g, gl, last_seen, Ainv)
+    joint = np.linalg.inv(_reduced(A, C, H))
+    joint = 0.5 * (joint + joint.T)
+    marginal = np.empty((T, 3, 3))
+    marginal[T - 1] = joint[:3, :3]
+    Sl = joint[3:, 3:].copy()
+    S = joint[:3, :3].copy()  # covariance of pose k+1
+    X = joint[:3, 3:].copy()  # its cross-covariance with the landmarks
+    for k in range(T - 2, -1, -1):
+        # pose k given the rest: -Ainv (B ξ_{k+1} + C l), conditional covariance Ainv
+        F = Ainv[k] @ B[k]
+        G = Ainv[k] @ C[k]
+        Xk = -(F @ X + G @ Sl)
+        Sk1 = -(F @ S + G @ X.T)  # cov(ξ_k, ξ_{k+1})
+        Sk = Ainv[k] - Sk1 @ F.T - Xk @ G.T
+        S = 0.5 * (Sk + Sk.T)
+        X = Xk
+        marginal[k] = S
+    return joint, marginal

@@ -1,0 +1,181 @@
+"""Configuration of a run: one frozen dataclass per part, defaults in code, a TOML file optional and partial.
+
+Order of precedence: defaults, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
+Unknown keys are refused with their full name; the effective configuration is written into the run folder.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+
+from graphslam.core.errors import ConfigError
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class GpsConfig:
+    """How GPS enters the graph, and which fixes are kept back to score it."""
+
+    use: Literal["none", "all", "every-second", "even-segments", "odd-segments"] = "none"
+    """Fixes that become factors; the rest is withheld and scored. Segments are runs of fixes without a gap."""
+    sigma: float = 0.5
+    """σ of each coordinate of a fix [m]; replaces the stream's own where positive."""
+    robust: Literal["none", "huber", "cauchy"] = "cauchy"
+    """Robust kernel on every GPS factor."""
+    segment_gap: float = 2.0
+    """A gap longer than this starts a new segment [s]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class BackEndConfig:
+    """From submaps to a solved graph."""
+
+    covariance_scale: float = 1.0
+    """Factor on every submap covariance in the join; 1 = trust the front end. Choose it so that join χ²/dof is 1."""
+    associate: bool = True
+    """Associate landmarks without identity to the graph's (joint compatibility); identities in the submaps win."""
+    gate: float = 11.8
+    """χ² gate of one pairing given the ones before (2 dof: 99.7 %)."""
+    merge_distance: float = 0.0
+    """Landmarks nearer than this after the join are one [m]; 0 = never merge by distance."""
+    merge_every: int = 20
+    """Look for landmarks to merge after this many submaps, and at the end."""
+    confirmed_hits: int = 1
+    """Landmarks of the final map were sighted at least this often over all submaps."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RunConfig:
+    """Everything that steers ``graphslam run`` beside the source and the seed."""
+
+    frontend: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the front end; its own dataclass validates them."""
+    backend: BackEndConfig = dataclasses.field(default_factory=BackEndConfig)
+    """Association, scale, merging."""
+    gps: GpsConfig = dataclasses.field(default_factory=GpsConfig)
+    """GPS factors and what is withheld."""
+
+
+def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
+    """Build dataclass ``kind`` from nested mappings.
+
+    Raises
+    ------
+    ConfigError
+        Unknown key or a value of the wrong type; names the full key.
+    """
+    hints = typing.get_type_hints(kind)
+    known = {f.name for f in dataclasses.fields(kind)}
+    out = {}
+    for key, value in values.items():
+        name = f"{where}.{key}" if where else key
+        if key not in known:
+            raise ConfigError(f"unknown configuration key {name!r}; known: {', '.join(sorted(known))}")
+        out[key] = _convert(hints[key], value, name)
+    try:
+        return kind(**out)
+    except TypeError as error:
+        raise ConfigError(f"{where or kind.__name__}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None or value == "none" and type(None) in args and str not in args:
+            return None
+        return _convert(next(a for a in args if a is not type(None)), value, name)
+    if origin is Literal:
+        if value not in args:
+            raise ConfigError(f"{name} = {value!r}; known: {', '.join(map(str, args))}")
+        return value
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{name} = {value!r}; wanted a table of options")
+        return build(hint, value, name)
+    if origin is tuple:
+        return tuple(_convert(a, v, name) for a, v in zip(args, value, strict=True))
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint in (int, bool, str) and type(value) is hint:
+        return value
+    if origin is Mapping or hint is Mapping or hint is Any:
+        return value
+    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+        return dict(value)
+    raise ConfigError(f"{name} = {value!r}; wanted {getattr(hint, '__name__', hint)}")
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Deep merge of nested mappings, ``over`` wins."""
+    out = dict(base)
+    for key, value in over.items():
+        old = out.get(key)
+        out[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    ConfigError
+        Missing or malformed.
+    """
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file ({error})") from None
+
+
+def parse_setting(text: str) -> dict[str, Any]:
+    """``a.b=c`` → ``{"a": {"b": c}}``; c is read as a TOML value, or as a bare word."""
+    key, eq, raw = text.partition("=")
+    parts = key.strip().split(".")
+    if not eq or not all(parts):
+        raise ConfigError(f"--set {text!r}; wanted a.b=value")
+    try:
+        value = tomllib.loads(f"v = {raw.strip()}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = raw.strip()
+    for part in reversed(parts):
+        value = {part: value}
+    return dict(value)
+
+
+def preset(name: str) -> dict[str, Any]:
+    """Recommended settings of a source, or nothing where there are none."""
+    file = resources.files("graphslam.app") / "presets" / f"{name}.toml"
+    return tomllib.loads(file.read_text()) if file.is_file() else {}
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dict of a configuration; None becomes absent (TOML has no null)."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        items = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    else:
+        items = dict(config)
+    out: dict[str, Any] = {}
+    for key, value in items.items():
+        if value is None:
+            continue
+        if dataclasses.is_dataclass(value) or isinstance(value, Mapping):
+            out[key] = as_dict(value)
+        else:
+            out[key] = list(value) if isinstance(value, tuple) else value
+    return out
+
+
+def dump_toml(values: Mapping[str, Any]) -> str:
+    """TOML text of nested mappings."""
+    return tomli_w.dumps(values)
