@@ -28,7 +28,7 @@ Verdict = Literal["consistent", "over-confident", "pessimistic"]
 
 
 def pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
-    """Right-tangent errors ``Log(T_est⁻¹ T_true)`` ``(..., 3)`` or ``(..., 6)`` of poses ``(..., 3)`` or ``(..., 7)``."""
+    """Right-tangent errors ``Log(T_est⁻¹ T_true)``: ``(..., 3)`` of 2-D poses, ``(..., 6)`` of 3-D poses."""
     e, t = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if e.shape[-1] != t.shape[-1] or e.shape[-1] not in (3, 7):
         raise DataError("poses of estimate and truth differ in kind", got=(e.shape, t.shape), wanted="(..., 3) or 7")

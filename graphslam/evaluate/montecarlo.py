@@ -117,9 +117,10 @@ def _failed(k: int, seed: int, error: Exception) -> TrialError:
 def _serial(trial: Trial, seeds: dict[int, int], workers: int | None) -> Iterator[tuple[int, list[Measurement]]]:
     for k, s in seeds.items():
         try:
-            yield k, _call(trial, s)
+            measured = _call(trial, s)
         except Exception as error:
             raise _failed(k, s, error) from error
+        yield k, measured
 
 
 def _processes(trial: Trial, seeds: dict[int, int], workers: int | None) -> Iterator[tuple[int, list[Measurement]]]:
@@ -129,7 +130,8 @@ def _processes(trial: Trial, seeds: dict[int, int], workers: int | None) -> Iter
         for future in as_completed(futures):
             k = futures[future]
             try:
-                yield k, future.result()
+                measured = future.result()
             except Exception as error:
                 pool.shutdown(cancel_futures=True)
                 raise _failed(k, seeds[k], error) from error
+            yield k, measured

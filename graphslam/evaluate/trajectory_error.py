@@ -42,7 +42,7 @@ class TrajectoryError:
     scale : float
         1 unless ``sim``.
     pairs : int
-        Associated poses.
+        Number of errors: associated poses (ATE), or pairs of them ``delta`` apart (RPE).
     delta : (float, str) or None
         RPE only: distance [m] or time [s] of the pairs.
     """

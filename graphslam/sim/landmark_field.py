@@ -158,16 +158,16 @@ PRESETS: Mapping[str, LandmarkFieldConfig] = {
     "B": dataclasses.replace(_A, lap_length=5300.0, laps=1.055),
     # A with the sensor of the classic simulator
     "C": dataclasses.replace(_A, sigma_range=0.1, sigma_bearing=math.radians(1.0)),
-    # one lap and a quarter of 320 m: closes a loop, the whole pipeline takes seconds
+    # 480 m and a fifth of it again: closes a loop, the whole pipeline takes seconds
     "demo": dataclasses.replace(
         _A,
-        lap_length=320.0,
-        laps=1.25,
+        lap_length=480.0,
+        laps=1.2,
         route_waves=5,
         route_amplitude=0.08,
-        landmarks=80,
-        sigma_range=0.2,
-        sigma_bearing=math.radians(2.0),
+        landmarks=120,
+        sigma_range=0.3,
+        sigma_bearing=math.radians(3.0),
     ),
     # smaller still, for tests and notebooks in quick mode
     "quick": dataclasses.replace(

@@ -1,0 +1,122 @@
+"""How well one data association agrees with another, by pairs of observations.
+
+Two observations that we call the same landmark should be the same in the reference (precision); two that are the same
+in the reference should be the same in ours (recall). Counting pairs needs no matching of landmark names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, wrap_angle
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class PairAgreement:
+    """Agreement of two labellings of the same observations.
+
+    Parameters
+    ----------
+    observations : int
+        Observations labelled by both.
+    together, together_reference, together_both : int
+        Pairs of observations under one label in ours, in the reference, and in both.
+    mixed : int
+        Our landmarks that hold observations of more than one reference landmark.
+    split : int
+        Reference landmarks whose observations lie in more than one of ours.
+    """
+
+    observations: int
+    together: int
+    together_reference: int
+    together_both: int
+    mixed: int
+    split: int
+
+    @property
+    def precision(self) -> float:
+        """Share of our pairs that the reference confirms."""
+        return self.together_both / self.together if self.together else float("nan")
+
+    @property
+    def recall(self) -> float:
+        """Share of the reference's pairs that we found."""
+        return self.together_both / self.together_reference if self.together_reference else float("nan")
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of a table."""
+        return {
+            "observations": self.observations,
+            "pair_precision": self.precision,
+            "pair_recall": self.recall,
+            "mixed": self.mixed,
+            "split": self.split,
+        }
+
+
+def pair_agreement(labels: npt.ArrayLike, reference: npt.ArrayLike) -> PairAgreement:
+    """Compare labels ``(n,)`` with reference labels ``(n,)``; a negative label means none, such rows are left out."""
+    a, b = np.asarray(labels, dtype=np.int64), np.asarray(reference, dtype=np.int64)
+    if a.shape != b.shape or a.ndim != 1:
+        raise DataError("labellings differ in shape", got=a.shape, wanted=b.shape)
+    both = (a >= 0) & (b >= 0)
+    a, b = a[both], b[both]
+    cells, counts = np.unique(np.stack([a, b], 1), axis=0, return_counts=True)
+
+    def pairs(n: Ints) -> int:
+        return int(np.sum(n * (n - 1) // 2))
+
+    _, per_a = np.unique(a, return_counts=True)
+    _, per_b = np.unique(b, return_counts=True)
+    return PairAgreement(
+        observations=len(a),
+        together=pairs(per_a),
+        together_reference=pairs(per_b),
+        together_both=pairs(counts),
+        mixed=int(np.sum(np.unique(cells[:, 0], return_counts=True)[1] > 1)) if len(cells) else 0,
+        split=int(np.sum(np.unique(cells[:, 1], return_counts=True)[1] > 1)) if len(cells) else 0,
+    )
+
+
+def match_observations(
+    times: Array,
+    ranges: Array,
+    bearings: Array,
+    reference_times: Array,
+    reference_ranges: Array,
+    reference_bearings: Array,
+    *,
+    max_range_difference: float = 0.3,
+    max_bearing_difference: float = float(np.deg2rad(0.5)),
+    max_time_difference: float = 0.005,
+) -> Ints:
+    """Row of the reference for every observation ``(n,)``, -1 where there is none.
+
+    Both lists are in time order. Within one scan the nearest pairs (each difference divided by its gate) are taken
+    first, every row at most once.
+    """
+    out = np.full(len(times), -1, dtype=np.int64)
+    lo = np.searchsorted(reference_times, times - max_time_difference, "left")
+    hi = np.searchsorted(reference_times, times + max_time_difference, "right")
+    span = hi - lo
+    i = np.repeat(np.arange(len(times)), span)
+    j = np.arange(span.sum()) - np.repeat(np.cumsum(span) - span, span) + np.repeat(lo, span)
+    dr = np.abs(ranges[i] - reference_ranges[j]) / max_range_difference
+    db = np.abs(wrap_angle(bearings[i] - reference_bearings[j])) / max_bearing_difference
+    ok = (dr <= 1) & (db <= 1)
+    i, j, cost = i[ok], j[ok], np.hypot(dr[ok], db[ok])
+    taken: set[int] = set()
+    for k in np.argsort(cost, kind="stable"):
+        a, b = int(i[k]), int(j[k])
+        if out[a] < 0 and b not in taken:
+            out[a] = b
+            taken.add(b)
+    return out

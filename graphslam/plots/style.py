@@ -1,0 +1,79 @@
+"""Colours, sizes and the frame of every figure: the one place to change how graphslam's figures look.
+
+The palette is Okabe and Ito's (2008), which readers with any common colour vision tell apart. Meaning is never
+carried by colour alone: reference data are dashed or have a marker of their own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+YELLOW = "#F0E442"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
+GREY = "#6B6B6B"
+PALE = "#D9D9D9"
+
+# what a thing is -> its colour, in every figure
+ESTIMATE = BLUE
+LANDMARK = VERMILION
+TRUTH = BLACK
+GPS = GREEN
+DEAD_RECKONING = ORANGE
+BOUNDS = PALE
+
+# curves and bars that have no meaning of their own, in order
+CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
+LINE_STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+FIGURE_SIZE = (8.0, 5.5)
+DPI = 150
+
+
+def colour(k: int) -> str:
+    """Colour of item k of a series; repeats after the palette's length."""
+    return CYCLE[k % len(CYCLE)]
+
+
+def line(k: int) -> dict[str, Any]:
+    """Colour, marker and line style of curve k: distinct for 28 curves, also in grey."""
+    return {
+        "color": CYCLE[k % len(CYCLE)],
+        "linestyle": LINE_STYLES[(k // len(CYCLE)) % len(LINE_STYLES)],
+        "marker": MARKERS[k % len(MARKERS)],
+    }
+
+
+def new_axes(ax: Axes | None, size: tuple[float, float] = FIGURE_SIZE) -> Axes:
+    """``ax``, or the axes of a new figure; with the common frame."""
+    if ax is None:
+        _, ax = plt.subplots(figsize=size, dpi=DPI, layout="constrained")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(True, color=PALE, linewidth=0.5, alpha=0.6)
+    ax.set_axisbelow(True)
+    return ax
+
+
+def metric_axes(ax: Axes, x: str = "x", y: str = "y") -> None:
+    """Equal scales in metres: an angle on the map is an angle on the figure."""
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_xlabel(f"{x} [m]")
+    ax.set_ylabel(f"{y} [m]")
+
+
+def legend(ax: Axes, *, outside: bool = True, **options: Any) -> None:
+    """Legend, if there is anything to name; to the right of the axes, where it hides no data."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0} if outside else {}
+        options = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "fontsize": "small", **place, **options}
+        ax.legend(handles, labels, **options)

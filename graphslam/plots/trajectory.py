@@ -1,0 +1,68 @@
+"""Errors along a trajectory: against GPS, against a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from graphslam.evaluate.gps import GpsResiduals
+from graphslam.evaluate.trajectory_error import TrajectoryError
+from graphslam.plots import style
+
+# A pause between fixes longer than this starts a new segment: no line is drawn over it [s].
+SEGMENT_GAP = 2.0
+
+
+def plot_gps_residuals(
+    ax: Axes | None, residuals: GpsResiduals | Mapping[str, GpsResiduals], *, title: str | None = None
+) -> Axes:
+    """Distance between fixes and path against time, with RMSE and median of each trajectory.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    residuals : GpsResiduals, or mapping of label to GpsResiduals
+    """
+    ax = style.new_axes(ax, (7.0, 3.2))
+    top = 0.0
+    named = residuals if isinstance(residuals, Mapping) else {"path": residuals}
+    for k, (label, r) in enumerate(named.items()):
+        s = r.statistics
+        t, e = r.times, r.errors
+        breaks = np.flatnonzero(np.diff(t) > SEGMENT_GAP) + 1
+        t, e = np.insert(t, breaks, np.nan), np.insert(e, breaks, np.nan)
+        text = f"{label}: RMSE {s.rmse:.2f} m, median {s.median:.2f} m, {s.count} fixes"
+        ax.plot(t, e, color=style.colour(k), lw=0.5, marker=style.MARKERS[k], ms=2.5, label=text)
+        top = max(top, s.maximum)
+        ax.axhline(s.rmse, color=style.colour(k), lw=0.9, ls="--")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("distance to fix [m]")
+    ax.set_title(
+        title if title is not None else "GPS residuals (rigid alignment, no scale; dashed: RMSE)", fontsize="medium"
+    )
+    ax.set_ylim(0.0, top * (1.08 + 0.12 * len(named)))  # room for the legend
+    style.legend(ax, outside=False, loc="upper left")
+    return ax
+
+
+def plot_trajectory_error(
+    ax: Axes | None, errors: TrajectoryError | Mapping[str, TrajectoryError], *, title: str | None = None
+) -> Axes:
+    """Translation error against time (ATE or RPE)."""
+    ax = style.new_axes(ax, (7.0, 3.2))
+    top = 0.0
+    named = errors if isinstance(errors, Mapping) else {"estimate": errors}
+    for k, (label, e) in enumerate(named.items()):
+        text = f"{label}: RMSE {e.statistics.rmse:.3f} m, {e.pairs} pairs"
+        top = max(top, e.statistics.maximum)
+        ax.plot(e.times, e.translation, color=style.colour(k), lw=1.2, label=text)
+    first = next(iter(named.values()))
+    what = first.kind if first.delta is None else f"{first.kind} over {first.delta[0]:g} {first.delta[1]}"
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("translation error [m]")
+    ax.set_title(title if title is not None else f"{what}, alignment: {first.alignment}", fontsize="medium")
+    ax.set_ylim(0.0, top * (1.08 + 0.12 * len(named)))  # room for the legend
+    style.legend(ax, outside=False, loc="upper left")
+    return ax
