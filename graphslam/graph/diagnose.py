@@ -1,0 +1,141 @@
+"""Which variables a graph does not constrain, and what would fix them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from graphslam.core.errors import IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.records import Record
+from graphslam.graph.state import Layout, Values
+
+# Eigenvalues of the unit-diagonal matrix below this are rounding, not information: double precision keeps 1e-16 of the
+# largest, and a chain of a thousand honest submaps stays above 1e-9 (measured).
+_RANK_TOLERANCE = 1e-13
+# Share of a null direction that a variable must carry to be named.
+_SHARE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What :func:`diagnose` found.
+
+    Parameters
+    ----------
+    unconstrained : tuple of str
+        Names of variables that can move without changing the objective; empty if the graph determines everything.
+    remedies : tuple of str
+        One sentence each: what would fix them.
+    """
+
+    unconstrained: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Nothing is unconstrained."""
+        return not self.unconstrained
+
+    def raise_if_bad(self) -> None:
+        """Raise :class:`~graphslam.core.errors.IndeterminateError` naming the variables and the remedies."""
+        if not self.ok:
+            names = ", ".join(self.unconstrained[:12]) + (" …" if len(self.unconstrained) > 12 else "")
+            raise IndeterminateError(
+                f"{len(self.unconstrained)} unconstrained variables: {names}; {' '.join(self.remedies)}",
+                self.unconstrained,
+            )
+
+
+def unreached(records: Sequence[Record], layout: Layout) -> list[str]:
+    """Variables that no chain of factors ties to the fixed first base (cheap, no numbers)."""
+    parent: dict[str, str] = {n: n for n in [*layout.names(), "x0"]}
+
+    def root(a: str) -> str:
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        return a
+
+    touched = set()
+    for record in records:
+        names = record.variables()
+        touched.update(names)
+        for other in names[1:]:
+            parent[root(other)] = root(names[0])
+    # A prior ties its bias to a known value although no other factor has met it yet.
+    prior = {n for r in records if r.group == "gps-bias" for n in r.variables()}
+    home = {root("x0"), *(root(n) for n in prior)}
+    return [n for n in layout.names() if n not in touched or root(n) not in home]
+
+
+def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diagnosis:
+    """Find unconstrained variables by structure and by number.
+
+    Parameters
+    ----------
+    flat : FlatGraph
+    values : Values
+        Where to linearise.
+    waiting_fixes : int
+        GPS fixes without a datum yet (for the remedy's wording).
+    """
+    lay = flat.layout
+    lost = unreached(flat.records, lay)
+    if not lost:
+        system = flat.evaluate(values)
+        lost = _null_variables(system.A, lay)
+    if not lost:
+        return Diagnosis()
+    return Diagnosis(tuple(lost), tuple(_remedies(lost, flat, waiting_fixes)))
+
+
+def _null_variables(A: Array | sp.csc_matrix, lay: Layout) -> list[str]:
+    diagonal = np.asarray(A.diagonal())
+    owner = np.array(lay.owner_of_columns(), dtype=object)
+    if lay.size == 0:
+        return []
+    bad = ~(np.isfinite(diagonal) & (diagonal > 0))
+    if np.any(bad):
+        return list(dict.fromkeys(owner[bad]))
+    s = 1.0 / np.sqrt(diagonal)
+    if sp.issparse(A):
+        scaled = sp.csc_matrix(sp.diags(s) @ A @ sp.diags(s))
+        shifted = sp.csc_matrix(scaled + 1e-12 * sp.eye(lay.size))  # keeps a singular matrix factorable
+        w, V = spla.eigsh(scaled, k=min(12, lay.size - 1), sigma=0.0, OPinv=_inverse(shifted))
+        V = V[:, w < 10 * _RANK_TOLERANCE]
+    else:
+        w, V = np.linalg.eigh(A * s[:, None] * s)
+        V = V[:, w < _RANK_TOLERANCE * lay.size]
+    weight = np.max(np.abs(V), axis=1) if V.shape[1] else np.zeros(lay.size)
+    return list(dict.fromkeys(owner[weight > _SHARE]))
+
+
+def _inverse(matrix: sp.csc_matrix) -> spla.LinearOperator:
+    lu = spla.splu(matrix)
+    return spla.LinearOperator(matrix.shape, matvec=lu.solve, dtype=np.float64)  # type: ignore[arg-type]
+
+
+def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
+    out = []
+    nodes = [n for n in lost if n[0] == "x"]
+    if nodes:
+        first = min(int(n[1:]) for n in nodes)
+        out.append(
+            f"x{first} is not tied to x{first - 1}: add a submap or a between-factor from x{first - 1} to it, "
+            "or two landmarks that both sides saw."
+        )
+    landmarks = [n for n in lost if n[0] == "l"]
+    if landmarks and not nodes:
+        out.append(f"{landmarks[0]} is in no submap with a usable covariance: remove it or add a submap that saw it.")
+    if "datum" in lost:
+        fixes = sum(r.group == "gps" for r in flat.records)
+        out.append(f"the GPS datum hangs on {fixes} fixes ({waiting} waiting): it needs two that are metres apart.")
+    if any(n.startswith("bias") for n in lost):
+        out.append("a GPS bias has neither a prior nor a fix of its own: set bias_sigma.")
+    return out

@@ -1,0 +1,165 @@
+"""GPS fixes as factors on the submap that holds them.
+
+A fix at time t inside submap k sees the antenna at ``arm = T_start_body(t) · lever`` in the base frame of the submap,
+so the world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first
+base stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is solved for, not assumed.
+
+The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix is equally
+uncertain in all directions, so rotating it changes nothing, and there the uncertainty of the arm (from the submap's own
+trajectory) has a constant covariance that is simply added to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
+from graphslam.core.trajectory import Trajectory
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.state import Values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsConfig:
+    """How fixes enter the graph.
+
+    Parameters
+    ----------
+    robust : Robust
+        Kernel on each fix.
+    sigma : float or None
+        Standard deviation of a coordinate [m] in place of the stream's own.
+    baseline : float
+        Fixes wait until they span this distance [m], on the ground and in the map; then a rigid alignment starts
+        the datum.
+    bias_sigma : float or None
+        With a number [m]: one bias per GPS segment with that prior (default: none).
+    segment_gap : float
+        A pause longer than this [s] starts a new segment.
+    """
+
+    robust: Robust = NO_KERNEL
+    sigma: float | None = None
+    baseline: float = 20.0
+    bias_sigma: float | None = None
+    segment_gap: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "baseline", "bias_sigma", "segment_gap"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"gps.{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """A fix that has not become a factor yet."""
+
+    factor_id: int
+    time: float
+    position: Array
+    sigma: float
+    lever: Array
+    config: GpsConfig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiedFix:
+    """A fix with its place in a submap: all it needs but a datum."""
+
+    fix: Fix
+    node: int
+    arm: Array
+    covariance: Array
+
+
+def arm_of(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:
+    """Antenna in the base frame, and its covariance from the submap's own trajectory.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        ``T_start_body(t)``; covariances in the right tangent, none = the arm is taken as exact.
+    times : (q,)
+    lever : (2,)
+        Antenna in the body frame [m].
+
+    Returns
+    -------
+    arm : (q, 2)
+    covariance : (q, 2, 2)
+        ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, the derivative of ``T Exp(ξ) · lever``.
+    """
+    T = trajectory.interpolate(times)
+    arm = se2_transform(T, np.broadcast_to(lever, (len(T), 2)))
+    if trajectory.covariances is None:
+        return arm, np.zeros((len(T), 2, 2))
+    G = np.zeros((len(T), 2, 3))
+    R = rotation2(T[:, 2])
+    G[:, :, :2] = R
+    G[:, :, 2] = R @ np.array([-lever[1], lever[0]])
+    return arm, G @ trajectory.interpolate_covariance(times) @ np.swapaxes(G, 1, 2)
+
+
+def gps_residual(pose: Array, datum: Array, bias: Array, arm: Array, z: Array) -> Array:
+    """``arm - x⁻¹ T_gps_world⁻¹ (z - bias)``; every argument broadcasts over leading axes."""
+    p_world = (z - bias - datum[..., :2])[..., None, :] @ rotation2(datum[..., 2])
+    q = (p_world[..., 0, :] - pose[..., :2])[..., None, :] @ rotation2(pose[..., 2])
+    return np.asarray(arm - q[..., 0, :])
+
+
+def gps_jacobians(
+    values: Values, node: npt.NDArray[np.int64], arm: Array, z: Array, bias: npt.NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Residuals ``(q, 2)`` and Jacobians ``(q, 2, 8)`` on (x_node, datum, bias) in right tangents.
+
+    Parameters
+    ----------
+    node, bias : (q,) int
+        ``bias`` is -1 where a fix has none.
+    """
+    assert values.datum is not None
+    x, D = values.poses[node], values.datum
+    b = np.zeros_like(z)
+    has = bias >= 0
+    b[has] = values.biases[bias[has]]
+    Rx, RD = rotation2(x[:, 2]), rotation2(D[2])
+    p = (z - b - D[:2]) @ RD  # world position of the fix
+    q = np.einsum("kji,kj->ki", Rx, p - x[:, :2])  # in the base frame
+    J = np.zeros((len(z), 2, 8))
+    RxT = np.swapaxes(Rx, 1, 2)
+    J[:, :, :2] = np.eye(2)  # x Exp(ξ): q → Exp(-ξ) q
+    J[:, 0, 2], J[:, 1, 2] = -q[:, 1], q[:, 0]
+    J[:, :, 3:5] = RxT  # datum Exp(ξ): p → Exp(-ξ) p, seen through R_xᵀ
+    J[:, :, 5] = np.einsum("kij,kj->ki", RxT, np.stack([-p[:, 1], p[:, 0]], -1))
+    J[:, :, 6:8] = np.where(has[:, None, None], RxT @ RD.T, 0.0)
+    return arm - q, J
+
+
+def spread(points: Array) -> float:
+    """Greatest distance from the first point [m]: zero for none."""
+    return float(np.max(np.linalg.norm(points - points[0], axis=1))) if len(points) else 0.0
+
+
+def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
+    """First ``T_gps_world`` from antenna positions in the map and their fixes.
+
+    Rigid alignment, reweighted a few times with Cauchy weights of three sigma (at least 1 m), so that one wild fix
+    does not turn the datum.
+
+    Parameters
+    ----------
+    world, fixes : (q, 2)
+    sigma : (q,)
+    """
+    w = 1.0 / sigma**2
+    T = align_se2(world, fixes, w)
+    width = np.maximum(3.0 * sigma, 1.0)
+    for _ in range(10):
+        d = np.linalg.norm(se2_transform(T, world) - fixes, axis=1)
+        T = align_se2(world, fixes, w / (1.0 + (d / width) ** 2))
+    return T

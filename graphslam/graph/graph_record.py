@@ -1,0 +1,245 @@
+"""What a graph holds: factor records, values, landmark table, ledger, events; and every question one can ask of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, GraphSlamError
+from graphslam.core.geometry import Array
+from graphslam.core.trajectory import Trajectory
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.diagnose import Diagnosis, diagnose
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.gps_queue import GpsQueue
+from graphslam.graph.ledger import Ledger
+from graphslam.graph.records import BiasPriorRecord, GpsRecord, Record, SubmapRecord
+from graphslam.graph.score import Score, score
+from graphslam.graph.state import Values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapNode:
+    """What the graph keeps of a submap besides its factor."""
+
+    key: int
+    node: int
+    interval: tuple[float, float]
+    trajectory: Trajectory | None
+    factor_id: int
+
+
+class GraphRecord:
+    """The passive part of a :class:`~graphslam.graph.pose_graph.PoseGraph`.
+
+    Parameters
+    ----------
+    dim : int
+        2.
+
+    Attributes
+    ----------
+    values : Values
+        Best known values; solvers write them back.
+    records : dict of int to Record
+        Every factor by id.
+    ledger : Ledger
+    events : list of dict
+        What happened, in order; JSON-serialisable.
+    revision : int
+        Grows with every change of factors or variables.
+    """
+
+    def __init__(self, dim: int = 2) -> None:
+        if dim != 2:
+            raise ConfigError(f"PoseGraph works in two dimensions, got dim={dim}")
+        self.dim = dim
+        self.origin = np.zeros(3)
+        self.values = Values(np.zeros((1, 3)), np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+        self.records: dict[int, Record] = {}
+        self.ledger = Ledger()
+        self.events: list[dict[str, Any]] = []
+        self.revision = 0
+        self.submaps: list[SubmapNode] = []
+        self.gps = GpsQueue()
+        self.gps_origin: Array | None = None
+        self._row: dict[int, int] = {}
+        self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
+        self._retired: set[int] = set()  # ids merged away or removed: never used again
+        self._next_factor = 0
+        self._next_landmark = 0
+        self._flat: tuple[int, FlatGraph] | None = None
+        self._covariance: tuple[int, Values, JointCovariance] | None = None
+
+    # ---------------------------------------------------------------- changing
+
+    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
+        """Take a factor out and give its evidence back; landmarks that nothing sees any more go with it.
+
+        Removing a submap also removes the GPS fixes inside it, whose arms come from its trajectory, and, if it is the
+        last one, the last node.
+        """
+        record = self.records.pop(factor_id, None)
+        if record is None:
+            raise DataError(f"factor {factor_id} is not in the graph", wanted="the id of a factor")
+        self.ledger.refund(factor_id)
+        self.revision += 1
+        if isinstance(record, SubmapRecord):
+            for i in set(record.landmark_ids.tolist()):
+                self._seen_in[i].discard(factor_id)
+            self._drop_landmarks([i for i in set(record.landmark_ids.tolist()) if not self._seen_in[i]])
+        self._event("removed", factor_id=factor_id, factor=record.label(), reason=reason)
+        owner = next((s for s in self.submaps if s.factor_id == factor_id), None)
+        if owner is not None:
+            self._remove_fixes_of(owner)
+            used = {n for r in self.records.values() for n in r.variables()}
+            if owner is self.submaps[-1] and f"x{owner.node + 1}" not in used:
+                self.values.poses = self.values.poses[:-1].copy()
+                self.submaps.pop()
+        if self.values.datum is not None and not any(isinstance(r, GpsRecord) for r in self.records.values()):
+            for fid in [k for k, r in self.records.items() if isinstance(r, BiasPriorRecord)]:
+                self.ledger.refund(fid)
+                del self.records[fid]
+            self.values.datum, self.values.biases = None, np.zeros((0, 2))
+            self.revision += 1
+
+    def merge_landmarks(self, keep: int, drop: int) -> None:
+        """Two landmarks turned out to be one: factors on ``drop`` become factors on ``keep``."""
+        if keep == drop or keep not in self._row or drop not in self._row:
+            raise DataError("landmarks to merge are not two of the graph", got=(keep, drop), wanted="two known ids")
+        distance = float(np.linalg.norm(self.landmark(keep) - self.landmark(drop)))
+        for fid in self._seen_in[drop]:
+            record = self.records[fid]
+            assert isinstance(record, SubmapRecord)
+            ids = np.where(record.landmark_ids == drop, keep, record.landmark_ids)
+            self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
+            self._seen_in[keep].add(fid)
+        self._seen_in[drop] = set()
+        self._drop_landmarks([drop])
+        self.revision += 1
+        self._event("merged", keep=keep, drop=drop, distance=distance)
+
+    def set_values(self, values: Values) -> None:
+        """Take a solver's values (same variables).
+
+        Raises
+        ------
+        DataError
+            If they are not finite or are of other variables.
+        """
+        if not values.is_finite():
+            raise DataError("values of the graph are not finite", wanted="finite numbers")
+        if values.layout() != self.values.layout():
+            raise DataError("values are of other variables than the graph's", wanted="the same layout")
+        self.values = values
+
+    # ---------------------------------------------------------------- asking
+
+    def node_of(self, submap_key: int) -> int:
+        """Node at the base of a submap."""
+        for s in self.submaps:
+            if s.key == submap_key:
+                return s.node
+        raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")
+
+    def landmark(self, landmark_id: int) -> Array:
+        """World position of a landmark."""
+        return self.values.landmarks[self._row[landmark_id]]
+
+    def sightings(self, landmark_id: int) -> frozenset[int]:
+        """Factors that see a landmark."""
+        return frozenset(self._seen_in[landmark_id])
+
+    def landmark_ids_of(self, submap_key: int) -> npt.NDArray[np.int64]:
+        """Graph landmark of every entry of a submap, as it stands now."""
+        fid = next((s.factor_id for s in self.submaps if s.key == submap_key), None)
+        record = self.records.get(-1 if fid is None else fid)
+        return record.landmark_ids.copy() if isinstance(record, SubmapRecord) else np.zeros(0, dtype=np.int64)
+
+    def flat(self) -> FlatGraph:
+        """Flat arrays of the factors, made once per revision."""
+        if self._flat is None or self._flat[0] != self.revision:
+            self._flat = (self.revision, FlatGraph(list(self.records.values()), self.values.layout()))
+        return self._flat[1]
+
+    def covariance(self) -> JointCovariance:
+        """Joint covariance at the current values, made once per revision and values."""
+        c = self._covariance
+        if c is None or c[0] != self.revision or c[1] is not self.values:
+            system = self.flat().evaluate(self.values)
+            try:
+                cov = JointCovariance(self.flat().layout, system.A)
+            except GraphSlamError:
+                self.diagnose().raise_if_bad()
+                raise
+            self._covariance = c = (self.revision, self.values, cov)
+        return c[2]
+
+    def objective(self, values: Values | None = None) -> Score:
+        """χ² and dof per class of factor at ``values`` (default: the graph's)."""
+        flat = self.flat()
+        return score(flat, flat.evaluate(values or self.values, hessian=False).chi2)
+
+    def diagnose(self, values: Values | None = None) -> Diagnosis:
+        """Unconstrained variables and what would fix them; ``.raise_if_bad()`` makes it an error."""
+        waiting = len(self.gps.waiting) + len(self.gps.tied)
+        return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
+
+    def _repr_html_(self) -> str:
+        return (
+            f"<b>PoseGraph</b> {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, "
+            f"{len(self.records)} factors{self.objective()._repr_html_()}"
+        )
+
+    # ---------------------------------------------------------------- inside
+
+    def _insert(self, record: Record) -> None:
+        self.records[record.factor_id] = record
+        self._next_factor = max(self._next_factor, record.factor_id + 1)
+        self.revision += 1
+        if isinstance(record, SubmapRecord):
+            for i in record.landmark_ids.tolist():
+                self._seen_in[i].add(record.factor_id)
+
+    def _event(self, kind: str, **facts: Any) -> None:
+        self.events.append({"event": kind, **facts})
+
+    def _start_landmarks(self, ids: npt.NDArray[np.int64], world: Array) -> None:
+        new: dict[int, Array] = {}
+        for i, p in zip(ids.tolist(), world):
+            if i not in self._row and i not in new:
+                new[i] = p
+        for i in new:
+            self._row[i] = len(self._row)
+            self._seen_in[i] = set()
+        v = self.values
+        v.landmark_ids = np.concatenate([v.landmark_ids, np.array(list(new), dtype=np.int64)])
+        v.landmarks = np.concatenate([v.landmarks, np.array(list(new.values())).reshape(-1, 2)])
+
+    def _drop_landmarks(self, ids: Sequence[int]) -> None:
+        if not ids:
+            return
+        keep = ~np.isin(self.values.landmark_ids, np.asarray(ids))
+        self.values.landmark_ids = self.values.landmark_ids[keep]
+        self.values.landmarks = self.values.landmarks[keep]
+        self._row = {int(i): r for r, i in enumerate(self.values.landmark_ids)}
+        for i in ids:
+            self._seen_in.pop(i, None)
+            self._retired.add(i)
+
+    def _remove_fixes_of(self, s: SubmapNode) -> None:
+        inside = [r for r in self.records.values() if isinstance(r, GpsRecord) and r.node == s.node]
+        for r in inside:
+            del self.records[r.factor_id]
+        tied = [t.fix.factor_id for t in self.gps.tied if t.node == s.node]
+        self.gps.tied = [t for t in self.gps.tied if t.node != s.node]
+        self._drop_fixes([(i, "its submap was removed") for i in [*tied, *(r.factor_id for r in inside)]])
+
+    def _drop_fixes(self, dropped: Sequence[tuple[int, str]]) -> None:
+        for fid, reason in dropped:
+            self.ledger.refund(fid)
+            self._event("gps-dropped", factor_id=fid, reason=reason)

@@ -1,0 +1,102 @@
+"""Landmarks that turned out to be one.
+
+Two tests with different blind spots. The Mahalanobis test believes the covariances and never merges two landmarks of
+one submap, so it cannot repair a duplicate that a front end made inside a submap, nor a split from an over-confident
+covariance. The Euclidean test knows only how close two things of the kind can stand (trees do not grow within 0.7 m
+of each other, and the detector isolates them by metres) and repairs both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from graphslam.core.geometry import Array
+from graphslam.graph.pose_graph import PoseGraph
+
+
+def euclidean_merges(graph: PoseGraph, distance: float = 0.7, *, within_submap: bool = True) -> list[tuple[int, int]]:
+    """Landmarks closer than ``distance`` [m], as (keep, drop).
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    distance : float
+    within_submap : bool
+        Also merge two landmarks that one submap holds apart.
+
+    Returns
+    -------
+    list of (int, int)
+        Ready for :meth:`PoseGraph.merge_landmarks` in this order. Closest pairs first; the one seen more often (then
+        the older) is kept. A landmark that already moved into another is compared from where it went, so a row of
+        near ones does not collapse into one: every dropped landmark lies within ``distance`` of the one that is kept.
+    """
+    pairs = cKDTree(graph.values.landmarks).query_pairs(distance, output_type="ndarray")
+    if len(pairs) == 0:
+        return []
+    gaps = np.linalg.norm(graph.values.landmarks[pairs[:, 0]] - graph.values.landmarks[pairs[:, 1]], axis=1)
+    return _resolve(graph, pairs[np.argsort(gaps, kind="stable")], within_submap=within_submap, limit=distance)
+
+
+def mahalanobis_merges(graph: PoseGraph, gate: float = 11.8, *, distance: float = 5.0) -> list[tuple[int, int]]:
+    """Landmarks of different submaps that the joint covariance cannot tell apart, as (keep, drop).
+
+    ``d² = δᵀ (P_ii + P_jj - P_ij - P_ji)⁻¹ δ < gate`` with the graph's joint covariance, closest in d² first.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    gate : float
+        χ² with two degrees of freedom.
+    distance : float
+        Pairs further apart [m] are not looked at.
+    """
+    pairs = cKDTree(graph.values.landmarks).query_pairs(distance, output_type="ndarray")
+    ids = graph.values.landmark_ids
+    pairs = np.array([p for p in pairs if not _share(graph, int(ids[p[0]]), int(ids[p[1]]))]).reshape(-1, 2)
+    if len(pairs) == 0:
+        return []
+    covariance, lay = graph.covariance(), graph.flat().layout
+    d2 = np.empty(len(pairs))
+    for k, (a, b) in enumerate(pairs):
+        c = lay.landmark_start + 2 * np.array([a, a, b, b]) + np.array([0, 1, 0, 1])
+        P = covariance.columns(c)
+        S = P[:2, :2] + P[2:, 2:] - P[:2, 2:] - P[2:, :2]
+        delta = graph.values.landmarks[a] - graph.values.landmarks[b]
+        d2[k] = delta @ np.linalg.solve(S, delta)
+    order = np.argsort(d2, kind="stable")
+    return _resolve(graph, pairs[order[d2[order] < gate]], within_submap=False, limit=distance)
+
+
+def _share(graph: PoseGraph, i: int, j: int) -> bool:
+    """Does one submap hold both?"""
+    return bool(graph.sightings(i) & graph.sightings(j))
+
+
+def _resolve(graph: PoseGraph, pairs: Array, *, within_submap: bool, limit: float) -> list[tuple[int, int]]:
+    """Turn pairs of rows into merges, each landmark dropped at most once and never kept after."""
+    ids, points = graph.values.landmark_ids, graph.values.landmarks
+    seen = {int(i): set(graph.sightings(int(i))) for i in ids[np.unique(pairs)]}
+    home: dict[int, int] = {}
+    row = {int(i): r for r, i in enumerate(ids)}
+    members: dict[int, list[int]] = {i: [i] for i in seen}
+
+    def root(i: int) -> int:
+        while i in home:
+            i = home[i]
+        return i
+
+    merges = []
+    for a, b in pairs:
+        i, j = root(int(ids[a])), root(int(ids[b]))
+        if i == j or (not within_submap and seen[i] & seen[j]):
+            continue
+        keep, drop = (i, j) if (len(seen[i]), -i) >= (len(seen[j]), -j) else (j, i)
+        if any(np.linalg.norm(points[row[m]] - points[row[keep]]) > limit for m in members[drop]):
+            continue
+        home[drop] = keep
+        seen[keep] |= seen[drop]
+        members[keep] += members[drop]
+        merges.append((keep, drop))
+    return merges

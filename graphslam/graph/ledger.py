@@ -1,0 +1,164 @@
+"""The ledger: which measurement went into which factor. Nothing is spent twice.
+
+Every factor names the stream(s) and the interval it spends. Two entries of one stream whose intervals overlap are a
+double count and are refused, unless one of them is of a *declared* kind: a deliberate exception that says why, such
+as a laser scan that made a submap and also matches it to another. Intervals are half open, ``[t_start, t_end)``; an
+instant (``t_start == t_end``) belongs to the interval that starts there.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+EXCLUSIVE = "measurement"
+DECLARED = {
+    "shared-scan": "a scan that made a submap also registers it to another one",
+    "prior": "an assumption, not a measurement",
+}
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Entry:
+    """One spending: ``stream`` over ``[t_start, t_end)`` by a factor."""
+
+    t_start: float
+    t_end: float
+    stream: str
+    factor_id: int
+    factor: str
+    kind: str
+    note: str = ""
+
+
+class Ledger:
+    """Spent evidence of one graph.
+
+    Examples
+    --------
+    >>> ledger = Ledger()
+    >>> ledger.spend(0, "submap 0", ["laser", "odometry"], (0.0, 10.0))
+    >>> ledger.spend(1, "between x0 x1", ["odometry"], (9.0, 11.0))
+    Traceback (most recent call last):
+    ...
+    graphslam.core.errors.EvidenceReusedError: between x0 x1 would spend stream 'odometry' over [9.000, 11.000) s a \
+second time: submap 0 spent it over [0.000, 10.000) s
+    """
+
+    def __init__(self) -> None:
+        self._kinds = dict(DECLARED)
+        self._exclusive: dict[str, list[Entry]] = {}  # stream -> entries in order of start; they never overlap
+        self._by_factor: dict[int, list[Entry]] = {}
+
+    def declare(self, kind: str, reason: str) -> None:
+        """Declare a kind of factor that may share evidence, and why."""
+        if kind == EXCLUSIVE or not reason.strip():
+            raise ConfigError(f"ledger kind {kind!r} needs a name of its own and a reason")
+        self._kinds[kind] = reason
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """Declared kinds and their reasons."""
+        return dict(self._kinds)
+
+    def conflict(self, stream: str, interval: tuple[float, float]) -> Entry | None:
+        """The entry that already spent ``stream`` over an overlapping interval, or None."""
+        t0, t1 = interval
+        entries = self._exclusive.get(stream, [])
+        i = bisect_right(entries, t0, key=lambda e: e.t_start)
+        # the one that starts at or before t0, and the first that starts after it
+        for e in entries[max(i - 1, 0) : i + 1]:
+            if _overlap(e.t_start, e.t_end, t0, t1):
+                return e
+        return None
+
+    def check(self, factor: str, streams: Iterable[str], interval: tuple[float, float], kind: str = EXCLUSIVE) -> None:
+        """Raise if :meth:`spend` would.
+
+        Raises
+        ------
+        EvidenceReusedError
+            A stream of an exclusive factor is already spent over an overlapping interval.
+        ConfigError
+            The kind was not declared.
+        DataError
+            The interval is not finite or runs backwards.
+        """
+        t0, t1 = interval
+        if not (np.isfinite(t0) and np.isfinite(t1) and t0 <= t1):
+            raise DataError(f"interval of {factor} cannot be entered in the ledger", got=interval, wanted="t0 <= t1")
+        if kind != EXCLUSIVE:
+            if kind not in self._kinds:
+                raise ConfigError(f"ledger kind {kind!r} is not declared; known: {EXCLUSIVE}, {', '.join(self._kinds)}")
+            return
+        for stream in streams:
+            e = self.conflict(stream, interval)
+            if e is not None:
+                raise EvidenceReusedError(
+                    f"{factor} would spend stream {stream!r} over [{t0:.3f}, {t1:.3f}) s a second time: "
+                    f"{e.factor} spent it over [{e.t_start:.3f}, {e.t_end:.3f}) s"
+                )
+
+    def spend(
+        self,
+        factor_id: int,
+        factor: str,
+        streams: Iterable[str],
+        interval: tuple[float, float],
+        kind: str = EXCLUSIVE,
+        note: str = "",
+    ) -> None:
+        """Enter one factor; all streams or none (see :meth:`check` for the errors)."""
+        names = sorted(set(streams))
+        self.check(factor, names, interval, kind)
+        note = note or (self._kinds[kind] if kind != EXCLUSIVE else "")
+        for stream in names:
+            e = Entry(float(interval[0]), float(interval[1]), stream, factor_id, factor, kind, note)
+            if kind == EXCLUSIVE:
+                insort(self._exclusive.setdefault(stream, []), e)
+            self._by_factor.setdefault(factor_id, []).append(e)
+
+    def refund(self, factor_id: int) -> None:
+        """Take a factor's spendings back (the factor was removed)."""
+        for e in self._by_factor.pop(factor_id, []):
+            entries = self._exclusive.get(e.stream, [])
+            i = bisect_left(entries, e)
+            if i < len(entries) and entries[i] == e:
+                del entries[i]
+
+    def entries(self) -> list[Entry]:
+        """All entries in order of time."""
+        return sorted(e for es in self._by_factor.values() for e in es)
+
+    def __len__(self) -> int:
+        return sum(len(es) for es in self._by_factor.values())
+
+    def table(self) -> pd.DataFrame:
+        """The ledger as a table: one row a factor and stream."""
+        import pandas as pd
+
+        rows = [(e.factor_id, e.factor, e.stream, e.t_start, e.t_end, e.kind, e.note) for e in self.entries()]
+        return pd.DataFrame(rows, columns=["factor_id", "factor", "stream", "t_start", "t_end", "kind", "note"])
+
+    def _repr_html_(self) -> str:
+        return str(self.table()._repr_html_())  # type: ignore[operator]
+
+
+def _overlap(a0: float, a1: float, b0: float, b1: float) -> bool:
+    """Do two half-open intervals share an instant? An empty one counts as the instant where it stands."""
+    if a0 == a1 and b0 == b1:
+        return a0 == b0
+    if a0 == a1:
+        return b0 <= a0 < b1
+    if b0 == b1:
+        return a0 <= b0 < a1
+    return a0 < b1 and b0 < a1

@@ -1,0 +1,132 @@
+"""Numba kernels: Gauss-Newton blocks of landmark submaps, and their assembly. Plain arrays only."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+@nb.njit(cache=True)
+def submap_blocks(
+    poses: Array,
+    points: Array,
+    start: Index,
+    entry_offset: Index,
+    entry_row: Index,
+    z: Array,
+    z_offset: Index,
+    info: Array,
+    info_offset: Index,
+    hessian: bool,
+    H: Array,
+    H_offset: Index,
+    g: Array,
+    g_offset: Index,
+    chi2: Array,
+) -> None:
+    """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
+
+    Local variables of submap s are ``[x_start (3), x_{start+1} (3), entry_1 (2), …]``; an entry that stands twice is
+    two local variables here and is added up by the assembly.
+
+    Parameters
+    ----------
+    poses : (m + 1, 3); points : (n, 2)
+    start : (S,) node of each submap
+    entry_offset : (S + 1,); entry_row : (E,) rows of ``points``
+    z, z_offset : flat measurements; info, info_offset : flat row-major information matrices
+    hessian : bool, fill H as well
+    H, H_offset : flat ``(6 + 2n)²`` blocks out; g, g_offset : flat ``6 + 2n`` gradients out; chi2 : (S,) out
+    """
+    for s in range(start.shape[0]):
+        a, b = start[s], start[s] + 1
+        e0, e1 = entry_offset[s], entry_offset[s + 1]
+        n = e1 - e0
+        m = 3 + 2 * n
+        d = 6 + 2 * n
+        z0 = z_offset[s]
+        L = info[info_offset[s] : info_offset[s] + m * m].reshape(m, m)
+        ca, sa = np.cos(poses[a, 2]), np.sin(poses[a, 2])
+        # q: everything in the start frame; r = H(X) - z (eq. 15)
+        q = np.empty((n + 1, 2))
+        r = np.empty(m)
+        for i in range(n + 1):
+            if i == 0:
+                dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+            else:
+                row = entry_row[e0 + i - 1]
+                dx, dy = points[row, 0] - poses[a, 0], points[row, 1] - poses[a, 1]
+            q[i, 0] = ca * dx + sa * dy
+            q[i, 1] = -sa * dx + ca * dy
+            k = 0 if i == 0 else 1 + 2 * i
+            r[k] = q[i, 0] - z[z0 + k]
+            r[k + 1] = q[i, 1] - z[z0 + k + 1]
+        t = poses[b, 2] - poses[a, 2] - z[z0 + 2]
+        r[2] = np.pi - ((np.pi - t) % (2.0 * np.pi))
+        Lr = L @ r
+        chi2[s] = np.dot(r, Lr)
+        if not hessian:
+            continue
+        ce, se = np.cos(poses[b, 2] - poses[a, 2]), np.sin(poses[b, 2] - poses[a, 2])
+        M = np.zeros((m, d))  # Λ J, column block by column block
+        for row in range(m):
+            sx, sy, st = 0.0, 0.0, -L[row, 2]
+            for i in range(n + 1):
+                k = 0 if i == 0 else 1 + 2 * i
+                lx, ly = L[row, k], L[row, k + 1]
+                sx += lx
+                sy += ly
+                st += lx * q[i, 1] - ly * q[i, 0]
+                c = 3 if i == 0 else 4 + 2 * i
+                if i == 0:  # d/dx_end: R_sᵀ R_e
+                    M[row, 3] = lx * ce + ly * se
+                    M[row, 4] = -lx * se + ly * ce
+                else:  # d/dl: R_sᵀ
+                    M[row, c] = lx * ca - ly * sa
+                    M[row, c + 1] = lx * sa + ly * ca
+            M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st
+            M[row, 5] = L[row, 2]
+        h0 = H_offset[s]
+        g0 = g_offset[s]
+        B = H[h0 : h0 + d * d].reshape(d, d)
+        for c in range(d):  # Jᵀ M, the same sparsity of J applied to rows
+            sx, sy, st = 0.0, 0.0, -M[2, c]
+            for i in range(n + 1):
+                k = 0 if i == 0 else 1 + 2 * i
+                lx, ly = M[k, c], M[k + 1, c]
+                sx += lx
+                sy += ly
+                st += lx * q[i, 1] - ly * q[i, 0]
+                if i == 0:
+                    B[3, c] = lx * ce + ly * se
+                    B[4, c] = -lx * se + ly * ce
+                else:
+                    B[4 + 2 * i, c] = lx * ca - ly * sa
+                    B[5 + 2 * i, c] = lx * sa + ly * ca
+            B[0, c], B[1, c], B[2, c] = -sx, -sy, st
+            B[5, c] = M[2, c]
+        for c in range(d):
+            v = 0.0
+            for row in range(m):
+                v += M[row, c] * r[row]
+            g[g0 + c] = v
+
+
+@nb.njit(cache=True)
+def scatter_dense(columns: Index, offset: Index, H: Array, H_offset: Index, A: Array) -> None:
+    """Add every block ``H_s`` into ``A[columns_s, columns_s]``; a column of -1 belongs to the fixed first base."""
+    for s in range(offset.shape[0] - 1):
+        c0, d = offset[s], offset[s + 1] - offset[s]
+        h0 = H_offset[s]
+        for i in range(d):
+            ci = columns[c0 + i]
+            if ci < 0:
+                continue
+            for j in range(d):
+                cj = columns[c0 + j]
+                if cj >= 0:
+                    A[ci, cj] += H[h0 + i * d + j]

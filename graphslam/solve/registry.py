@@ -1,0 +1,54 @@
+"""Solvers by name. A solver is a class over a :class:`~graphslam.graph.pose_graph.PoseGraph` with a few verbs."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from graphslam.core.errors import UnknownNameError
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.batch import BatchSolver
+from graphslam.solve.isam2 import Isam2Solver
+from graphslam.solve.solution import Solution
+
+
+class Solver(Protocol):
+    """What every solver offers; it reads the graph at each call and writes its values back."""
+
+    graph: PoseGraph
+
+    def update(self) -> None:
+        """Take in what changed in the graph."""
+        ...
+
+    def solve_to_optimum(self) -> None:
+        """Go to the batch optimum reached from here."""
+        ...
+
+    def gap(self) -> float:
+        """Objective now less that optimum."""
+        ...
+
+    def covariance(self) -> JointCovariance:
+        """Joint covariance at the present values."""
+        ...
+
+    def solution(self, *, gap: bool = True) -> Solution:
+        """Values, score, and whether they are the optimum."""
+        ...
+
+
+SOLVERS: dict[str, type] = {"isam2": Isam2Solver, "batch": BatchSolver}
+
+
+def make_solver(name: str, graph: PoseGraph, **options: Any) -> Solver:
+    """A registered solver over ``graph``.
+
+    Raises
+    ------
+    UnknownNameError
+    """
+    if name not in SOLVERS:
+        raise UnknownNameError("solver", name, SOLVERS)
+    solver: Solver = SOLVERS[name](graph, **options)
+    return solver

@@ -1,0 +1,185 @@
+"""What a solver hands over: values with their uncertainty, and the honest word on whether it is the optimum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import MissingDataError
+from graphslam.core.geometry import Array, se2_adjoint, se2_compose, se2_inverse
+from graphslam.core.trajectory import Trajectory
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.pose_graph import PoseGraph, SubmapNode
+from graphslam.graph.score import Score, score
+from graphslam.graph.state import Values, vector_form
+from graphslam.solve.levenberg import Optimum
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A solved graph, independent of what happens to the graph afterwards.
+
+    Parameters
+    ----------
+    solver : str
+    values : Values
+    score : Score
+        χ² and dof per class of factor.
+    iterations : int
+        Of the solver so far (updates for an incremental one).
+    converged : bool
+        True only at the optimum: the decrease that the quadratic model still promises is negligible.
+    decrement : float
+        That promised decrease.
+    gap : float or None
+        Objective now less the batch optimum reached from here; None if it was not asked for.
+    seconds : float
+        Spent in the solver.
+    """
+
+    solver: str
+    values: Values
+    score: Score
+    iterations: int
+    converged: bool
+    decrement: float
+    gap: float | None
+    seconds: float
+    gps_origin: Array | None
+    _flat: FlatGraph = field(repr=False)
+    _submaps: Sequence[SubmapNode] = field(repr=False)
+
+    @property
+    def objective(self) -> float:
+        """``Σ rᵀ P⁻¹ r`` (no ½)."""
+        return self.score.total
+
+    @property
+    def poses(self) -> Array:
+        """Nodes ``(m + 1, 3)`` in the frame of the first base."""
+        return self.values.poses
+
+    @property
+    def landmark_ids(self) -> npt.NDArray[np.int64]:
+        """``(n,)``."""
+        return self.values.landmark_ids
+
+    @property
+    def landmarks(self) -> Array:
+        """``(n, 2)``."""
+        return self.values.landmarks
+
+    @property
+    def states(self) -> int:
+        """Free scalars; the fixed first base is not one."""
+        return self._flat.layout.size
+
+    @property
+    def T_gps_world(self) -> Array | None:
+        """Map → the GPS stream's own frame ``(3,)``, or None without GPS."""
+        if self.values.datum is None or self.gps_origin is None:
+            return None
+        return self.values.datum + np.append(self.gps_origin, 0.0)
+
+    @cached_property
+    def covariance(self) -> JointCovariance:
+        """Joint covariance at these values; made at the first use."""
+        return JointCovariance(self._flat.layout, self._flat.evaluate(self.values).A)
+
+    def marginal(self, name: str) -> Array:
+        """Covariance of one variable (``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``); poses in the right tangent."""
+        return self.covariance.marginal(name)
+
+    def joint_marginal(self, names: Iterable[str]) -> Array:
+        """Joint covariance of several variables in that order."""
+        return self.covariance.joint(names)
+
+    def node_covariances(self) -> Array:
+        """``(m + 1, 3, 3)``, right tangent; zeros for the fixed first base."""
+        return self.covariance.poses()
+
+    def landmark_covariances(self) -> Array:
+        """``(n, 2, 2)``."""
+        return self.covariance.landmarks()
+
+    def joint_covariance(self) -> Array:
+        """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base."""
+        lay = self._flat.layout
+        P = self.covariance.columns(np.arange(lay.datum_start))
+        return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
+
+    def trajectory(self, *, covariances: bool = True) -> Trajectory:
+        """Path at full rate: ``x_k ∘ T_start_body(t)`` for every submap with a trajectory of its own.
+
+        Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the node and the local path taken as
+        independent. Where two submaps share an instant the later one has it: a fresh base is surer than a long arm.
+
+        Raises
+        ------
+        MissingDataError
+            No submap has a trajectory.
+        """
+        P_nodes = self.node_covariances() if covariances else None
+        times, poses, covs = [], [], []
+        with_path = [s for s in self._submaps if s.trajectory is not None and len(s.trajectory)]
+        if not with_path:
+            raise MissingDataError("no submap has a trajectory", wanted="submaps with T_start_body(t)")
+        last = np.inf
+        for s in reversed(with_path):
+            local = s.trajectory
+            assert local is not None
+            keep = local.times < last
+            if not np.any(keep):
+                continue
+            T = local.poses[keep]
+            last = float(local.times[keep][0])
+            times.append(local.times[keep])
+            poses.append(se2_compose(self.values.poses[s.node], T))
+            if P_nodes is not None:
+                ad = se2_adjoint(se2_inverse(T))
+                P = ad @ P_nodes[s.node] @ np.swapaxes(ad, 1, 2)
+                covs.append(P if local.covariances is None else P + local.covariances[keep])
+        return Trajectory(
+            np.concatenate(times[::-1]),
+            np.concatenate(poses[::-1]),
+            np.concatenate(covs[::-1]) if covs else None,
+        )
+
+    def _repr_html_(self) -> str:
+        verdict = "at the optimum" if self.converged else f"not at its optimum (may still fall by {self.decrement:.3g})"
+        gap = "" if self.gap is None else f", gap {self.gap:.3g}"
+        return (
+            f"<b>Solution</b> ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
+            f"{self.objective:.4f}, {verdict}{gap}, {self.iterations} iterations, {self.seconds:.2f} s"
+            f"{self.score._repr_html_()}"
+        )
+
+
+# The decrement at which a solution counts as the optimum, relative to max(1, objective): far below what any figure
+# printed of an objective shows, far above rounding.
+CONVERGED = 1e-8
+
+
+def make_solution(
+    solver: str, graph: PoseGraph, optimum: Optimum, *, iterations: int, gap: float | None, seconds: float
+) -> Solution:
+    """A :class:`Solution` of the graph's present state from where an optimiser stands."""
+    flat = graph.flat()
+    return Solution(
+        solver=solver,
+        values=optimum.values.copy(),
+        score=score(flat, optimum.chi2),
+        iterations=iterations,
+        converged=optimum.decrement <= CONVERGED * max(1.0, optimum.objective),
+        decrement=optimum.decrement,
+        gap=gap,
+        seconds=seconds,
+        gps_origin=None if graph.gps_origin is None else graph.gps_origin.copy(),
+        _flat=flat,
+        _submaps=tuple(graph.submaps),
+    )
