@@ -1,0 +1,401 @@
+"""Submaps on disk: one npz each and an index, whole at every moment, the same bytes for the same submaps.
+
+``submaps/000000.npz`` … hold the submaps (``graphslam.submap/1``), ``submaps/index.json`` lists them
+(``graphslam.submaps/1``), ``truth.npz`` beside the folder holds the truth where it is known. A submap's file is written
+before the index names it, each under a temporary name that is then renamed: after a kill the store holds every submap
+the index names, and perhaps one file more, which is written again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
+from graphslam.core.geometry import tangent_to_vector_covariance
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.submap import DensePayload, LandmarkMap, Match, Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.atomic import read_json, read_npz, write_json, write_npz
+
+logger = logging.getLogger(__name__)
+
+SUBMAP_FORMAT = "graphslam.submap/1"
+INDEX_FORMAT = "graphslam.submaps/1"
+INDEX = "index.json"
+TRUTH = "truth.npz"
+
+GridLoader = Callable[[Path], DensePayload]
+
+
+def submap_arrays(submap: Submap) -> dict[str, Any]:
+    """Everything of a submap but its grid, as the arrays of its file."""
+    d = submap.dim
+    arrays: dict[str, Any] = {
+        "format": SUBMAP_FORMAT,
+        "key": np.int64(submap.key),
+        "interval": np.asarray(submap.interval, dtype=np.float64),
+        "dim": np.int64(d),
+        "exit_pose": submap.exit_pose,
+        "exit_covariance": submap.exit_covariance,
+        "has_landmarks": np.bool_(submap.landmarks is not None),
+        "used": np.array(sorted(submap.uses), dtype=np.str_),
+        "report": json.dumps(dict(submap.report), sort_keys=True, default=_plain),
+    }
+    landmarks = submap.landmarks
+    if landmarks is None:  # what measures the exit alone is still a joint Gaussian over [exit pose]
+        P = submap.exit_covariance
+        arrays["covariance"] = tangent_to_vector_covariance(submap.exit_pose, P) if d == 2 else P
+        arrays["landmark_ids"], arrays["landmarks"] = np.zeros(0, dtype=np.int64), np.zeros((0, d))
+    else:
+        arrays["landmark_ids"], arrays["landmarks"] = landmarks.ids, landmarks.positions
+        if landmarks.information is None:
+            arrays["covariance"] = landmarks.covariance
+        else:
+            for part in ("data", "indices", "indptr"):
+                arrays[f"information_{part}"] = getattr(landmarks.information, part)
+        if landmarks.sightings is not None:
+            arrays["sightings"] = landmarks.sightings
+    if submap.trajectory is not None:
+        arrays["trajectory_times"] = submap.trajectory.times
+        arrays["trajectory_poses"] = submap.trajectory.poses
+        if submap.trajectory.covariances is not None:
+            arrays["trajectory_covariances"] = submap.trajectory.covariances
+    if submap.cloud is not None:
+        arrays["cloud"] = submap.cloud
+    if submap.matches:
+        arrays["match_targets"] = np.array([q.target for q in submap.matches], dtype=np.int64)
+        arrays["match_poses"] = np.array([q.T_target_here for q in submap.matches])
+        arrays["match_covariances"] = np.array([q.covariance for q in submap.matches])
+        arrays["match_fitness"] = np.array([q.fitness for q in submap.matches])
+        arrays["match_support"] = np.array([q.support for q in submap.matches])
+    return arrays
+
+
+def _plain(value: Any) -> Any:
+    """NumPy scalars and arrays of a report as JSON values."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise FormatError("a submap's report holds something JSON has no word for", got=type(value).__name__)
+
+
+def submap_from_arrays(arrays: Mapping[str, Any], *, where: str) -> Submap:
+    """The submap that :func:`submap_arrays` wrote down; optional arrays may be missing.
+
+    Raises
+    ------
+    FormatError
+        An array is missing or of the wrong kind.
+    DataError
+        Its values are impossible (the particular kind of :class:`DataError` is kept); names the file.
+    """
+
+    def need(name: str) -> Any:
+        if name not in arrays:
+            raise FormatError(f"array {name!r} is missing", where=where, got=sorted(arrays))
+        return arrays[name]
+
+    try:
+        dim, d = int(need("dim")), {2: 3, 3: 6}.get(int(need("dim")))
+        exit_pose = np.asarray(need("exit_pose"), dtype=np.float64)
+        if d is None or exit_pose.shape != ({2: 3, 3: 7}[dim],):
+            raise FormatError("dim and exit_pose do not agree", where=where, got=(dim, exit_pose.shape))
+        interval = np.asarray(need("interval"), dtype=np.float64)
+        if interval.shape != (2,):
+            raise FormatError("interval is not two times", where=where, got=interval.shape)
+        rest: dict[str, Any] = {
+            "uses": frozenset(str(s) for s in np.asarray(arrays.get("used", ()), dtype=np.str_).ravel()),
+            "report": json.loads(str(arrays["report"])) if "report" in arrays else {},
+            "trajectory": _trajectory(arrays),
+            "matches": _matches(arrays),
+            "cloud": arrays.get("cloud"),
+        }
+        key, span = int(need("key")), (float(interval[0]), float(interval[1]))
+        if bool(arrays.get("has_landmarks", True)):
+            landmarks = _landmark_map(arrays, need, exit_pose, dim, d, where)
+            if "exit_covariance" not in arrays:
+                return Submap.from_landmarks(key, landmarks, interval=span, **rest)
+            rest["landmarks"] = landmarks
+        return Submap(key=key, interval=span, exit_pose=exit_pose, exit_covariance=need("exit_covariance"), **rest)
+    except DataError as error:
+        if error.where is not None and error.where.startswith(where):
+            raise
+        inside = f"{where}: {error.where}" if error.where else where
+        raise type(error)(error.what, where=inside, got=error.got, wanted=error.wanted) from None
+    except (ValueError, TypeError, KeyError) as error:
+        raise FormatError(f"an array is of the wrong kind ({error})", where=where) from None
+
+
+def _landmark_map(
+    arrays: Mapping[str, Any], need: Callable[[str], Any], exit_pose: Any, dim: int, d: int, where: str
+) -> LandmarkMap:
+    ids = np.asarray(need("landmark_ids"))
+    positions = np.asarray(need("landmarks"), dtype=np.float64)
+    if ids.ndim != 1 or (len(ids) and not np.issubdtype(ids.dtype, np.integer)):
+        raise FormatError("landmark_ids are not a list of integers", where=where, got=f"{ids.dtype} {ids.shape}")
+    if positions.size != len(ids) * dim:
+        raise FormatError("landmarks do not fit landmark_ids", where=where, got=positions.shape, wanted=(len(ids), dim))
+    information = None
+    if "covariance" not in arrays:
+        n = d + dim * len(ids)
+        parts = [np.asarray(need(f"information_{p}")) for p in ("data", "indices", "indptr")]
+        information = sp.csc_matrix((parts[0], parts[1], parts[2]), shape=(n, n))
+        information.check_format(full_check=True)
+    return LandmarkMap(
+        ids=ids.astype(np.int64),
+        exit_pose=exit_pose,
+        positions=positions,
+        covariance=arrays.get("covariance"),
+        information=information,
+        sightings=arrays.get("sightings"),
+    )
+
+
+def _trajectory(arrays: Mapping[str, Any]) -> Trajectory | None:
+    if "trajectory_times" not in arrays or len(arrays["trajectory_times"]) == 0:
+        return None
+    return Trajectory(arrays["trajectory_times"], arrays["trajectory_poses"], arrays.get("trajectory_covariances"))
+
+
+def _matches(arrays: Mapping[str, Any]) -> tuple[Match, ...]:
+    if "match_targets" not in arrays:
+        return ()
+    names = ("targets", "poses", "covariances", "fitness", "support")
+    return tuple(
+        Match(target=int(t), T_target_here=T, covariance=P, fitness=float(f), support=float(s))
+        for t, T, P, f, s in zip(*(arrays[f"match_{n}"] for n in names), strict=True)
+    )
+
+
+class SubmapStore:
+    """A folder of submaps.
+
+    Parameters
+    ----------
+    path : path
+        The folder ``submaps/``, or its parent. It is made by the first :meth:`append`.
+    load_grid : callable, optional
+        Reads ``<name>.grid.npz``; without it submaps come back without their grid.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, load_grid: GridLoader | None = None) -> None:
+        root = Path(path)
+        inner = root / "submaps"
+        self.path = inner if not (root / INDEX).is_file() and inner.is_dir() else root
+        self._load_grid = load_grid
+        self._entries: list[dict[str, Any]] | None = None
+
+    @property
+    def entries(self) -> list[dict[str, Any]]:
+        """The index: key, file, interval and number of landmarks of every submap. Empty where there is none yet.
+
+        Raises
+        ------
+        FormatError
+        """
+        if self._entries is None:
+            file = self.path / INDEX
+            self._entries = _read_index(file) if file.exists() else []
+        return self._entries
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, k: int) -> Submap:
+        """Submap k of the index (not: of key k).
+
+        Raises
+        ------
+        FormatError, MissingDataError, DataError
+            Names the file.
+        """
+        entry = self.entries[k]
+        file = self.path / entry["file"]
+        submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT), where=str(file))
+        found = {**_entry(submap), "file": entry["file"]}
+        if found != entry:
+            raise FormatError("index and file do not agree", where=str(file), got=found, wanted=entry)
+        grid = file.with_suffix(".grid.npz")
+        if self._load_grid is not None and grid.exists():
+            submap = replace(submap, grid=self._load_grid(grid))
+        return submap
+
+    def __iter__(self) -> Iterator[Submap]:
+        return (self[k] for k in range(len(self)))
+
+    def read_all(self) -> list[Submap]:
+        """Every submap of the index, in order."""
+        return list(self)
+
+    def append(self, submap: Submap) -> None:
+        """Write one submap, then the index that names it.
+
+        Raises
+        ------
+        DataError
+            Keys must rise, and the dimension must stay.
+        """
+        entries = self.entries
+        if entries and submap.key <= entries[-1]["key"]:
+            raise DataError(
+                "submap key does not rise", where=str(self.path), got=submap.key, wanted=f"> {entries[-1]['key']}"
+            )
+        if entries and submap.dim != self._dim():
+            raise DataError(f"submap {submap.key} is {submap.dim}-D", where=str(self.path), wanted=f"{self._dim()}-D")
+        self.path.mkdir(parents=True, exist_ok=True)
+        entry = _entry(submap)
+        file = self.path / entry["file"]
+        if submap.grid is not None:
+            final = file.with_suffix(".grid.npz")
+            temporary = final.with_name(f".{final.stem}.part.npz")
+            submap.grid.save(temporary)
+            temporary.replace(final)
+        write_npz(file, submap_arrays(submap))
+        self._write_index([*entries, entry], submap.dim)
+
+    def complete_prefix(self) -> list[Submap]:
+        """The submaps from the first up to the last before anything is missing, damaged, or not what the index says.
+
+        What a resumed run can trust: half-written temporary files and files the index does not name are ignored.
+        """
+        whole: list[Submap] = []
+        for k in range(len(self)):
+            try:
+                whole.append(self[k])
+            except GraphSlamError as error:
+                logger.warning("submap store ends after %d of %d submaps: %s", k, len(self), error)
+                break
+        return whole
+
+    def truncate(self, count: int) -> None:
+        """Forget all but the first ``count`` submaps, and remove what else lies in the folder from a killed run."""
+        kept = self.entries[:count]
+        if not self.path.is_dir():
+            return
+        if len(kept) < len(self.entries):
+            self._write_index(kept, self._dim())
+        names = {e["file"] for e in kept} | {e["file"].replace(".npz", ".grid.npz") for e in kept}
+        for stray in [*self.path.glob("*.npz"), *self.path.glob(".*.part"), *self.path.glob(".*.part.npz")]:
+            if stray.name not in names:
+                stray.unlink(missing_ok=True)
+
+    def _dim(self) -> int:
+        return int(read_json(self.path / INDEX, fmt=INDEX_FORMAT)["dim"])
+
+    def _write_index(self, entries: list[dict[str, Any]], dim: int) -> None:
+        write_json(self.path / INDEX, {"format": INDEX_FORMAT, "dim": dim, "count": len(entries), "submaps": entries})
+        self._entries = entries
+
+
+def _entry(submap: Submap) -> dict[str, Any]:
+    return {
+        "key": int(submap.key),
+        "file": f"{submap.key:06d}.npz",
+        "interval": [float(t) for t in submap.interval],
+        "landmarks": 0 if submap.landmarks is None else len(submap.landmarks),
+    }
+
+
+def _read_index(file: Path) -> list[dict[str, Any]]:
+    index = read_json(file, fmt=INDEX_FORMAT)
+    try:
+        entries: list[dict[str, Any]] = [
+            {
+                "key": int(e["key"]),
+                "file": str(e["file"]),
+                "interval": [float(t) for t in e["interval"]],
+                "landmarks": int(e["landmarks"]),
+            }
+            for e in index["submaps"]
+        ]
+        dim, count = int(index["dim"]), int(index["count"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"an entry is missing or of the wrong kind ({error!r})", where=str(file)) from None
+    if count != len(entries) or dim not in (2, 3):
+        raise FormatError("count or dim is wrong", where=str(file), got=(count, dim), wanted=(len(entries), "2 or 3"))
+    for e in entries:
+        if Path(e["file"]).name != e["file"] or e["file"] in ("", ".", ".."):
+            raise FormatError("a submap lies outside the folder", where=str(file), got=e["file"], wanted="a file name")
+    keys = [e["key"] for e in entries]
+    if any(b <= a for a, b in itertools.pairwise(keys)):
+        raise FormatError("keys do not rise", where=str(file), got=keys)
+    return entries
+
+
+def read_submaps(path: str | os.PathLike[str], *, load_grid: GridLoader | None = None) -> list[Submap]:
+    """All submaps of a store.
+
+    Parameters
+    ----------
+    path : path
+        The folder ``submaps/``, or its parent (a run folder).
+    load_grid : callable, optional
+        See :class:`SubmapStore`.
+
+    Raises
+    ------
+    MissingDataError
+        No store there.
+    FormatError, DataError
+        Names the file.
+    """
+    store = SubmapStore(path, load_grid=load_grid)
+    if not (store.path / INDEX).is_file():
+        raise MissingDataError("no submap store", where=str(path), wanted=f"a folder with {INDEX}, or its parent")
+    return store.read_all()
+
+
+def write_submaps(path: str | os.PathLike[str], submaps: list[Submap], *, truth: MapTruth | None = None) -> None:
+    """Write ``path/submaps/`` anew, and ``path/truth.npz`` where the truth is known."""
+    store = SubmapStore(Path(path) / "submaps")
+    store.truncate(0)
+    for submap in submaps:
+        store.append(submap)
+    if truth is not None:
+        write_truth(path, truth)
+
+
+def write_truth(path: str | os.PathLike[str], truth: MapTruth) -> None:
+    """Write ``path/truth.npz``, beside the folder ``submaps/``."""
+    names = ("keys", "exit_poses", "landmark_ids", "landmarks")
+    write_npz(Path(path) / TRUTH, {n: getattr(truth, n) for n in names})
+
+
+def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
+    """The truth beside a store, or None where it is not known.
+
+    Parameters
+    ----------
+    path : path
+        The folder ``submaps/``, its parent, or the file.
+
+    Raises
+    ------
+    FormatError, GeometryError
+        Names the file.
+    """
+    root = Path(path)
+    candidates = [root] if root.suffix == ".npz" else [root / TRUTH, root.parent / TRUTH]
+    if root.suffix != ".npz" and not (root / INDEX).is_file():
+        candidates = candidates[:1]  # a run folder: what lies beside it is somebody else's
+    file = next((c for c in candidates if c.is_file()), None)
+    if file is None:
+        return None
+    arrays = read_npz(file, fmt="none")
+    try:
+        return MapTruth(**{n: arrays[n] for n in ("keys", "exit_poses", "landmark_ids", "landmarks")})
+    except KeyError as error:
+        raise FormatError(f"array {error} is missing", where=str(file), got=sorted(arrays)) from None
+    except GeometryError as error:
+        raise GeometryError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"an array is of the wrong kind ({error})", where=str(file)) from None

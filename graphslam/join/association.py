@@ -1,0 +1,318 @@
+"""Which landmarks of the next map are known already (Combined SLAM B7, Algorithm 1).
+
+Candidates are found by geometry: earlier submaps whose start is near, then their landmarks that are near. Only the
+covariance of the last pose and the candidates is recovered, by sparse solves. Two rules decide: the nearest neighbour
+by Mahalanobis distance, or the largest jointly compatible set, searched from many starts with every accepted pair
+conditioning the rest. Both are exclusive: one landmark, one entry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, se2_compose
+from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
+
+Index = npt.NDArray[np.intp]
+
+# Working memory of a joint search: 8 million doubles. Where two halves of a run meet, fewer beams must do.
+_BEAM_SCALARS = 8_000_000
+
+
+@dataclass(frozen=True)
+class Association:
+    """How landmarks are recognised.
+
+    Parameters
+    ----------
+    rule : "nearest" or "joint"
+        Nearest neighbour, or joint compatibility.
+    sensor_range : float
+        TH1 of Algorithm 1 [m]: submaps whose starts are within twice this may have seen the same landmarks.
+    radius : float
+        TH2 of Algorithm 1 [m]: how far a candidate may be from where it is expected, beyond ``margin`` standard
+        deviations of that expectation.
+    margin : float
+        Standard deviations of the pose added to both radii, so that a loop is found again after a long drift.
+    confidence : float
+        Probability of the chi-square gates.
+    starts : int
+        Beams of the joint search.
+    """
+
+    rule: Literal["nearest", "joint"] = "joint"
+    sensor_range: float = 45.0
+    radius: float = 3.0
+    margin: float = 3.0
+    confidence: float = 0.9973
+    starts: int = 25
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("nearest", "joint"):
+            raise ConfigError(f"unknown association rule {self.rule!r}; wanted 'nearest' or 'joint'")
+        if not (self.sensor_range > 0 and self.radius > 0 and self.margin >= 0 and self.starts >= 1):
+            raise ConfigError("association radii must be positive and at least one start is needed")
+        if not 0.0 < self.confidence < 1.0:
+            raise ConfigError(f"association confidence is {self.confidence}; wanted 0 < p < 1")
+
+
+def associate(a: MapView, b: MapView, options: Association) -> Index:
+    """Match the landmarks of B, which starts where A ends, to those of A.
+
+    Returns
+    -------
+    (L_b,)
+        Landmark of A, or -1.
+    """
+    match = np.full(len(b.landmark_at), -1, dtype=np.intp)
+    near_b, near_a = _candidate_pairs(a, b, options)
+    if len(near_b) == 0:
+        return match
+    own, i = np.unique(near_b, return_inverse=True)  # landmarks of B at stake
+    known, j = np.unique(near_a, return_inverse=True)  # landmarks of A at stake
+    start = a.pose_at[-1] + np.arange(3)
+    P = a.covariance_block(np.concatenate([start, landmark_scalars(a.landmark_at[known]).ravel()]))
+    Q = b.covariance_block(landmark_scalars(b.landmark_at[own]).ravel())
+    pairs = CandidatePairs.predict(
+        a.x[start], a.x[landmark_scalars(a.landmark_at[known])], P, b.x[landmark_scalars(b.landmark_at[own])], Q, i, j
+    )
+    gate = chi2_quantile(options.confidence, 2)
+    pairs = pairs.subset(pairs.mahalanobis2() <= gate)  # individual compatibility
+    chosen = pairs.nearest() if options.rule == "nearest" else pairs.joint(options.confidence, options.starts)
+    match[own[pairs.i[chosen]]] = known[pairs.j[chosen]]
+    return match
+
+
+def _candidate_pairs(a: MapView, b: MapView, options: Association) -> tuple[Index, Index]:
+    """Pairs (landmark of B, landmark of A) that geometry allows: Algorithm 1, TH1 and TH2."""
+    none = np.zeros(0, dtype=np.intp)
+    if len(a.landmark_at) == 0 or len(b.landmark_at) == 0:
+        return none, none
+    last = a.x[a.pose_at[-1] : a.pose_at[-1] + 3]
+    P = a.covariance_block(a.pose_at[-1] + np.arange(3))
+
+    def spread(local: Array) -> Array:  # standard deviation of where a point at `local`, seen from the last pose, is
+        return np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1] + P[2, 2] * np.sum(local**2, axis=-1))
+
+    # B's inner starts drift too, relative to its own base.
+    starts_a = np.vstack([np.zeros((1, 2)), a.x[landmark_scalars(a.pose_at[:-1])]])
+    local = np.vstack([np.zeros((1, 3)), b.x[pose_scalars(b.pose_at[:-1])]])
+    sigma = spread(local[:, :2])
+    if len(local) > 1:
+        inner = b.pose_at[:-1]
+        C = b.covariance_block(landmark_scalars(inner).ravel())
+        sigma[1:] = np.sqrt(sigma[1:] ** 2 + np.diag(C).reshape(-1, 2).sum(axis=1))
+    starts_b = se2_compose(last, local)[:, :2]
+    distance = np.linalg.norm(starts_b[:, None] - starts_a[None], axis=-1)
+    near = distance <= 2.0 * options.sensor_range + options.margin * sigma[:, None]
+    from_b = np.unique(np.concatenate([none, *(b.entries[k] for k in np.flatnonzero(near.any(axis=1)))]))
+    from_a = np.unique(np.concatenate([none, *(a.entries[k] for k in np.flatnonzero(near.any(axis=0)))]))
+    if len(from_a) == 0 or len(from_b) == 0:
+        return none, none
+    z = b.x[landmark_scalars(b.landmark_at[from_b])]
+    c, s = np.cos(last[2]), np.sin(last[2])
+    expected = last[:2] + z @ np.array([[c, s], [-s, c]])
+    sigma_z = spread(z)
+    if len(local) > 1:
+        C = b.covariance_block(landmark_scalars(b.landmark_at[from_b]).ravel())
+        sigma_z = np.sqrt(sigma_z**2 + np.diag(C).reshape(-1, 2).sum(axis=1))
+    tree = cKDTree(a.x[landmark_scalars(a.landmark_at[from_a])])
+    hits = tree.query_ball_point(expected, options.radius + options.margin * sigma_z, return_sorted=True)
+    count = np.array([len(h) for h in hits], dtype=np.intp)
+    j = np.concatenate([none, *(np.asarray(h, dtype=np.intp) for h in hits)])
+    return from_b[np.repeat(np.arange(len(hits)), count)], from_a[j]
+
+
+@dataclass(frozen=True)
+class CandidatePairs:
+    """Innovations of candidate pairs with their joint covariance, kept as its parts.
+
+    Parameters
+    ----------
+    i, j : (p,)
+        Which observation and which known landmark each pair joins.
+    innovation : (p, 2)
+        ``z_i - R(θ)ᵀ (f_j - p)``.
+    jacobian : (p, 2, 5)
+        With respect to the pose (3) and the known landmark (2).
+    P : (3 + 2c, 3 + 2c)
+        Covariance of the pose and the known landmarks.
+    Q : (2o, 2o)
+        Covariance of the observations.
+    """
+
+    i: Index
+    j: Index
+    innovation: Array
+    jacobian: Array
+    P: Array
+    Q: Array
+
+    @classmethod
+    def predict(
+        cls, pose: Array, known: Array, P: Array, observed: Array, Q: Array, i: Index, j: Index
+    ) -> CandidatePairs:
+        """Innovations of the pairs ``(i, j)``; ``known`` ``(c, 2)`` in the frame of ``pose``, ``observed`` from it."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        Rt = np.array([[c, s], [-s, c]])
+        q = (known[j] - pose[:2]) @ Rt.T
+        J = np.empty((len(i), 2, 5))
+        J[:, :, :2], J[:, :, 3:] = -Rt, Rt
+        J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
+        return cls(i, j, observed[i] - q, J, P, Q)
+
+    def subset(self, keep: npt.ArrayLike) -> CandidatePairs:
+        """The pairs ``keep`` (mask or indices)."""
+        k = np.arange(len(self.i))[np.asarray(keep)]
+        return CandidatePairs(self.i[k], self.j[k], self.innovation[k], self.jacobian[k], self.P, self.Q)
+
+    def _own_scalars(self) -> tuple[Index, Index]:
+        state = np.concatenate([np.tile(np.arange(3), (len(self.j), 1)), 3 + landmark_scalars(2 * self.j)], axis=1)
+        return state, landmark_scalars(2 * self.i)
+
+    def covariances(self) -> Array:
+        """Innovation covariance of every pair by itself ``(p, 2, 2)``."""
+        state, obs = self._own_scalars()
+        P = self.P[state[:, :, None], state[:, None, :]]
+        return self.jacobian @ P @ self.jacobian.swapaxes(1, 2) + self.Q[obs[:, :, None], obs[:, None, :]]
+
+    def joint_covariance(self) -> Array:
+        """Innovation covariance of all pairs together ``(2p, 2p)``."""
+        p = len(self.i)
+        state, obs = self._own_scalars()
+        J = np.zeros((2 * p, len(self.P)))
+        rows = landmark_scalars(2 * np.arange(p))
+        J[rows[:, :, None], state[:, None, :]] = self.jacobian
+        return J @ self.P @ J.T + self.Q[np.ix_(obs.ravel(), obs.ravel())]
+
+    def mahalanobis2(self) -> Array:
+        """Squared distance of every pair by itself ``(p,)``."""
+        return _quadratic(self.innovation, self.covariances())[0]
+
+    def nearest(self) -> Index:
+        """Exclusive nearest neighbours: the smallest Mahalanobis distance of all is taken first, and so on."""
+        return _take_exclusively(np.argsort(self.mahalanobis2(), kind="stable"), self.i, self.j)
+
+    def joint(self, confidence: float, starts: int) -> Index:
+        """Largest jointly compatible set that a beam search finds.
+
+        Every beam begins with one pair and takes, again and again, the likeliest pair that is compatible *given* those
+        taken, as long as the whole set stays inside its chi-square gate. Conditioning uses rows ``w`` of a partial
+        Cholesky factor of the joint covariance C: ``C | taken = C - Σ wᵀ w``, so that C is formed once.
+        """
+        p = len(self.i)
+        if p == 0:
+            return np.zeros(0, dtype=np.intp)
+        C = self.joint_covariance()
+        d2 = self.mahalanobis2()
+        # The best pairs of every observation come first, so that no cluttered corner eats all the beams.
+        order = np.lexsort((d2, self.i))
+        rank = np.empty(p, dtype=np.intp)
+        first = np.searchsorted(self.i[order], self.i[order])
+        rank[order] = np.arange(p) - first
+        most = int(min(len(np.unique(self.i)), len(np.unique(self.j))))
+        affordable = max(1, _BEAM_SCALARS // (4 * most * p))
+        seeds = np.lexsort((d2, rank))[: min(starts, affordable)]
+        gates = np.array([chi2_quantile(confidence, 2 * (t + 1)) for t in range(most)])
+
+        B = len(seeds)
+        beam = np.arange(B)
+        nu = np.tile(self.innovation, (B, 1, 1))
+        S = np.tile(self.covariances(), (B, 1, 1, 1))
+        W = np.zeros((B, 2 * most, 2 * p))
+        taken = np.full((B, most), -1, dtype=np.intp)
+        total, cost = np.zeros(B), np.zeros(B)
+        free = np.ones((B, p), dtype=bool)
+        alive = np.ones(B, dtype=bool)
+        for t in range(most):
+            d2, logdet = _quadratic(nu, S)
+            allowed = free & (d2 <= gates[0]) & (total[:, None] + d2 <= gates[t])
+            score = np.where(allowed, d2 + logdet, np.inf)
+            pick = seeds if t == 0 else np.argmin(score, axis=1)
+            alive &= np.isfinite(score[beam, pick])
+            if not np.any(alive):
+                break
+            live, k = beam[alive], pick[alive]
+            taken[live, t] = k
+            total[live] += d2[live, k]
+            cost[live] += score[live, k]
+            cross = C[landmark_scalars(2 * k)]  # (live, 2, 2p)
+            if t:
+                past = W[live, : 2 * t]
+                cross = (
+                    cross - np.take_along_axis(past, landmark_scalars(2 * k)[:, None, :], axis=2).swapaxes(1, 2) @ past
+                )
+            L = np.linalg.cholesky(S[live, k])
+            w = np.linalg.solve(L, cross)
+            W[live, 2 * t : 2 * t + 2] = w
+            white = np.linalg.solve(L, nu[live, k][..., None])
+            wp = w.reshape(len(live), 2, p, 2)
+            nu[live] -= np.einsum("brpx,br->bpx", wp, white[..., 0])
+            S[live] -= np.einsum("brpx,brpy->bpxy", wp, wp)
+            free[live] &= (self.i != self.i[k][:, None]) & (self.j != self.j[k][:, None])
+        size = np.sum(taken >= 0, axis=1)
+        best = np.lexsort((cost, -size))[0]
+        return taken[best, : size[best]]
+
+
+def _quadratic(nu: Array, S: Array) -> tuple[Array, Array]:
+    """``νᵀ S⁻¹ ν`` and ``ln det S`` of stacked 2-vectors and 2×2 matrices.
+
+    A pair that is known exactly once others are taken (two entries for one thing) has no say: its distance is infinite.
+    """
+    det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
+    fit = det > 0
+    safe = np.where(fit, det, 1.0)
+    d2 = S[..., 1, 1] * nu[..., 0] ** 2 - 2.0 * S[..., 0, 1] * nu[..., 0] * nu[..., 1] + S[..., 0, 0] * nu[..., 1] ** 2
+    return np.where(fit, d2 / safe, np.inf), np.log(safe)
+
+
+def _take_exclusively(order: Index, i: Index, j: Index) -> Index:
+    """Go through the pairs in ``order`` and keep those of which neither side is taken."""
+    seen_i: set[int] = set()
+    seen_j: set[int] = set()
+    kept = []
+    for k in order:
+        if int(i[k]) not in seen_i and int(j[k]) not in seen_j:
+            seen_i.add(int(i[k]))
+            seen_j.add(int(j[k]))
+            kept.append(k)
+    return np.asarray(kept, dtype=np.intp)
+
+
+def merge_close(ids: npt.ArrayLike, positions: npt.ArrayLike, radius: float) -> npt.NDArray[np.int64]:
+    """New ids under which landmarks closer than ``radius`` are one.
+
+    Duplicates a few decimetres apart slip through every Mahalanobis test where covariances are slightly small or both
+    entries stand in one submap; things that are known to stand further apart than ``radius`` can be merged by distance.
+
+    Parameters
+    ----------
+    ids : (L,) int64
+    positions : (L, 2)
+    radius : float
+        [m]
+
+    Returns
+    -------
+    (L,) int64
+        The smallest id of the cluster that each landmark belongs to (clusters are chains of close landmarks).
+    """
+    ids, points = np.asarray(ids, dtype=np.int64), np.asarray(positions, dtype=np.float64).reshape(-1, 2)
+    if len(ids) == 0:
+        return ids.copy()
+    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(ids), len(ids)))
+    _, cluster = connected_components(graph, directed=False)
+    smallest = np.full(cluster.max() + 1, np.iinfo(np.int64).max)
+    np.minimum.at(smallest, cluster, ids)
+    return smallest[cluster]

@@ -1,0 +1,78 @@
+"""Two orders of joining (Combined SLAM B6, B9): one after the other, or pairwise up a binary tree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tqdm.auto import tqdm
+
+from graphslam.core.errors import DataError
+from graphslam.core.submap import Submap
+from graphslam.graph.submap_blocks import check_identified
+from graphslam.join.association import Association, associate
+from graphslam.join.eif import join_maps, match_by_id
+from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, finish, landmark_labels
+
+
+def _check(submaps: Sequence[Submap], association: Association | None) -> None:
+    if association is None:
+        check_identified(submaps)
+    elif not submaps:
+        raise DataError("there are no submaps", got=0, wanted="at least one")
+
+
+def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
+    with times.measure("association"):
+        match = match_by_id(a, b) if association is None else associate(a, b, association)
+    return join_maps(a, b, match, times)
+
+
+def join_sequential(
+    submaps: Sequence[Submap], *, association: Association | None = None, progress: bool = False
+) -> JoinResult:
+    """Join submaps one after the other: every submap is a measurement of the map so far.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+    association : Association, optional
+        Recognise landmarks; default: by the ids they bear.
+    progress : bool
+        Show a progress bar.
+
+    Raises
+    ------
+    DataError, CovarianceError
+    """
+    _check(submaps, association)
+    times = JoinTimes()
+    identified = association is None
+    with times.measure("update"):
+        joined = JoinedMap.leaf(submaps[0], identified=identified)
+    for submap in tqdm(submaps[1:], desc="join", unit="submap", disable=not progress):
+        with times.measure("update"):
+            leaf = JoinedMap.leaf(submap, identified=identified)
+        joined = _join(joined, leaf, association, times)
+    labels = landmark_labels(joined, joined.ids, identified=identified)
+    return finish(submaps, joined, labels, method="eif-sequential", times=times, information=joined.information)
+
+
+def join_tree(
+    submaps: Sequence[Submap], *, association: Association | None = None, progress: bool = False
+) -> JoinResult:
+    """Join submaps pairwise, then the pairs, and so on: the joined map of B9 is a submap for the next level.
+
+    An odd one out goes up a level by itself. Parameters as in :func:`join_sequential`.
+    """
+    _check(submaps, association)
+    times = JoinTimes()
+    identified = association is None
+    with times.measure("update"):
+        level = [JoinedMap.leaf(s, identified=identified, ordered=False) for s in submaps]
+    with tqdm(total=len(level) - 1, desc="join", unit="join", disable=not progress) as bar:
+        while len(level) > 1:
+            above = [_join(a, b, association, times) for a, b in zip(level[::2], level[1::2])]
+            bar.update(len(above))
+            level = above + level[len(level) - len(level) % 2 :]
+    labels = landmark_labels(level[0], level[0].ids, identified=identified)
+    return finish(submaps, level[0], labels, method="eif-tree", times=times, information=level[0].information)
