@@ -123,6 +123,14 @@ class AckermannGeometry:
     encoder_offset: float = 0.0
     model: str = "rear-axle"
 
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.wheelbase) and self.wheelbase > 0):
+            raise GeometryError("wheelbase is impossible", got=self.wheelbase, wanted="> 0 m")
+        if not np.isfinite(self.encoder_offset):
+            raise GeometryError("encoder offset is not finite", got=self.encoder_offset)
+        if self.model not in ("rear-axle", "front-steer"):
+            raise GeometryError("unknown steering model", got=self.model, wanted="rear-axle or front-steer")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringControls:
@@ -268,6 +276,8 @@ class LandmarkObservations:
             raise DataError(f"sigma of observation {k} is not positive", got=self.sigmas[k], wanted="> 0")
         if self.ids is not None:
             object.__setattr__(self, "ids", np.ascontiguousarray(self.ids, dtype=np.int64))
+            if self.ids.shape != (q,):
+                raise DataError("ids and observations differ in number", got=self.ids.shape, wanted=f"({q},)")
         object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
 
     def scan(self, k: int) -> slice:

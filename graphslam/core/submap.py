@@ -125,7 +125,8 @@ class LandmarkMap:
 
     def subset(self, keep: npt.ArrayLike) -> LandmarkMap:
         """Marginal over the exit pose and the landmarks ``keep`` (mask or integer indices)."""
-        k = np.arange(len(self))[np.asarray(keep)]
+        chosen = np.asarray(keep)
+        k = np.arange(len(self))[chosen if chosen.size else chosen.astype(np.intp)]  # an empty list is of floats
         d = 3 if self.dim == 2 else 6
         ix = np.concatenate([np.arange(d), (d + self.dim * k[:, None] + np.arange(self.dim)).ravel()]).astype(np.intp)
         return LandmarkMap(

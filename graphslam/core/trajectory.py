@@ -48,6 +48,9 @@ class Trajectory:
                 raise GeometryError(
                     "trajectory covariances have the wrong shape", got=C.shape, wanted=(len(poses), d, d)
                 )
+            if not np.all(np.isfinite(C)):
+                k = int(np.argwhere(~np.isfinite(C))[0][0])
+                raise GeometryError(f"trajectory covariance {k} is not finite", got=C[k])
             object.__setattr__(self, "covariances", C)
 
     def __len__(self) -> int:
@@ -65,7 +68,7 @@ class Trajectory:
 
     def _bracket(self, t: ArrayLike, max_gap: float | None) -> tuple[Index, Index, Array]:
         q = np.atleast_1d(np.asarray(t, dtype=np.float64))
-        if len(self) == 0 or np.any((q < self.times[0]) | (q > self.times[-1])):
+        if len(self) == 0 or not np.all((q >= self.times[0]) & (q <= self.times[-1])):  # nan is outside, too
             span = f"[{self.times[0]:.3f}, {self.times[-1]:.3f}]" if len(self) else "an empty trajectory"
             raise DataError("time outside the trajectory", got=f"[{q.min():.3f}, {q.max():.3f}]", wanted=span)
         j = np.clip(np.searchsorted(self.times, q, side="right"), 1, max(len(self) - 1, 1))
