@@ -44,12 +44,15 @@ class JointCovariance:
             return
         # Columns scaled to a unit diagonal: metres, radians and tight or loose factors then share one scale.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
-        L, info = lapack.dpotrf(A * scale[:, None] * scale, lower=1, clean=1, overwrite_a=1)
+        M = A * scale[:, None]
+        M *= scale
+        L, info = lapack.dpotrf(M.T, lower=1, clean=1, overwrite_a=1)  # .T: LAPACK's order, no copy
         if info == 0:
             L, info = lapack.dtrtri(L, lower=1, overwrite_c=1)
         if info != 0:
             raise IndeterminateError("the Gauss-Newton matrix is singular: some variables are not constrained")
-        self._inverse_factor = L * scale  # A⁻¹ = (L⁻¹ S)ᵀ (L⁻¹ S)
+        L *= scale
+        self._inverse_factor = L  # A⁻¹ = (L⁻¹ S)ᵀ (L⁻¹ S)
 
     def columns(self, ix: npt.ArrayLike) -> Array:
         """Covariance of the columns ``ix`` ``(q,)`` in that order, ``(q, q)``."""

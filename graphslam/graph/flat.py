@@ -213,4 +213,4 @@ class FlatGraph:
 
 _R0, _J0 = np.zeros((0, 2)), np.zeros((0, 2, 8))
 # Above this many columns a sparse factorisation wins over a dense inverse factor (measured).
-DENSE_LIMIT = 1200
+DENSE_LIMIT = 1600

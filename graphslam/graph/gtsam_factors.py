@@ -45,7 +45,9 @@ def gtsam_factor(record: Record, origin: Array) -> Any:
 
 
 def _between(record: BetweenRecord, origin: Array) -> Any:
-    noise = with_kernel(gtsam.noiseModel.Gaussian.SqrtInformation(record.whitener), record.robust)
+    # Not SqrtInformation(W): GTSAM wants that upper triangular and of a lower one silently keeps the diagonal alone.
+    information = record.whitener.T @ record.whitener
+    noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
     if record.i and record.j:
         ki, kj = gtsam_key(f"x{record.i}"), gtsam_key(f"x{record.j}")
         return gtsam.BetweenFactorPose2(ki, kj, gtsam.Pose2(*record.T_ij), noise)

@@ -9,6 +9,7 @@ Mahalanobis distance is the plain alternative.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -227,7 +228,7 @@ def _search(pairs: Pairings, cfg: AssociationConfig) -> npt.NDArray[np.intp]:
     """Best of the beam search: the start with the greatest ``Σ (gate - d²)``."""
     seeds = _seeds(pairs, cfg.starts)
     most = min(len(np.unique(pairs.observed)), len(np.unique(pairs.target)))
-    limit = np.array([np.inf] + [chi2_quantile(cfg.joint_probability, 2 * k) for k in range(1, most + 1)])
+    limit = np.array(_joint_limits(cfg.joint_probability, most))
     limit[1] = max(limit[1], cfg.gate)  # a single pairing is judged by its own gate
     out = np.zeros((len(seeds), most), dtype=np.int64)
     count, score = np.zeros(len(seeds), dtype=np.int64), np.zeros(len(seeds))
@@ -237,6 +238,12 @@ def _search(pairs: Pairings, cfg: AssociationConfig) -> npt.NDArray[np.intp]:
     )  # fmt: skip
     best = int(np.argmax(score))
     return out[best, : count[best]].astype(np.intp)
+
+
+@cache
+def _joint_limits(probability: float, most: int) -> tuple[float, ...]:
+    """χ² limits of 0 (none), 1, … ``most`` pairings together."""
+    return (np.inf, *(chi2_quantile(probability, 2 * k) for k in range(1, most + 1)))
 
 
 def _seeds(pairs: Pairings, starts: int) -> npt.NDArray[np.int64]:

@@ -20,7 +20,7 @@ from graphslam.graph.state import Values
 from graphslam.graph.symmetric_factor import SymmetricFactor
 
 # A dense Cholesky factorisation beats a sparse one below this many columns (measured).
-DENSE_SOLVE_LIMIT = 300
+DENSE_SOLVE_LIMIT = 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +85,10 @@ def newton_step(system: System, damping: float = 0.0) -> tuple[Array, float]:
         step = SymmetricFactor(sp.csc_matrix(M)).solve(-g)
     else:
         s = 1.0 / np.sqrt(d)
-        M = A * s[:, None] * s
+        M = A * s[:, None]
+        M *= s
         M[np.diag_indices_from(M)] += damping
-        L, info = lapack.dpotrf(M, lower=1, overwrite_a=1)
+        L, info = lapack.dpotrf(M.T, lower=1, overwrite_a=1)  # .T: LAPACK's order, no copy
         if info != 0:
             raise IndeterminateError("the Gauss-Newton matrix is singular")
         y, _ = lapack.dpotrs(L, -g * s, lower=1)
@@ -126,6 +127,11 @@ def optimise(flat: FlatGraph, values: Values, config: LevenbergConfig | None = N
         if damping == 0.0 and promised <= cfg.tolerance * max(1.0, system.objective):
             decrement = max(promised, 0.0)
             converged = True
+            # the step is there already and the last one squares the error, so take it
+            trial = values.retract(step)
+            last = flat.evaluate(trial, hessian=False)
+            if last.objective <= system.objective * (1.0 + 1e-13):
+                values, system = trial, last
             break
         trial = values.retract(step)
         after = flat.evaluate(trial, hessian=False).objective
