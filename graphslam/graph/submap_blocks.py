@@ -153,9 +153,7 @@ class SubmapProblem:
         check_identified(submaps)
         maps = [landmark_map_of(s) for s in submaps]
         self.m = m = len(maps)
-        weights = 1.0 / np.broadcast_to(np.asarray(1.0 if scale is None else scale, dtype=np.float64), (m,))
-        if not np.all(np.isfinite(weights) & (weights > 0)):
-            raise DataError("covariance scale is not a positive number", got=scale, wanted="> 0")
+        weights = 1.0 / _check_scale(1.0 if scale is None else scale, m)
         all_ids = np.concatenate([a.ids for a in maps])
         unique, first, inverse = np.unique(all_ids, return_index=True, return_inverse=True)
         by_sighting = np.argsort(first, kind="stable")
@@ -369,3 +367,30 @@ def relabel(submaps: Sequence[Submap], ids: Sequence[npt.ArrayLike]) -> list[Sub
         s if s.landmarks is None else replace(s, landmarks=replace(s.landmarks, ids=np.asarray(i, dtype=np.int64)))
         for s, i in zip(submaps, ids, strict=True)
     ]
+
+
+def _check_scale(scale: ArrayLike, m: int) -> Array:
+    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), (m,))
+    if not np.all(np.isfinite(factors) & (factors > 0)):
+        raise DataError("covariance scale is not a positive number", got=scale, wanted="> 0")
+    return factors
+
+
+def scale_covariances(submaps: Sequence[Submap], factor: ArrayLike) -> list[Submap]:
+    """The same submaps with their covariances multiplied by ``factor`` (one number, or one a submap).
+
+    Raises
+    ------
+    DataError
+        If a factor is not a positive number.
+    """
+    factors = _check_scale(factor, len(submaps))
+    scaled = []
+    for s, f in zip(submaps, factors):
+        landmarks = s.landmarks
+        if landmarks is not None and landmarks.information is not None:
+            landmarks = replace(landmarks, information=landmarks.information / f)
+        elif landmarks is not None:
+            landmarks = replace(landmarks, covariance=f * landmarks.dense_covariance())
+        scaled.append(replace(s, landmarks=landmarks, exit_covariance=f * s.exit_covariance))
+    return scaled

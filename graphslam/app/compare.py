@@ -1,0 +1,288 @@
+"""The same submaps, joined and solved in every way there is, in one table."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from tqdm.auto import tqdm
+
+from graphslam.app.memory import MemoryProbe
+from graphslam.core.errors import ConfigError, DataError, UnknownNameError
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.submap import Submap
+from graphslam.evaluate.consistency import consistency_index, joint_nees, vector_pose_error
+from graphslam.evaluate.map_error import match_ids
+from graphslam.graph.submap_blocks import relabel, scale_covariances
+from graphslam.graph.submap_solver import SubmapEstimate
+from graphslam.join.association import Association
+from graphslam.join.ekf import join_ekf
+from graphslam.join.joined_map import JoinResult
+from graphslam.join.order import join_sequential, join_tree
+from graphslam.join.polish import polish as polish_join
+from graphslam.solve.submap_batch import solve_submaps
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
+JSON_COLUMNS = (
+    *("method", "objective", "objective_polished", "seconds", "peak_mb", "states", "landmarks", "nnz"),
+    *("nees", "nees_dof", "ci"),
+)
+
+
+def _isam2(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> SubmapEstimate:
+    from graphslam.solve.submap_isam2 import solve_submaps_isam2  # gtsam takes a second to load
+
+    return solve_submaps_isam2(submaps, polish=polish, progress=progress)
+
+
+def _batch(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> SubmapEstimate:
+    return solve_submaps(submaps)
+
+
+JOINERS: dict[str, Callable[..., JoinResult]] = {
+    "eif-tree": join_tree,
+    "eif-sequential": join_sequential,
+    "ekf": join_ekf,
+}
+SOLVERS: dict[str, Callable[..., SubmapEstimate]] = {"isam2": _isam2, "batch": _batch}
+
+
+def _association(associate: str | Association) -> Association | None:
+    if isinstance(associate, Association):
+        return associate
+    if associate == "given":
+        return None
+    if associate in ("nearest", "joint"):
+        return Association(rule=associate)  # type: ignore[arg-type]
+    raise ConfigError(f"unknown association {associate!r}; wanted 'given', 'nearest' or 'joint'")
+
+
+def join(
+    submaps: Sequence[Submap],
+    method: str = "eif-tree",
+    *,
+    polish: bool = False,
+    associate: str | Association = "given",
+    covariance_scale: float = 1.0,
+    progress: bool = False,
+) -> SubmapEstimate:
+    """Join submaps into one map.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        In order; submap k+1 starts where submap k ends.
+    method : str
+        ``eif-tree``, ``eif-sequential`` or ``ekf``: once linearised. ``batch``, ``isam2``: least squares.
+    polish : bool
+        Go on to the least-squares optimum from there.
+    associate : "given", "nearest", "joint" or Association
+        Landmarks are one if they bear the same id; or are recognised while joining, whatever ids they bear. The solvers
+        take ids that were recognised by joining in sequence.
+    covariance_scale : float
+        Factor on every submap's covariance.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    SubmapEstimate
+        A :class:`~graphslam.join.joined_map.JoinResult` for the joiners.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError, DataError, CovarianceError
+    """
+    if method not in JOINERS and method not in SOLVERS:
+        raise UnknownNameError("method", method, [*JOINERS, *SOLVERS])
+    association = _association(associate)
+    submaps = list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
+    if method in SOLVERS:
+        if association is not None:
+            submaps = identify(submaps, association, progress=progress)
+        return SOLVERS[method](submaps, polish=polish, progress=progress)
+    joined = JOINERS[method](submaps, association=association, progress=progress)
+    return polish_join(submaps, joined) if polish else joined
+
+
+def identify(submaps: Sequence[Submap], association: Association, *, progress: bool = False) -> list[Submap]:
+    """The same submaps with the landmark ids that joining them in sequence finds."""
+    return relabel(submaps, join_sequential(submaps, association=association, progress=progress).submap_ids)
+
+
+def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[float, int]:
+    """Joint NEES of all poses and landmarks of known truth, gauge "first base fixed", and its dimension (eq. 18).
+
+    Parameters
+    ----------
+    estimate : SubmapEstimate
+    keys : (m,)
+        Keys of the submaps that were joined.
+    truth : MapTruth
+        In the frame of the first base.
+
+    Raises
+    ------
+    DataError
+        Nothing in the estimate has a truth.
+    """
+    error, known = _errors(estimate, keys, truth)
+    if len(known) == 0:
+        raise DataError("neither a pose nor a landmark has a truth", got=len(truth.keys), wanted="common keys or ids")
+    if estimate.information is not None and len(known) == estimate.states:
+        return joint_nees(error[np.argsort(known)], information=estimate.information), len(known)
+    return joint_nees(error, covariance=estimate.covariance_block(known)), len(known)
+
+
+def _errors(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of all scalars of known truth, and where they stand in the state vector."""
+    if truth.exit_poses.shape[1] != 3:
+        raise DataError("truth is not two-dimensional", got=truth.exit_poses.shape, wanted="(m, 3)")
+    m = len(estimate.poses) - 1
+    i, j = match_ids(np.asarray(keys), truth.keys)
+    pose_error = vector_pose_error(estimate.poses[1 + i], truth.exit_poses[j])
+    a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
+    landmark_error = truth.landmarks[b] - estimate.landmarks[a]
+    at = [(3 * i[:, None] + np.arange(3)).ravel(), (3 * m + 2 * a[:, None] + np.arange(2)).ravel()]
+    return np.concatenate([pose_error.ravel(), landmark_error.ravel()]), np.concatenate(at)
+
+
+def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:
+    if truth is None:
+        return {"nees": None, "nees_dof": None, "ci": None, "rmse_poses": None, "rmse_landmarks": None}
+    d2, dof = map_nees(estimate, keys, truth)
+    error, known = _errors(estimate, keys, truth)
+    pose = (known < 3 * len(keys)) & (known % 3 < 2)
+    landmark = known >= 3 * len(keys)
+    return {
+        "nees": d2,
+        "nees_dof": dof,
+        "ci": float(consistency_index(d2, dof)),
+        "rmse_poses": math.sqrt(2.0 * float(np.mean(error[pose] ** 2))) if pose.any() else None,
+        "rmse_landmarks": math.sqrt(2.0 * float(np.mean(error[landmark] ** 2))) if landmark.any() else None,
+    }
+
+
+def compare(
+    submaps: Sequence[Submap],
+    methods: Sequence[str] = DEFAULT_METHODS,
+    *,
+    truth: MapTruth | None = None,
+    polish: bool = True,
+    associate: str | Association = "given",
+    covariance_scale: float = 1.0,
+    memory: bool = True,
+    progress: bool = False,
+) -> pd.DataFrame:
+    """Every method on the same submaps with the same landmark ids, a row each.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+    methods : sequence of str
+        See :func:`join`.
+    truth : MapTruth, optional
+        Gives NEES, its dimension, CI (eq. 20) and root-mean-square errors, all in the gauge "first base fixed".
+    polish : bool
+        Take every method on to the least-squares optimum.
+    associate, covariance_scale
+        See :func:`join`; landmarks are recognised once, for all methods.
+    memory : bool
+        Measure ``peak_mb``: each method runs once more in a process of its own, and the growth of its resident memory
+        while it joins is taken, native allocations included. Costs about a second a method.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``objective`` is that of the method itself, ``objective_polished`` that of the optimum reached from it.
+        ``nees``, ``ci`` and the errors judge the map that is handed over: the polished one where there is a polish;
+        ``nees_unpolished`` the joiner's own. ``seconds`` is wall time, polish included; ``nnz`` the stored entries of
+        the information matrix (of the dense covariance for an unpolished EKF).
+    """
+    unknown = [m for m in methods if m not in JOINERS and m not in SOLVERS]
+    if unknown:
+        raise UnknownNameError("method", unknown[0], [*JOINERS, *SOLVERS])
+    association = _association(associate)
+    submaps = list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
+    if association is not None:
+        submaps = identify(submaps, association, progress=progress)
+        # Recognised landmarks have names of their own; only the poses can be held against the truth.
+        truth = None if truth is None else _poses_only(truth)
+    keys = [s.key for s in submaps]
+    rows = []
+    for method in tqdm(methods, desc="compare", unit="method", disable=not progress):
+        own: dict[str, Any] = {}
+        if method in JOINERS:
+            joined = JOINERS[method](submaps)
+            if polish:
+                own = _judge(joined, keys, truth)
+            estimate: SubmapEstimate = polish_join(submaps, joined) if polish else joined
+        else:
+            estimate = SOLVERS[method](submaps, polish=polish, progress=False)
+        rows.append(
+            {
+                **_describe(method, estimate),
+                **_judge(estimate, keys, truth),
+                "nees_unpolished": own.get("nees"),
+                "iterations": estimate.iterations,
+                "converged": estimate.converged,
+            }
+        )
+    with MemoryProbe(submaps if memory else None) as probe:
+        for row, megabytes in zip(rows, probe.measure(methods, polish=polish)):
+            row["peak_mb"] = megabytes
+    return pd.DataFrame(rows)
+
+
+def _describe(method: str, estimate: SubmapEstimate) -> dict[str, Any]:
+    return {
+        "method": method,
+        "objective": estimate.objective,
+        "objective_polished": estimate.objective_polished,
+        "seconds": estimate.seconds,
+        "peak_mb": None,
+        "states": estimate.states,
+        "landmarks": len(estimate.landmark_ids),
+        "nnz": estimate.nnz,
+    }
+
+
+def _poses_only(truth: MapTruth) -> MapTruth:
+    none = np.zeros(0, dtype=np.int64)
+    return MapTruth(keys=truth.keys, exit_poses=truth.exit_poses, landmark_ids=none, landmarks=np.zeros((0, 2)))
+
+
+def methods_json(table: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
+    """The table as ``{"methods": [{"method", "objective", …}]}``; what is not known is null."""
+    return {"methods": [_json_row(r) for r in table.to_dict("records")]}
+
+
+def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name in JSON_COLUMNS:
+        value = row.get(name)
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            values[name] = None
+        elif name == "method":
+            values[name] = str(value)
+        elif name in ("states", "landmarks", "nnz", "nees_dof"):
+            values[name] = int(value)
+        else:
+            values[name] = float(value)
+    return values
+
+
+def join_json(
+    submaps: Sequence[Submap], method: str, estimate: SubmapEstimate, *, truth: MapTruth | None = None
+) -> dict[str, list[dict[str, Any]]]:
+    """One joined map in the same form as :func:`methods_json`; memory is not measured."""
+    row = {**_describe(method, estimate), **_judge(estimate, [s.key for s in submaps], truth)}
+    return {"methods": [_json_row(row)]}

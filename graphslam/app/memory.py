@@ -1,0 +1,123 @@
+"""Peak memory of a join, measured from outside: a process of its own, and the kernel's count of resident pages.
+
+Tracing Python's allocations would miss what SuperLU, LAPACK and gtsam take, and would slow down what is being timed. So
+each method runs once more in a fresh interpreter, which loads the submaps and every module first, resets the kernel's
+high-water mark, joins, and reports by how much the mark rose above where it was. Linux only; elsewhere there is no
+figure.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import logging
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+
+import graphslam
+from graphslam.core.submap import Submap
+from graphslam.io.submap_store import read_submaps, write_submaps
+
+logger = logging.getLogger(__name__)
+
+_TIMEOUT_S = 3600.0
+
+
+class MemoryProbe:
+    """Context in which :meth:`measure` can be asked for the peak memory of methods on the same submaps.
+
+    Ask after all timing is done: the measuring processes take the cores.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap or None
+        None: measure nothing.
+    """
+
+    def __init__(self, submaps: Sequence[Submap] | None) -> None:
+        self._submaps = submaps if Path("/proc/self/clear_refs").exists() else None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> MemoryProbe:
+        if self._submaps is not None:
+            self._folder = tempfile.TemporaryDirectory(prefix="graphslam-")
+            write_submaps(self._folder.name, list(self._submaps))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def measure(self, methods: Sequence[str], *, polish: bool) -> list[float | None]:
+        """Peak growth of resident memory [MB = 10⁶ bytes] while each method joins, or None where it is not known.
+
+        The processes share nothing, so as many run side by side as there are cores.
+        """
+        if self._folder is None:
+            return [None] * len(methods)
+        with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as pool:
+            return list(pool.map(lambda method: self._measure(method, polish), methods))
+
+    def _measure(self, method: str, polish: bool) -> float | None:
+        assert self._folder is not None
+        command = [sys.executable, "-m", "graphslam.app.memory", self._folder.name, method, str(int(polish))]
+        paths = [str(Path(graphslam.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in paths if p)}
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=True, env=environment, timeout=_TIMEOUT_S
+            )
+            megabytes = float(done.stdout.strip().splitlines()[-1])
+        except (subprocess.SubprocessError, ValueError, IndexError) as error:
+            logger.warning("peak memory of %s could not be measured: %s", method, error)
+            return None
+        return megabytes if math.isfinite(megabytes) else None
+
+
+def _status(field: str) -> int:
+    """A field of ``/proc/self/status`` in bytes."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return 1024 * int(line.split()[1])
+    raise ValueError(f"/proc/self/status has no {field}")
+
+
+def _measure_here(folder: str, method: str, polish: bool) -> float:
+    """Load, settle, reset the high-water mark, join, read the mark [MB]."""
+    from graphslam.app.compare import join
+
+    submaps = read_submaps(folder)
+    join(submaps[:2], method, polish=polish)  # modules and thread pools that load on first use
+    gc.collect()
+    try:  # hand freed heap back, or the join would reuse it unseen
+        ctypes.CDLL(None).malloc_trim(0)
+    except (OSError, AttributeError):
+        logger.debug("no malloc_trim here")
+    before = _status("VmRSS")
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return math.nan
+    result = join(submaps, method, polish=polish)
+    peak = _status("VmHWM")
+    assert result.states > 0
+    return max(peak - before, 0) / 1e6
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Entry of the measuring process: folder, method, polish (0 or 1); the figure goes to standard output."""
+    folder, method, polish = arguments
+    sys.stdout.write(f"{_measure_here(folder, method, polish == '1')}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

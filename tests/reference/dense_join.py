@@ -1,0 +1,86 @@
+"""Slow, obvious twins: the submap problem with dense Jacobians, and the information join as the paper writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphslam.core.geometry import se2_compose, se2_transform, wrap_angle
+from graphslam.core.submap import Submap
+from graphslam.graph.submap_model import predict_submap, submap_jacobians, submap_residual
+
+
+def first_sighting(submaps: Sequence[Submap]) -> list[int]:
+    ids: list[int] = []
+    for s in submaps:
+        for j in s.landmarks.ids if s.landmarks is not None else ():
+            if int(j) not in ids:
+                ids.append(int(j))
+    return ids
+
+
+def dense_normal_equations(submaps: Sequence[Submap], x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Objective, ``JᵀΩr`` and ``JᵀΩJ`` at ``x = [poses, landmarks by first sighting]``, one factor at a time."""
+    ids, m = first_sighting(submaps), len(submaps)
+    place = {j: 3 * m + 2 * i for i, j in enumerate(ids)}
+    f, g, H = 0.0, np.zeros(len(x)), np.zeros((len(x), len(x)))
+    for k, s in enumerate(submaps):
+        start = np.zeros(3) if k == 0 else x[3 * k - 3 : 3 * k]
+        end = x[3 * k : 3 * k + 3]
+        own = [place[int(j)] for j in s.landmarks.ids]
+        points = np.array([x[a : a + 2] for a in own]).reshape(-1, 2)
+        r = submap_residual(start, end, points, s.landmarks.mean)
+        J_start, J_end, J_landmark = submap_jacobians(start, end, points, tangent=False)
+        J = np.zeros((len(r), len(x)))
+        if k:
+            J[:, 3 * k - 3 : 3 * k] += J_start
+        J[:, 3 * k : 3 * k + 3] += J_end
+        for i, a in enumerate(own):
+            J[3 + 2 * i : 5 + 2 * i, a : a + 2] += J_landmark
+        omega = np.linalg.inv(s.landmarks.dense_covariance())
+        f += r @ omega @ r
+        g += J.T @ omega @ r
+        H += J.T @ omega @ J
+    return f, g, H
+
+
+def dense_information_join(submaps: Sequence[Submap]) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Eq. 13–16 to the letter, dense: returns X, I and the ids, state ``[poses, landmarks by first sighting]``.
+
+    ``i`` itself is accumulated; the only liberty is that the predicted heading is unwrapped towards the measured one.
+    """
+    ids, m = first_sighting(submaps), len(submaps)
+    n = 3 * m + 2 * len(ids)
+    place = {j: 3 * m + 2 * i for i, j in enumerate(ids)}
+    X, i, I = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    active = np.zeros(n, dtype=bool)
+    for k, s in enumerate(submaps):
+        start = np.zeros(3) if k == 0 else X[3 * k - 3 : 3 * k]
+        # 1. what is new gets its first value from this submap, with zero information
+        X[3 * k : 3 * k + 3] = se2_compose(start, s.landmarks.exit_pose)
+        X[3 * k + 2] = start[2] + s.landmarks.exit_pose[2]
+        active[3 * k : 3 * k + 3] = True
+        own = [place[int(j)] for j in s.landmarks.ids]
+        for a, p in zip(own, s.landmarks.positions):
+            if not active[a]:
+                X[a : a + 2] = se2_transform(start, p)
+                active[a : a + 2] = True
+        i = I @ X  # rows of zeros for what is new
+        # 2. the submap is a measurement
+        end, points = X[3 * k : 3 * k + 3], np.array([X[a : a + 2] for a in own]).reshape(-1, 2)
+        J_start, J_end, J_landmark = submap_jacobians(start, end, points, tangent=False)
+        J = np.zeros((3 + 2 * len(own), n))
+        if k:
+            J[:, 3 * k - 3 : 3 * k] = J_start
+        J[:, 3 * k : 3 * k + 3] = J_end
+        for q, a in enumerate(own):
+            J[3 + 2 * q : 5 + 2 * q, a : a + 2] = J_landmark
+        omega = np.linalg.inv(s.landmarks.dense_covariance())
+        innovation = s.landmarks.mean - predict_submap(start, end, points)
+        innovation[2] = wrap_angle(innovation[2])
+        I = I + J.T @ omega @ J
+        i = i + J.T @ omega @ (innovation + J @ X)
+        on = np.flatnonzero(active)
+        X[on] = np.linalg.solve(I[np.ix_(on, on)], i[on])  # eq. 13
+    return X, I, ids
