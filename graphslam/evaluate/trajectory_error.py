@@ -200,7 +200,7 @@ def ate(
 def delta_pairs(progress: Array, delta: float, *, tolerance: float, all_pairs: bool) -> tuple[Index, Index]:
     """Pairs ``i < j`` whose ``progress`` (path length or time, ``(n,)``, non-decreasing) differs by ``delta``.
 
-    For each i the j whose difference is nearest to ``delta``, kept if within ``tolerance``. With
+    For each i the first j whose difference is nearest to ``delta``, kept if within ``tolerance``. With
     ``all_pairs=False`` the pairs do not overlap: the next one starts where the last one ended.
     """
     n = len(progress)
@@ -209,6 +209,8 @@ def delta_pairs(progress: Array, delta: float, *, tolerance: float, all_pairs: b
     after = np.clip(np.searchsorted(progress, want), i + 1, n - 1)
     before = np.maximum(after - 1, i + 1)
     j = np.where(np.abs(progress[before] - want) <= np.abs(progress[after] - want), before, after)
+    # a vehicle that stands makes no progress: of equal candidates the first counts
+    j = np.maximum(np.searchsorted(progress, progress[j], side="left"), i + 1)
     good = np.abs(progress[j] - want) <= tolerance
     if all_pairs:
         return i[good], j[good]
