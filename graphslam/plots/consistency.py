@@ -48,7 +48,7 @@ def plot_consistency(
         if k == 0:
             name = f"{c.confidence:.0%} bounds, {c.runs} run{'s' if c.runs != 1 else ''}"
             ax.fill_between(x, low * factor, high * factor, color=style.BOUNDS, alpha=0.8, lw=0, label=name, zorder=0)
-            ax.plot(x, factor, color=style.GREY, lw=0.9, ls=":", label="honest", zorder=1)
+            ax.plot(x, factor, color=style.GREY, lw=0.9, ls=":", label="expected if honest", zorder=1)
         every = max(1, len(x) // 12)
         ax.plot(x, mean * factor, lw=1.5, ms=4, markevery=(k * every // 4, every), label=label, **style.line(k))
         top = max(top, float(np.nanmax(mean / high)))

@@ -1,0 +1,20 @@
+"""Figures to files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from graphslam.plots import style
+
+
+def save(ax: Axes, path: Path) -> Path:
+    """Write the figure of ``ax`` as PNG and close it; the same data give the same bytes (no date, no version)."""
+    figure = ax.figure
+    assert isinstance(figure, Figure)
+    figure.savefig(path, dpi=style.DPI, bbox_inches="tight", metadata={"Software": None})
+    plt.close(figure)
+    return path
