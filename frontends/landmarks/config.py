@@ -78,6 +78,8 @@ class RbpfEkfConfig:
     """Observations beyond are not used [m]."""
     ess_fraction: float = 0.5
     """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
+    control_hold: float = 0.5
+    """Scans up to this long before the first control are used, with that control held backwards [s]."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None

@@ -67,6 +67,21 @@ class RbpfEkf:
             yield submap
             key, t_start = key + 1, submap.interval[1]
 
+    def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
+        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans).
+
+        Raises
+        ------
+        MissingDataError
+        """
+        stream = log.of_type(LandmarkObservations)
+        if stream is not None:
+            return stream, log[stream]
+        stream = log.of_type(LaserScans)
+        if stream is None:
+            raise MissingDataError("no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans")
+        return stream, detect_trees(log[stream], self.config.detector)
+
     def prepare(self, log: SensorLog, drops: DropCounter) -> Prepared:
         """Detect, drop what cannot be used (counted), and integrate the controls between scans."""
         c = self.config
@@ -86,7 +101,7 @@ class RbpfEkf:
                     "no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans"
                 )
             observations = detect_trees(log[stream], c.detector)
-        early = int(np.searchsorted(observations.times, controls.times[0], side="left"))
+        early = int(np.searchsorted(observations.times, controls.times[0] - c.control_hold, side="left"))
         if early:
             drops.drop(stream, "before the first control", early)
         scans = observations.take(slice(early, None))
@@ -106,6 +121,7 @@ class RbpfEkf:
         filter_var = own if c.noise is None else c.noise.variances(scans.ranges)
         smooth_var = filter_var if c.smoothing_noise is None else c.smoothing_noise.variances(scans.ranges)
         t_start = float(min(controls.times[0], scans.times[0]))
+        controls = replace(controls, times=np.concatenate([[t_start], controls.times[1:]]))  # held backwards
         stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
         odometry = steering_odometry(controls, stamps, c.motion)
         if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k

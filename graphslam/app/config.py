@@ -26,10 +26,14 @@ class GpsConfig:
 
     use: Literal["none", "all", "every-second", "even-segments", "odd-segments"] = "none"
     """Fixes that become factors; the rest is withheld and scored. Segments are runs of fixes without a gap."""
-    sigma: float = 0.5
-    """σ of each coordinate of a fix [m]; replaces the stream's own where positive."""
+    sigma: float | None = None
+    """σ of each coordinate of a fix [m] in place of the stream's own."""
     robust: Literal["none", "huber", "cauchy"] = "cauchy"
     """Robust kernel on every GPS factor."""
+    robust_width: float = 1.0
+    """Width of the kernel in standard deviations."""
+    bias_sigma: float | None = None
+    """With a number [m]: one bias per segment of fixes with that prior."""
     segment_gap: float = 2.0
     """A gap longer than this starts a new segment [s]."""
 
@@ -42,10 +46,14 @@ class BackEndConfig:
     """Factor on every submap covariance in the join; 1 = trust the front end. Choose it so that join χ²/dof is 1."""
     associate: bool = True
     """Associate landmarks without identity to the graph's (joint compatibility); identities in the submaps win."""
+    method: Literal["joint-compatibility", "nearest-neighbour"] = "joint-compatibility"
+    """How landmarks are associated."""
     gate: float = 11.8
     """χ² gate of one pairing given the ones before (2 dof: 99.7 %)."""
     merge_distance: float = 0.0
     """Landmarks nearer than this after the join are one [m]; 0 = never merge by distance."""
+    merge_reach: float = 5.0
+    """Landmarks farther apart than this are not tested for merging by covariance [m]."""
     merge_every: int = 20
     """Look for landmarks to merge after this many submaps, and at the end."""
     confirmed_hits: int = 1
@@ -89,7 +97,7 @@ def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
 def _convert(hint: Any, value: Any, name: str) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None or value == "none" and type(None) in args and str not in args:
+        if value is None or (value == "none" and str not in args):
             return None
         return _convert(next(a for a in args if a is not type(None)), value, name)
     if origin is Literal:

@@ -1,0 +1,125 @@
+"""Submaps in, a solved graph out: association, factors, solver, merging. One call per finished submap."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.config import BackEndConfig, GpsConfig
+from graphslam.core.geometry import Array
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.graph.gps import GpsConfig as GpsFactorConfig
+from graphslam.graph.landmark_association import AssociationConfig, associate
+from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.registry import make_solver
+from graphslam.solve.solution import Solution
+
+
+@dataclass
+class BackEnd:
+    """A pose graph that grows by submaps and is solved after each.
+
+    Parameters
+    ----------
+    config : BackEndConfig
+    solver : str
+        Name in the solver registry.
+    """
+
+    config: BackEndConfig
+    solver_name: str
+    graph: PoseGraph = field(default_factory=PoseGraph)
+    seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
+    per_submap_s: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.solver = make_solver(self.solver_name, self.graph)
+        self._association = AssociationConfig(
+            method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
+        )
+
+    def add_gps(self, gps: Gps, config: GpsConfig) -> None:
+        """Give the graph the fixes that count; they wait for the submaps that hold them."""
+        kernel = NO_KERNEL if config.robust == "none" else Robust(config.robust, config.robust_width)
+        self.graph.add_gps(
+            gps,
+            config=GpsFactorConfig(
+                robust=kernel, sigma=config.sigma, bias_sigma=config.bias_sigma, segment_gap=config.segment_gap
+            ),
+        )
+
+    def add(self, submap: Submap) -> None:
+        """Associate, add, solve; now and then merge landmarks that turned out to be one."""
+        start = time.perf_counter()
+        ids = associate(self.graph, submap, self._association) if self.config.associate else None
+        associated = time.perf_counter()
+        self.graph.add_submap(submap, landmark_ids=ids, covariance_scale=self.config.covariance_scale)
+        self.solver.update()
+        solved = time.perf_counter()
+        self.seconds["associate"] += associated - start
+        self.seconds["solve"] += solved - associated
+        if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
+            self.merge()
+        self.per_submap_s.append(time.perf_counter() - start)
+
+    def merge(self) -> int:
+        """Merge landmarks by joint covariance, then by distance, and solve again; returns the number merged."""
+        start = time.perf_counter()
+        merged = 0
+        if self.config.associate and len(self.graph.values.landmarks) > 1:
+            for keep, drop in mahalanobis_merges(self.graph, self.config.gate, distance=self.config.merge_reach):
+                self.graph.merge_landmarks(keep, drop)
+                merged += 1
+            if merged:
+                self.solver.update()
+            if self.config.merge_distance > 0:
+                for keep, drop in euclidean_merges(self.graph, self.config.merge_distance):
+                    self.graph.merge_landmarks(keep, drop)
+                    merged += 1
+                self.solver.update()
+        self.seconds["merge"] += time.perf_counter() - start
+        return merged
+
+    def finish(self) -> Solution:
+        """Merge until nothing merges any more, go to the optimum, and return the solution."""
+        self.graph.finish_gps()
+        self.solver.solve_to_optimum()
+        for _ in range(10):
+            if not self.merge():
+                break
+            self.solver.solve_to_optimum()
+        start = time.perf_counter()
+        self.solver.solve_to_optimum()
+        solution = self.solver.solution()
+        self.seconds["solve"] += time.perf_counter() - start
+        return solution
+
+    def landmark_hits(self, submaps: list[Submap]) -> dict[int, int]:
+        """Sightings of every landmark over all submaps (1 a submap where a submap does not count them)."""
+        hits: dict[int, int] = {int(i): 0 for i in self.graph.values.landmark_ids}
+        for s in submaps:
+            if s.landmarks is None:
+                continue
+            ids = self.graph.landmark_ids_of(s.key)
+            rows = s.landmarks.sightings
+            counts = np.ones(len(ids), dtype=int) if rows is None else np.bincount(rows[:, 1], minlength=len(ids))
+            for i, n in zip(ids.tolist(), counts.tolist()):
+                hits[i] = hits.get(i, 0) + n
+        return hits
+
+    def observation_labels(self, submaps: list[Submap]) -> tuple[Array, Array]:
+        """(observation index in the log, landmark id) of every sighting, for audits of the association."""
+        rows: list[Any] = [np.zeros((0, 2), dtype=np.int64)]
+        for s in submaps:
+            if s.landmarks is not None and s.landmarks.sightings is not None:
+                ids = self.graph.landmark_ids_of(s.key)
+                q = s.landmarks.sightings
+                rows.append(np.column_stack([q[:, 0], ids[q[:, 1]]]))
+        table = np.concatenate(rows)
+        return table[:, 0], table[:, 1]

@@ -1,0 +1,119 @@
+"""``graphslam run``, ``demo``, ``simulate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from graphslam.app import config as cfg
+from graphslam.app.terminal import emit, table
+
+JSON = typer.Option(False, "--json", help="One JSON object on stdout, nothing else there.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    app.command()(run)
+    app.command()(demo)
+    app.command()(simulate)
+
+
+def run(
+    source: str = typer.Argument(..., help="A data-set card, or a folder with a log."),
+    frontend: str = typer.Option("rbpf-ekf", help="Front end that makes the submaps."),
+    solver: str = typer.Option("isam2", help="isam2 or batch."),
+    config: Path | None = typer.Option(None, help="TOML file with options over the source's preset."),
+    setting: list[str] = typer.Option([], "--set", help="One option, a.b=value; may be repeated."),
+    seed: int = typer.Option(0, help="Root of the seed tree."),
+    out: Path = typer.Option(..., help="Run folder."),
+    resume: bool = typer.Option(False, "--resume", help="Go on after the last finished submap."),
+    as_json: bool = JSON,
+) -> None:
+    """Raw log → submaps → graph → map, with everything that was measured on the way."""
+    from graphslam.app.pipeline import run as run_pipeline
+
+    options = _options(config, setting)
+    result = run_pipeline(
+        source,
+        frontend=frontend,
+        solver=solver,
+        seed=seed,
+        out=out,
+        config=options,
+        resume=resume,
+        progress=not as_json,
+    )
+    rows = result.metrics.to_dict("records")
+    emit({"out": str(out), "metrics": rows, "report": result.report}, _summary(result, out), as_json=as_json)
+
+
+def _options(config: Path | None, settings: list[str]) -> dict[str, Any]:
+    values: dict[str, Any] = cfg.read_toml(config) if config else {}
+    values.pop("run", None)  # an effective config.toml of another run may be given as it is
+    for text in settings:
+        values = cfg.merge(values, cfg.parse_setting(text))
+    return values
+
+
+def _summary(result: Any, out: Path) -> str:
+    dropped = result.report["records_dropped"]
+    lines = [table(result.metrics.to_dict("records"), ["key", "value", "unit"])]
+    lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
+    chi2 = result.metrics.set_index("key")["value"].get("join_chi2_per_dof")
+    if chi2 is not None and not 0.7 < chi2 < 1.4:
+        scale = result.report["covariance_scale"] * chi2
+        lines.append(f"note: join χ²/dof is {chi2:.2f}, not 1: try --set backend.covariance_scale={scale:.2g}")
+    lines.append(f"written to {out}: map in {out / 'figures' / 'map.png'}")
+    return "\n".join(lines)
+
+
+def demo(
+    out: Path = typer.Option(Path("demo-run"), help="Run folder; a demo that is there already is gone on with."),
+    seed: int = typer.Option(1, help="Seed of world and filter."),
+    preset: str = typer.Option("demo", help="Size of the world: demo or quick."),
+    as_json: bool = JSON,
+) -> None:
+    """Simulated landmark field → RBPF-EKF submaps → graph → map, and every joiner on the same submaps."""
+    from graphslam.app.demo import run_demo
+
+    result, comparison = run_demo(out, seed=seed, preset=preset, progress=not as_json)
+    rows = comparison.to_dict("records")
+    columns = ["method", "objective", "objective_polished", "seconds", "peak_mb", "nnz", "nees", "nees_dof", "ci"]
+    text = (
+        f"{table(result.metrics.to_dict('records'), ['key', 'value', 'unit'])}\n\n"
+        f"{table(rows, columns)}"
+        f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
+    )
+    emit({"out": str(out), "metrics": result.metrics.to_dict("records"), "methods": rows}, text, as_json=as_json)
+
+
+def simulate(
+    world: str = typer.Argument(..., help="landmark-field"),
+    out: Path = typer.Option(..., help="Folder for the log, truth included."),
+    seed: int = typer.Option(0),
+    preset: str | None = typer.Option(None, help="A, B, C, demo or quick."),
+    setting: list[str] = typer.Option([], "--set", help="A figure of the world, name=value; may be repeated."),
+    as_json: bool = JSON,
+) -> None:
+    """A recorded log of a simulated world, with its truth and every noise figure stated."""
+    from graphslam.app.worlds import simulate as make
+    from graphslam.io.log_store import save_log
+
+    changes: dict[str, Any] = {}
+    for text in setting:
+        changes |= cfg.parse_setting(text)
+    log = make(world, seed=seed, preset=preset, **changes)
+    save_log(log, out)
+    streams = {name: len(s.times) for name, s in log.streams.items()}
+    rows = [{"stream": k, "records": v} for k, v in streams.items()]
+    value = {
+        "out": str(out),
+        "world": world,
+        "seed": seed,
+        "duration": log.duration,
+        "streams": streams,
+        "meta": log.meta,
+    }
+    emit(value, f"{table(rows)}\n{log.duration:.1f} s written to {out}", as_json=as_json)

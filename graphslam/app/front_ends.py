@@ -1,0 +1,50 @@
+"""Front ends by name (entry points ``graphslam.frontends``) and their configuration."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+from frontends.base import FrontEnd
+from graphslam.app import config as cfg
+from graphslam.core.errors import GraphSlamError, UnknownNameError
+from graphslam.core.log import SensorLog
+
+GROUP = "graphslam.frontends"
+
+
+def front_end_names() -> list[str]:
+    """Names of the installed front ends."""
+    return sorted({e.name for e in entry_points(group=GROUP)})
+
+
+def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
+    """Build front end ``name`` with ``options`` checked against its own configuration class.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+    """
+    found = [e for e in entry_points(group=GROUP) if e.name == name]
+    if not found:
+        raise UnknownNameError("front end", name, front_end_names())
+    try:
+        kind = found[0].load()
+    except ImportError as error:
+        raise GraphSlamError(f"front end {name!r} cannot be imported ({error})") from error
+    config_type = typing.get_type_hints(kind)["config"]
+    made: FrontEnd = kind(config=cfg.build(config_type, options, "frontend"))
+    return made
+
+
+def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
+    """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise."""
+    values = cfg.preset(f"{log.name}.{frontend}")
+    noise = log.meta.get("noise", {})
+    if log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise):
+        scale = float(noise.get("scale", 1.0))
+        motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
+        values = cfg.merge({"frontend": {"motion": motion}}, values)
+    return values

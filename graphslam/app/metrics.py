@@ -1,0 +1,162 @@
+"""The figures of a run: front end, join, time, GPS, truth. Every figure is measured in this run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, se2_between, se2_inverse, se2_transform
+from graphslam.core.log import SensorLog
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.consistency import joint_nees, vector_pose_error
+from graphslam.evaluate.gps import GpsResiduals, gps_residuals
+from graphslam.evaluate.map_error import match_ids
+from graphslam.solve.solution import Solution
+
+
+@dataclass
+class Metrics:
+    """Rows of ``metrics.json``."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, key: str, value: float, unit: str = "", direction: str = "none") -> None:
+        """One figure; ``direction`` says which way is better: lower, higher, one (nearer to 1) or none."""
+        self.rows.append({"key": key, "value": float(value), "unit": unit, "direction": direction})
+
+    def table(self) -> pd.DataFrame:
+        """As a table."""
+        return pd.DataFrame(self.rows, columns=["key", "value", "unit", "direction"])
+
+
+def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
+    """Counts and χ²/dof summed over the submaps, and how far particle maps are from smoothed ones."""
+    out.add("submaps", len(submaps))
+    reports = [s.report for s in submaps]
+    for key, unit in (("scans", ""), ("observations", ""), ("used", ""), ("not_associated", ""), ("trimmed", "")):
+        if all(key in r for r in reports):
+            out.add(f"frontend_{key}", sum(r[key] for r in reports), unit)
+    if all("chi2" in r for r in reports) and sum(r["dof"] for r in reports) > 0:
+        chi2, dof = sum(r["chi2"] for r in reports), sum(r["dof"] for r in reports)
+        used, scans = sum(r["used"] for r in reports), sum(r["scans"] for r in reports)
+        out.add("submap_chi2_per_dof", chi2 / dof, "", "one")
+        out.add("submap_chi2_range", sum(r["chi2_range"] for r in reports) / max(used, 1), "per observation")
+        out.add("submap_chi2_bearing", sum(r["chi2_bearing"] for r in reports) / max(used, 1), "per observation")
+        out.add("submap_chi2_odometry", sum(r["chi2_odometry"] for r in reports) / (3 * scans), "per component")
+        out.add("min_ess_median", float(np.median([r["min_ess"] for r in reports])), "particles", "higher")
+
+
+def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:
+    """Objective per class, gap, landmarks."""
+    out.add("objective", solution.objective, "", "lower")
+    for name in solution.score:
+        c = solution.score[name]
+        label = "join" if name in ("submap", "dense-submap") else name
+        out.add(f"{label}_chi2", c.chi2)
+        out.add(f"{label}_dof", c.dof)
+        if c.dof > 0:
+            out.add(f"{label}_chi2_per_dof", c.chi2_per_dof, "", "one")
+    out.add("gap", solution.gap if solution.gap is not None else float("nan"), "", "lower")
+    out.add("converged", float(solution.converged), "", "higher")
+    out.add("states", solution.states)
+    out.add("landmarks", len(solution.landmarks))
+    out.add("landmarks_confirmed", confirmed)
+
+
+def gps_metrics(
+    out: Metrics, trajectory: Trajectory, gps: Gps, withheld: np.ndarray, T_gps_world: Array | None
+) -> dict[str, GpsResiduals]:
+    """RMSE, median and p95 at the antenna: rigid alignment to the fixes scored, or the graph's own datum."""
+    results: dict[str, GpsResiduals] = {}
+    if len(gps.times) < 2:
+        return results
+    try:
+        if T_gps_world is None:
+            results["all"] = gps_residuals(trajectory, gps)
+        else:
+            results["withheld"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world, score=withheld)
+            results["all"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world)
+    except DataError:  # no fix on the path: nothing to score, and the counts say so
+        return results
+    for name, r in results.items():
+        s = r.statistics
+        prefix = "gps" if name == "all" else "gps_withheld"
+        for key, value in (("rmse", s.rmse), ("median", s.median), ("p95", s.p95), ("max", s.maximum)):
+            out.add(f"{prefix}_{key}", value, "m", "lower")
+        out.add(f"{prefix}_fixes", s.count)
+    return results
+
+
+def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
+    """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth."""
+    if log.truth is None or not submaps:
+        return None
+    base = log.truth.trajectory.interpolate([submaps[0].interval[0]])[0]
+    ends = log.truth.trajectory.interpolate(np.array([s.interval[1] for s in submaps]))
+    return MapTruth(
+        keys=np.array([s.key for s in submaps], dtype=np.int64),
+        exit_poses=se2_between(np.broadcast_to(base, ends.shape), ends),
+        landmark_ids=log.truth.landmark_ids,
+        landmarks=se2_transform(se2_inverse(base), log.truth.landmarks),
+    )
+
+
+def truth_path(log: SensorLog, times: Array) -> Trajectory | None:
+    """True path at ``times``, in the frame of the base at the first of them."""
+    if log.truth is None:
+        return None
+    path = log.truth.trajectory
+    inside = times[(times >= path.times[0]) & (times <= path.times[-1])]
+    poses = path.interpolate(inside)
+    return Trajectory(inside, se2_between(np.broadcast_to(poses[0], poses.shape), poses))
+
+
+def truth_metrics(out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool) -> None:
+    """RMSE and NEES with the first base fixed; landmarks only where their identities are the truth's."""
+    e_pose = vector_pose_error(solution.poses[1:], truth.exit_poses)
+    out.add("pose_rmse", float(np.sqrt(np.mean(np.sum(e_pose[:, :2] ** 2, axis=1)))), "m", "lower")
+    out.add("heading_rmse", float(np.rad2deg(np.sqrt(np.mean(e_pose[:, 2] ** 2)))), "deg", "lower")
+    P = solution.joint_covariance()
+    n_pose = e_pose.size
+    error = e_pose.ravel()
+    ix = np.arange(n_pose)
+    if identities:
+        ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
+        e_lm = truth.landmarks[theirs] - solution.landmarks[ours]
+        out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
+        error = np.concatenate([error, e_lm.ravel()])
+        ix = np.concatenate([ix, (n_pose + 2 * ours[:, None] + np.arange(2)).ravel()])
+    dof = len(error)
+    nees = joint_nees(error, covariance=P[np.ix_(ix, ix)])
+    out.add("nees", nees)
+    out.add("nees_dof", dof)
+    out.add("nees_per_dof", nees / dof, "", "one")
+    out.add("ci", nees / chi2_quantile(0.95, dof), "", "lower")
+
+
+def time_metrics(
+    out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, per_scan: Sequence[Array]
+) -> None:
+    """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log."""
+    for stage, value in seconds.items():
+        out.add(f"seconds_{stage}", value, "s", "lower")
+    total = seconds.get("total", 0.0)
+    if total > 0:
+        out.add("times_real_time", duration / total, "x", "higher")
+    if scans:
+        out.add("frontend_ms_per_scan", 1e3 * seconds.get("frontend", 0.0) / scans, "ms", "lower")
+    cost = np.concatenate(per_scan) if per_scan else np.zeros(0)
+    if len(cost) >= 8:
+        quarter = len(cost) // 4
+        out.add(
+            "frontend_last_to_first_quarter", float(np.median(cost[-quarter:]) / np.median(cost[:quarter])), "x", "one"
+        )

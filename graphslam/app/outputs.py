@@ -1,0 +1,158 @@
+"""What a run leaves on disk beside its submaps; every file is whole or not there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from graphslam.app.figures import save_figures
+from graphslam.app.run import GlobalMap, Run
+from graphslam.app.run_folder import RunFolder
+from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.core.geometry import Array
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.atomic import read_json, read_npz, write_npz
+from graphslam.io.map_graph import write_map_graph
+from graphslam.io.submap_store import read_submaps, read_truth, write_truth
+from graphslam.io.tum import read_tum, write_tum
+
+MAP_FORMAT = "graphslam.map/1"
+ASSOCIATION_FORMAT = "graphslam.association/1"
+
+
+def write_outputs(folder: RunFolder, run: Run) -> None:
+    """Write everything of the run folder but ``config.toml`` and ``submaps/``, which are there already."""
+    m = run.map
+    write_tum(folder.path / "trajectory.tum", m.trajectory)
+    write_tum(folder.path / "nodes.tum", Trajectory(m.node_times, m.node_poses))
+    folder.write_text("landmarks.csv", landmarks_csv(m))
+    write_npz(folder.path / "map.npz", _map_arrays(m))
+    write_npz(folder.path / "association.npz", _association_arrays(run.submaps))
+    if run.solution is not None:
+        v = run.solution.values
+        write_map_graph(folder.path / "graph.g2o", run.submaps, v.poses, v.landmark_ids, v.landmarks)
+    if run.truth is not None:
+        write_truth(folder.path, run.truth)
+    for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):
+        if path is not None:
+            write_tum(folder.path / name, path)
+    folder.write_lines("events.jsonl", run.events)
+    if run.ledger is not None:
+        folder.write_text("ledger.csv", run.ledger.to_csv(index=False))
+    folder.write_json("metrics.json", run.metrics.to_dict("records"))
+    save_figures(run, folder.figures)
+    folder.write_json("run.json", run.report)  # last: its presence says that the run is finished
+
+
+def landmarks_csv(m: GlobalMap) -> str:
+    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]."""
+    P = m.landmark_covariances
+    table = pd.DataFrame(
+        {
+            "id": m.landmark_ids,
+            "x": m.landmarks[:, 0],
+            "y": m.landmarks[:, 1],
+            "cov_xx": P[:, 0, 0],
+            "cov_xy": P[:, 0, 1],
+            "cov_yy": P[:, 1, 1],
+            "hits": m.landmark_hits,
+        }
+    )
+    return str(table.to_csv(index=False, float_format="%.9g"))
+
+
+def _map_arrays(m: GlobalMap) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "format": MAP_FORMAT,
+        "trajectory_times": m.trajectory.times,
+        "trajectory_poses": m.trajectory.poses,
+        "trajectory_covariances": m.trajectory.covariances,
+    }
+    for name in ("node_times", "node_poses", "node_covariances", "landmark_ids", "landmarks", "landmark_covariances"):
+        arrays[name] = getattr(m, name)
+    arrays["landmark_hits"] = m.landmark_hits
+    if m.T_gps_world is not None:
+        arrays["T_gps_world"] = m.T_gps_world
+    return arrays
+
+
+def _association_arrays(submaps: Any) -> dict[str, Any]:
+    ids = [s.landmarks.ids if s.landmarks is not None else np.zeros(0, dtype=np.int64) for s in submaps]
+    return {
+        "format": ASSOCIATION_FORMAT,
+        "keys": np.array([s.key for s in submaps], dtype=np.int64),
+        "offsets": np.concatenate([[0], np.cumsum([len(i) for i in ids])]).astype(np.int64),
+        "ids": np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64),
+    }
+
+
+def read_association(folder: Path) -> dict[int, Array]:
+    """Landmark identities that a run's back end gave, by submap key."""
+    a = read_npz(folder / "association.npz", fmt=ASSOCIATION_FORMAT)
+    o = a["offsets"]
+    return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
+
+
+def identified_submaps(path: str | Path) -> list[Submap]:
+    """Submaps of a store or of a run folder; a run's carry the identities of its back end."""
+    path = Path(path)
+    submaps = read_submaps(path)
+    if not (path / "association.npz").is_file():
+        return submaps
+    ids = read_association(path)
+    return [
+        s.with_ids(ids[s.key]) if s.landmarks is not None and len(ids.get(s.key, ())) == len(s.landmarks) else s
+        for s in submaps
+    ]
+
+
+def open_run(path: str | Path) -> Run:
+    """Read a finished run folder.
+
+    Raises
+    ------
+    RunFolderError
+        Not a finished run.
+    FormatError
+    """
+    root = Path(path)
+    if not (root / "run.json").is_file():
+        hint = (
+            "run again with --resume" if (root / "config.toml").is_file() else "give a folder that graphslam run wrote"
+        )
+        raise RunFolderError(f"{root}: not a finished run; {hint}")
+    report = read_json(root / "run.json", fmt="graphslam.run/1")
+    a = read_npz(root / "map.npz", fmt=MAP_FORMAT)
+    try:
+        m = GlobalMap(
+            trajectory=Trajectory(a["trajectory_times"], a["trajectory_poses"], a["trajectory_covariances"]),
+            node_times=a["node_times"],
+            node_poses=a["node_poses"],
+            node_covariances=a["node_covariances"],
+            landmark_ids=a["landmark_ids"],
+            landmarks=a["landmarks"],
+            landmark_covariances=a["landmark_covariances"],
+            landmark_hits=a["landmark_hits"],
+            T_gps_world=a.get("T_gps_world"),
+        )
+    except KeyError as error:
+        raise FormatError(f"map lacks array {error}", where=str(root / "map.npz")) from None
+    return Run(
+        name=str(report["source"]),
+        submaps=identified_submaps(root),
+        map=m,
+        metrics=pd.read_json(root / "metrics.json", orient="records"),
+        report=report,
+        folder=root,
+        truth=read_truth(root),
+        truth_path=_path(root / "truth.tum"),
+        dead_reckoning=_path(root / "dead_reckoning.tum"),
+    )
+
+
+def _path(file: Path) -> Trajectory | None:
+    return read_tum(file, dim=2) if file.is_file() else None

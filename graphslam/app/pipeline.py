@@ -1,0 +1,289 @@
+"""Raw log → submaps → graph → map: the main line of the project, one step after the other."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from frontends.motion import MotionNoise, steering_odometry
+from graphslam.app import config as cfg
+from graphslam.app.audit import audit_association
+from graphslam.app.back_end import BackEnd
+from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.gps_use import split, used_fixes
+from graphslam.app.metrics import (
+    Metrics,
+    front_end_metrics,
+    gps_metrics,
+    map_truth,
+    solution_metrics,
+    time_metrics,
+    truth_metrics,
+    truth_path,
+)
+from graphslam.app.outputs import write_outputs
+from graphslam.app.run import GlobalMap, Run
+from graphslam.app.run_folder import RunFolder
+from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.geometry import se2_compose
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.records import Gps, SteeringControls
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.catalog import load
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+PACKAGES = ("graphslam-submaps", "gtsam", "numpy", "scipy", "numba", "matplotlib", "pandas")
+
+
+def run(
+    source: str | Path | SensorLog,
+    *,
+    frontend: str = "rbpf-ekf",
+    solver: str = "isam2",
+    seed: int = 0,
+    out: str | Path | None = None,
+    config: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    progress: bool = True,
+) -> Run:
+    """Run a front end over a log, join its submaps in a graph, and score what can be scored.
+
+    Parameters
+    ----------
+    source : card name, folder, or SensorLog
+    frontend, solver : str
+        Registered names.
+    seed : int
+        Root of the seed tree.
+    out : path, optional
+        Run folder; without one nothing is written.
+    config : mapping, optional
+        Nested options over the source's preset: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``.
+    resume : bool
+        Go on after the last finished submap of ``out``, to the same result.
+    progress : bool
+        Show a progress bar on stderr.
+
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children; says what, where, got, wanted.
+    """
+    begin = time.perf_counter()
+    log = load_log_source(source)
+    seconds = {"load": time.perf_counter() - begin}
+    options = cfg.merge(recommended(log, frontend), config or {})
+    settings: cfg.RunConfig = cfg.build(cfg.RunConfig, options)
+    front = make_front_end(frontend, settings.frontend)
+    effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
+    folder = None if out is None else RunFolder.start(out, effective, resume=resume)
+
+    back = BackEnd(settings.backend, solver)
+    gps = gps_stream(log)
+    if gps is not None and settings.gps.use != "none":
+        back.add_gps(split(gps, settings.gps)[0], settings.gps)
+
+    drops = DropCounter()
+    submaps, timing = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
+    if not submaps:
+        raise MissingDataError("the log gave no submap", where=log.name)
+    solution = back.finish()
+    seconds |= timing | {f"backend_{k}": v for k, v in back.seconds.items()}
+    seconds["backend"] = sum(back.seconds.values())
+    seconds["total"] = time.perf_counter() - begin
+
+    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, drops, effective)
+    if folder is not None:
+        write_outputs(folder, result)
+        object.__setattr__(result, "folder", folder.path)
+    return result
+
+
+def load_log_source(source: str | Path | SensorLog) -> SensorLog:
+    """A log from a card name, a folder on disk, or itself."""
+    if isinstance(source, SensorLog):
+        return source
+    log = load(source)
+    if not isinstance(log, SensorLog):
+        raise MissingDataError(
+            f"{source} holds no sensor log", got=type(log).__name__, wanted="a log of sensor streams"
+        )
+    return log
+
+
+def gps_stream(log: SensorLog) -> Gps | None:
+    """The GPS stream of a log, if it has one."""
+    name = log.of_type(Gps)
+    return None if name is None else log[name]
+
+
+def effective_config(
+    source: str, frontend: str, solver: str, seed: int, front_config: Any, settings: cfg.RunConfig
+) -> dict[str, Any]:
+    """What ``config.toml`` holds: names, seed, and every option with its value."""
+    run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
+    return {
+        "run": run_part,
+        "frontend": cfg.as_dict(front_config),
+        "backend": cfg.as_dict(settings.backend),
+        "gps": cfg.as_dict(settings.gps),
+    }
+
+
+def _front_to_back(
+    log: SensorLog,
+    front: Any,
+    back: BackEnd,
+    seed: SeedTree,
+    folder: RunFolder | None,
+    drops: DropCounter,
+    progress: bool,
+) -> tuple[list[Submap], dict[str, Any]]:
+    """Feed every submap to the back end as soon as it is finished and stored."""
+    store = None if folder is None else folder.submaps
+    submaps = store.complete_prefix() if store is not None else []
+    if store is not None and len(submaps) < len(store):
+        store.truncate(len(submaps))
+    t_first, t_last = log.interval
+    bar = tqdm(total=round(t_last - t_first, 1), unit="s", desc=log.name, disable=not progress, leave=False)
+    for s in submaps:
+        back.add(s)
+    if submaps:
+        logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
+        bar.update(submaps[-1].interval[1] - t_first)
+    front_s, resumed, cost = 0.0, len(submaps), []
+    stream = front.submaps(log, seed=seed.child("frontend"), after=submaps[-1] if submaps else None, drops=drops)
+    while True:
+        start = time.perf_counter()
+        submap = next(stream, None)
+        spent = time.perf_counter() - start
+        front_s += spent
+        if submap is None:
+            break
+        if store is not None:
+            store.append(submap)
+        back.add(submap)
+        submaps.append(submap)
+        cost.append(spent / max(int(submap.report.get("scans", 1)), 1))
+        bar.update(submap.interval[1] - submap.interval[0])
+        bar.set_postfix(submaps=len(submaps), landmarks=len(back.graph.values.landmarks))
+    bar.close()
+    return submaps, {"frontend": front_s, "resumed_submaps": resumed, "cost": np.array(cost[1:])}
+
+
+def _judge(
+    log: SensorLog,
+    front: Any,
+    gps: Gps | None,
+    settings: cfg.RunConfig,
+    submaps: list[Submap],
+    back: BackEnd,
+    solution: Solution,
+    seconds: dict[str, Any],
+    drops: DropCounter,
+    effective: dict[str, Any],
+) -> Run:
+    """Metrics, residuals, and the value that the user gets."""
+    hits = back.landmark_hits(submaps)
+    global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
+    cost, resumed = seconds.pop("cost"), seconds.pop("resumed_submaps")
+    out = Metrics()
+    front_end_metrics(out, submaps)
+    solution_metrics(out, solution, len(global_map.landmarks))
+    scans = sum(int(s.report.get("scans", 0)) for s in submaps[resumed:])
+    time_metrics(out, seconds, log.duration, scans, [cost])
+    residuals = {}
+    if gps is not None:
+        withheld = ~used_fixes(gps, settings.gps)
+        residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
+    truth, identities = map_truth(log, submaps), "run"
+    identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
+    if truth is not None:
+        known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
+        truth_metrics(out, solution, truth, identities=known)
+        identities = "truth" if known else "run"
+    audit_association(out, log, front, *back.observation_labels(submaps))
+    report = {
+        "format": "graphslam.run/1",
+        **effective["run"],
+        "versions": versions(),
+        "seconds": seconds,
+        "resumed_submaps": resumed,
+        "records_read": dict(log.read) or {k: len(s.times) for k, s in log.streams.items()},
+        "records_dropped": {**log.dropped, **drops.counts},
+        "source_meta": dict(log.meta),
+        "identities": identities,
+        "covariance_scale": settings.backend.covariance_scale,
+        "objective": solution.objective,
+        "converged": solution.converged,
+    }
+    return Run(
+        name=log.name,
+        submaps=identified,
+        map=global_map,
+        metrics=out.table(),
+        report=report,
+        events=list(back.graph.events),
+        ledger=back.graph.ledger.table(),
+        gps=residuals,
+        log=log,
+        truth=truth,
+        truth_path=truth_path(log, global_map.trajectory.times),
+        dead_reckoning=dead_reckoning(log, global_map.trajectory.times),
+        solution=solution,
+        graph=back.graph,
+    )
+
+
+def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
+    """Trajectory at full rate, nodes, and the landmarks seen at least ``confirmed`` times."""
+    n = np.array([hits.get(int(i), 0) for i in solution.landmark_ids], dtype=np.int64)
+    keep = n >= confirmed
+    return GlobalMap(
+        trajectory=solution.trajectory(),
+        node_times=np.array([s.interval[0] for s in submaps] + [submaps[-1].interval[1]]),
+        node_poses=solution.poses,
+        node_covariances=solution.node_covariances(),
+        landmark_ids=solution.landmark_ids[keep],
+        landmarks=solution.landmarks[keep],
+        landmark_covariances=solution.landmark_covariances()[keep],
+        landmark_hits=n[keep],
+        T_gps_world=solution.T_gps_world,
+    )
+
+
+def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
+    """Path from the controls alone, in the frame of the first base."""
+    name = log.of_type(SteeringControls)
+    if name is None:
+        return None
+    try:
+        steps = steering_odometry(log[name], times, MotionNoise()).increments
+    except GraphSlamError:
+        return None
+    poses = np.zeros_like(steps)
+    for k in range(1, len(steps)):
+        poses[k] = se2_compose(poses[k - 1], steps[k])
+    return Trajectory(times, poses)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computed the run."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found

@@ -1,0 +1,128 @@
+"""A finished run as a value: what a notebook holds in its hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps import GpsResiduals
+
+if TYPE_CHECKING:
+    from graphslam.graph.pose_graph import PoseGraph
+    from graphslam.solve.solution import Solution
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The solved map, in the frame of the first base.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Full rate, ``T_world_base(t)`` with covariances.
+    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3), (m + 1, 3, 3)
+        Bases of the submaps and the end of the last.
+    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
+        Confirmed landmarks.
+    landmark_hits : (n,)
+        Sightings over all submaps.
+    T_gps_world : (3,) or None
+        Map → GPS frame, where GPS was in the graph.
+    """
+
+    trajectory: Trajectory
+    node_times: Array
+    node_poses: Array
+    node_covariances: Array
+    landmark_ids: Ints
+    landmarks: Array
+    landmark_covariances: Array
+    landmark_hits: Ints
+    T_gps_world: Array | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """Result of :func:`graphslam.run` or :func:`graphslam.open_run`.
+
+    Parameters
+    ----------
+    name : str
+    submaps : list of Submap
+        With the landmark identities that the back end gave them.
+    map : GlobalMap
+    metrics : DataFrame
+        ``key, value, unit, direction``.
+    report : dict
+        ``run.json``: versions, seed, times, counts of records read, used and dropped.
+    events : list of dict
+    ledger : DataFrame or None
+        Which factor spent which stream when; None for a run read back from disk.
+    gps : mapping of str to GpsResiduals
+        ``all`` and, where GPS was in the graph, ``withheld``.
+    folder : Path or None
+    log : SensorLog or None
+    truth : MapTruth or None
+        Ends of the submaps and landmarks.
+    truth_path, dead_reckoning : Trajectory or None
+        In the frame of the first base.
+    solution, graph : Solution, PoseGraph or None
+        The solver's own view; None for a run read back from disk.
+    """
+
+    name: str
+    submaps: Sequence[Submap]
+    map: GlobalMap
+    metrics: pd.DataFrame
+    report: dict[str, Any]
+    events: list[dict[str, Any]] = field(default_factory=list)
+    ledger: pd.DataFrame | None = None
+    gps: dict[str, GpsResiduals] = field(default_factory=dict)
+    folder: Path | None = None
+    log: SensorLog | None = None
+    truth: MapTruth | None = None
+    truth_path: Trajectory | None = None
+    dead_reckoning: Trajectory | None = None
+    solution: Solution | None = None
+    graph: PoseGraph | None = None
+
+    def metric(self, key: str) -> float:
+        """Value of one metric.
+
+        Raises
+        ------
+        KeyError
+        """
+        row = self.metrics[self.metrics["key"] == key]
+        if row.empty:
+            raise KeyError(key)
+        return float(row["value"].iloc[0])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""
+        from graphslam.app.figures import draw_map
+
+        return draw_map(self, ax)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{r.key}</td><td>{r.value:.6g}</td><td>{r.unit}</td></tr>" for r in self.metrics.itertuples()
+        )
+        where = f" in {self.folder.name}" if self.folder else ""
+        return (
+            f"<b>Run of {self.name}</b>{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
+            f"<table><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
+        )

@@ -1,0 +1,70 @@
+"""The verbs of a notebook: ``graphslam.load``, ``run``, ``compare``, ``join``, ``solve`` and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from graphslam.app import compare as comparing
+from graphslam.app.outputs import open_run as open_run
+from graphslam.app.pipeline import load_log_source
+from graphslam.app.pipeline import run as run
+from graphslam.app.run import Run
+from graphslam.app.submap_sources import submap_source
+from graphslam.app.worlds import simulate as simulate
+from graphslam.core.log import SensorLog
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.submap import Submap
+
+__all__ = ["compare", "join", "load", "open_run", "run", "simulate", "solve"]
+
+
+def load(source: str | Path) -> SensorLog:
+    """A sensor log by card name, or from a folder.
+
+    Raises
+    ------
+    UnknownNameError, MissingDataError, FormatError
+    """
+    return load_log_source(source)
+
+
+def compare(
+    source: Run | str | Path | Sequence[Submap],
+    methods: Sequence[str] = comparing.DEFAULT_METHODS,
+    *,
+    truth: MapTruth | None = None,
+    **options: Any,
+) -> pd.DataFrame:
+    """Join the same submaps by several methods: objective, time, memory, non-zeros, and NEES where truth is known.
+
+    Parameters
+    ----------
+    source : Run, run folder, submap store, card of submaps, or sequence of Submap
+    methods : sequence of str
+        Of ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
+    truth : MapTruth, optional
+        Instead of the source's own.
+    **options
+        See :func:`graphslam.app.compare.compare`.
+    """
+    s = submap_source(source)
+    options.setdefault("covariance_scale", s.covariance_scale)
+    return comparing.compare(s.submaps, methods=methods, truth=truth or s.truth, **options)
+
+
+def join(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
+    """Join submaps by one method; see :func:`graphslam.app.compare.join`."""
+    s = submap_source(source)
+    options.setdefault("covariance_scale", s.covariance_scale)
+    return comparing.join(s.submaps, method, **options)
+
+
+def solve(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
+    """Solve a pose-graph file; see :func:`graphslam.app.solve_file.solve_file`."""
+    from graphslam.app.solve_file import solve_file
+
+    return solve_file(path, solver, **options)

@@ -1,0 +1,52 @@
+"""Pair precision and recall of a data association."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graphslam.core.errors import DataError
+from graphslam.evaluate.association import match_observations, pair_agreement
+
+labels = st.lists(st.integers(-1, 4), min_size=2, max_size=14)
+
+
+@given(st.data())
+def test_counts_equal_enumeration_of_all_pairs(data):
+    a = np.array(data.draw(labels))
+    b = np.array(data.draw(st.lists(st.integers(-1, 4), min_size=len(a), max_size=len(a))))
+    got = pair_agreement(a, b)
+    used = [(x, y) for x, y in zip(a, b) if x >= 0 and y >= 0]
+    pairs = list(itertools.combinations(used, 2))
+    assert got.together == sum(p[0] == q[0] for p, q in pairs)
+    assert got.together_reference == sum(p[1] == q[1] for p, q in pairs)
+    assert got.together_both == sum(p == q for p, q in pairs)
+
+
+def test_hand_case_with_one_wrong_and_one_split():
+    got = pair_agreement([0, 0, 0, 1, 1, 2], [7, 7, 8, 9, 9, 9])
+    assert got.precision == pytest.approx(2 / 4)  # pairs of ours: 3 + 1; confirmed: (0,1), (3,4)
+    assert got.recall == pytest.approx(2 / 4)  # reference: 1 + 3
+    assert (got.mixed, got.split) == (1, 1)
+
+
+def test_identical_up_to_names_is_perfect():
+    got = pair_agreement([3, 3, 1, 1, 0], [0, 0, 5, 5, 9])
+    assert (got.precision, got.recall, got.mixed, got.split) == (1, 1, 0, 0)
+
+
+def test_shapes_must_agree():
+    with pytest.raises(DataError):
+        pair_agreement([0, 1], [0])
+
+
+def test_observations_are_matched_by_scan_and_each_row_once():
+    t = np.array([1.0, 1.0, 2.0])
+    rt = np.array([1.001, 1.001, 3.0])
+    got = match_observations(t, np.array([5.0, 5.1, 7.0]), np.zeros(3), rt, np.array([5.09, 5.25, 7.0]), np.zeros(3))
+    # row 0 of the reference is nearest to observation 1; observation 0 then takes the other; 3.0 s is another scan
+    assert got.tolist() == [1, 0, -1]
