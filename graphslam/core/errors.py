@@ -6,6 +6,8 @@ only the command line catches :class:`GraphSlamError`, prints its one line and e
 
 from __future__ import annotations
 
+import difflib
+
 
 class GraphSlamError(Exception):
     """Base of every error this project raises on purpose."""
@@ -50,8 +52,10 @@ class UnknownNameError(GraphSlamError):
     """A card, front end, solver, joiner or world of that name is not registered."""
 
     def __init__(self, kind: str, name: str, known: object = ()) -> None:
-        names = ", ".join(sorted(str(k) for k in known)) if known else "none"  # type: ignore[attr-defined]
-        super().__init__(f"unknown {kind} {name!r}; known: {names}")
+        names = sorted(str(k) for k in known) if known else []  # type: ignore[attr-defined]
+        close = difflib.get_close_matches(name, names, n=3)
+        hint = f"did you mean {' or '.join(close)}? " if close else ""
+        super().__init__(f"unknown {kind} {name!r}; {hint}known: {', '.join(names) or 'none'}")
         self.kind, self.name = kind, name
 
 

@@ -1,0 +1,245 @@
+"""Data-set cards: what a recorded data set is, where it comes from, its terms and the checksums of its files.
+
+A card is a TOML file in the folder ``datasets`` of the repository, which installs as ``graphslam/cards``. The format is
+described in ``datasets/README.md``. Data themselves never ship.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from html import escape
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import graphslam
+from graphslam.core.errors import FormatError, MissingDataError, UnknownNameError
+
+CARD_FORMAT = "graphslam.card/1"
+KINDS = ("sensor-log", "submaps", "detections", "pose-graph", "point-clouds", "octree")
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]*")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+COMPRESSIONS = (".gz", ".bz2", ".xz")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CardFile:
+    """One file of a data set.
+
+    Parameters
+    ----------
+    path : str
+        Below the card's folder, with forward slashes.
+    bytes, sha256 : int, str
+        Of the file as the card names it.
+    content_bytes, content_sha256 : int, str or None
+        Of what is inside, where the name ends in ``.gz``, ``.bz2`` or ``.xz``: the uncompressed file is as good.
+    url : str or None
+        Direct download of the file or, where there is a content, of the content.
+    optional : bool
+        The set can be used without it.
+    """
+
+    path: str
+    bytes: int
+    sha256: str
+    content_bytes: int | None = None
+    content_sha256: str | None = None
+    url: str | None = None
+    optional: bool = False
+
+    @property
+    def plain_path(self) -> str | None:
+        """Name of the uncompressed file, if the card knows its checksum."""
+        return str(PurePosixPath(self.path).with_suffix("")) if self.content_sha256 else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CardArchive:
+    """A zip archive that holds files of the set (found by name, in any folder inside it)."""
+
+    url: str
+    members: tuple[str, ...]
+    sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Card:
+    """What is known of a recorded data set.
+
+    Parameters
+    ----------
+    name, title : str
+    kind : str
+        One of :data:`KINDS`.
+    folder : str
+        Below a data root.
+    records : str
+        What it holds, in words.
+    source, obtained_from : str
+        The original page, and where our copy came from.
+    citation, licence, terms : str
+    caveats : tuple of str
+        Traps.
+    files : tuple of CardFile
+    archives : tuple of CardArchive
+    reader : str or None
+        Name in :data:`graphslam.io.catalog.READERS`.
+    """
+
+    name: str
+    title: str
+    kind: str
+    folder: str
+    records: str
+    source: str
+    obtained_from: str
+    citation: str
+    licence: str
+    terms: str
+    caveats: tuple[str, ...]
+    files: tuple[CardFile, ...]
+    archives: tuple[CardArchive, ...] = ()
+    reader: str | None = None
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files."""
+        return sum(f.bytes for f in self.files)
+
+    def archive_of(self, file: CardFile) -> CardArchive | None:
+        """The archive that holds a file, under its own or its uncompressed name."""
+        names = {PurePosixPath(p).name for p in (file.path, file.plain_path) if p}
+        return next((a for a in self.archives if names & set(a.members)), None)
+
+    @property
+    def fetchable(self) -> bool:
+        """Can every needed file be downloaded directly?"""
+        return all(f.url or self.archive_of(f) for f in self.files if not f.optional)
+
+    def _repr_html_(self) -> str:
+        rows = {
+            "kind": self.kind,
+            "holds": self.records,
+            "source": self.source,
+            "cite": self.citation,
+            "licence": f"{self.licence}. {self.terms}",
+            "files": f"{len(self.files)}, {self.bytes / 1e6:.1f} MB",
+        }
+        body = "".join(f"<tr><td>{k}</td><td>{escape(v)}</td></tr>" for k, v in rows.items())
+        notes = "".join(f"<li>{escape(c)}</li>" for c in self.caveats)
+        return f"<b>{escape(self.name)}</b>: {escape(self.title)}<table>{body}</table><ul>{notes}</ul>"
+
+
+def cards_folder() -> Path:
+    """Folder of the cards: inside the installed package, or ``datasets`` beside it in a checkout.
+
+    Raises
+    ------
+    MissingDataError
+        The installation holds no cards.
+    """
+    package = Path(graphslam.__file__).resolve().parent
+    for folder in (package / "cards", package.parent / "datasets"):
+        if any(folder.glob("*.toml")):
+            return folder
+    raise MissingDataError("this installation holds no data-set cards", where=str(package / "cards"))
+
+
+@cache
+def list_cards() -> tuple[Card, ...]:
+    """All cards, by name."""
+    return tuple(read_card(p) for p in sorted(cards_folder().glob("*.toml")))
+
+
+def card(name: str) -> Card:
+    """The card of that name.
+
+    Raises
+    ------
+    UnknownNameError
+        Says which names are close.
+    """
+    known = {c.name: c for c in list_cards()}
+    if name not in known:
+        raise UnknownNameError("data set", name, known)
+    return known[name]
+
+
+def read_card(path: Path) -> Card:
+    """Read and check one card.
+
+    Raises
+    ------
+    FormatError
+        Names the file and the key.
+    """
+    where = str(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FormatError(f"not TOML ({error})", where=where) from None
+    if content.pop("format", None) != CARD_FORMAT:
+        raise FormatError("unknown format of card", where=where, wanted=repr(CARD_FORMAT))
+    files = tuple(_build(CardFile, f, where) for f in _list(content, "files", where))
+    archives = tuple(_build(CardArchive, a, where) for a in _list(content, "archives", where))
+    made: Card = _build(Card, {**content, "files": files, "archives": archives}, where)
+    if not _NAME.fullmatch(made.name) or made.name != path.stem:
+        raise FormatError("name of the card is not that of its file", where=where, got=made.name, wanted=path.stem)
+    if made.kind not in KINDS:
+        raise FormatError("unknown kind", where=where, got=made.kind, wanted=", ".join(KINDS))
+    if not files:
+        raise FormatError("card without files", where=where)
+    for p in (made.folder, *(f.path for f in files)):
+        _check_path(p, where)
+    for f in files:
+        for digest, size in ((f.sha256, f.bytes), (f.content_sha256, f.content_bytes)):
+            if (digest is None) != (size is None) or (digest is not None and not _SHA256.fullmatch(digest)):
+                raise FormatError(
+                    f"bad checksum of {f.path}", where=where, got=digest, wanted="64 hex digits and bytes"
+                )
+        if f.content_sha256 and not f.path.endswith(COMPRESSIONS):
+            raise FormatError(f"{f.path} has a content but is not compressed", where=where)
+    return made
+
+
+def _check_path(path: str, where: str) -> None:
+    p = PurePosixPath(path)
+    if not path or "\\" in path or ":" in path or p.is_absolute() or ".." in p.parts:
+        raise FormatError("path leaves the folder of the data set", where=where, got=path)
+
+
+def _list(content: dict[str, Any], key: str, where: str) -> list[Any]:
+    value = content.pop(key, [])
+    if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
+        raise FormatError(f"{key} is not a list of tables", where=where)
+    return value
+
+
+def _build(kind: Any, values: Mapping[str, Any], where: str) -> Any:
+    """A dataclass from a table whose keys and types must be its fields'."""
+    wanted = {f.name: str(f.type) for f in fields(kind)}
+    for key, value in values.items():
+        if key not in wanted:
+            raise FormatError(f"unknown key {key!r}", where=where, wanted=", ".join(wanted))
+        text = wanted[key]
+        good = (
+            isinstance(value, list) and all(isinstance(v, str) for v in value)
+            if text == "tuple[str, ...]"
+            else isinstance(value, tuple)
+            if text.startswith("tuple")
+            else isinstance(value, bool)
+            if text == "bool"
+            else isinstance(value, int) and not isinstance(value, bool) and value >= 0
+            if text.startswith("int")
+            else isinstance(value, str)
+        )
+        if not good:
+            raise FormatError(f"{key} is not of type {text}", where=where, got=repr(value)[:80])
+    try:
+        return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    except TypeError as error:
+        raise FormatError(f"card is incomplete ({error})", where=where) from None

@@ -1,0 +1,160 @@
+"""Download of data sets into the cache, every file checked against its card before it gets its name."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+
+from graphslam.core.errors import DataError, FormatError, MissingDataError
+from graphslam.io.atomic import atomic_open
+from graphslam.io.cards import Card, CardArchive, CardFile, card
+from graphslam.io.catalog import cache_folder, check_file, data_roots
+
+log = logging.getLogger(__name__)
+TIMEOUT = 60.0
+"""Seconds without an answer before a download fails."""
+
+
+def fetch(data: Card | str, *, progress: bool = False) -> Path:
+    """Have all files of a data set on this machine; download what is missing or differs.
+
+    Parameters
+    ----------
+    data : Card or str
+    progress : bool
+        Show a bar for every download.
+
+    Returns
+    -------
+    Path
+        Folder that holds the files: the cache, or where they already were.
+
+    Raises
+    ------
+    UnknownNameError
+        No such card.
+    MissingDataError
+        The card has no direct download (says where to get the data), or the server does not answer.
+    DataError
+        What came is not what the card says.
+    """
+    c = card(data) if isinstance(data, str) else data
+    log.info("%s: %s", c.name, c.title)
+    log.info("%s: licence: %s. %s", c.name, c.licence, c.terms)
+    log.info("%s: please cite: %s", c.name, c.citation)
+    for root in data_roots():
+        states = [check_file(root / c.folder, f) for f in c.files]
+        if all(s.state == "ok" or (s.state == "missing" and s.file.optional) for s in states):
+            log.info("%s: already in %s, checksums agree", c.name, root / c.folder)
+            return root / c.folder
+    if not c.fetchable:
+        raise MissingDataError(
+            f"data set {c.name!r} has no direct download",
+            where=c.source,
+            wanted=f"a copy from there (ours came from {c.obtained_from}), in a folder {c.folder}/ of a data root",
+        )
+    target = cache_folder() / c.folder
+    target.mkdir(parents=True, exist_ok=True)
+    todo = [f for f in c.files if check_file(target, f).state != "ok"]
+    log.info("%s: fetching %d of %d files into %s", c.name, len(todo), len(c.files), target)
+    unpack: dict[str, list[CardFile]] = {}
+    archives: dict[str, CardArchive] = {}
+    for f in todo:
+        archive = c.archive_of(f)
+        if f.url:
+            _fetch_file(c, f, target, progress)
+        elif archive:
+            unpack.setdefault(archive.url, []).append(f)
+            archives[archive.url] = archive
+        else:
+            log.info("%s: %s has no direct download; it is not needed", c.name, f.path)
+    for url, wanted in unpack.items():
+        packed = _download(c, url, target, f".{PurePosixPath(url).name}", archives[url].sha256, progress)
+        try:
+            _unpack(packed, wanted, target)
+        finally:
+            packed.unlink(missing_ok=True)
+    return target
+
+
+def _fetch_file(c: Card, f: CardFile, target: Path, progress: bool) -> None:
+    """Download a file, or its content where that is what the link gives."""
+    assert f.url is not None
+    name, digest = (f.plain_path, f.content_sha256) if f.plain_path else (f.path, f.sha256)
+    assert name is not None
+    folder = target / PurePosixPath(name).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    if f.plain_path:
+        (target / f.path).unlink(missing_ok=True)  # a spoilt packed file would hide the good plain one
+    _download(c, f.url, folder, PurePosixPath(name).name, digest, progress)
+
+
+def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, progress: bool) -> Path:
+    import pooch
+    import requests
+
+    log.info("%s: downloading %s", c.name, url)
+    # quiet: pooch advises to paste an unknown hash into the code; here the members of an archive are checked instead
+    pooch.get_logger().setLevel("WARNING")
+    (folder / name).unlink(missing_ok=True)  # pooch keeps a file whose hash it was not told
+    try:
+        return Path(
+            pooch.retrieve(
+                url,
+                known_hash=None if digest is None else f"sha256:{digest}",
+                fname=name,
+                path=folder,
+                downloader=pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT),
+            )
+        )
+    except requests.exceptions.RequestException as error:
+        raise MissingDataError(
+            f"download failed ({type(error).__name__}: {error})", where=url, wanted=f"or a copy from {c.source}"
+        ) from None
+    except ValueError as error:
+        if "hash" not in str(error):
+            raise DataError(f"download failed ({error})", where=url) from None
+        raise DataError(
+            "what was downloaded is not the file of the card: the checksum differs; it was thrown away",
+            where=url,
+            wanted=f"sha256 {digest}",
+        ) from None
+
+
+def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:
+    """Take the wanted files out of a zip archive, by their last name; nothing else is written, and nowhere else."""
+    where = packed.name.removeprefix(".")
+    try:
+        with zipfile.ZipFile(packed) as archive:
+            members = archive.infolist()
+            for m in members:
+                p = PurePosixPath(m.filename.replace("\\", "/"))
+                if p.is_absolute() or ".." in p.parts or ":" in m.filename:
+                    raise FormatError("archive names a path outside itself", where=where, got=m.filename)
+            by_name = {PurePosixPath(m.filename).name.lower(): m for m in members if not m.is_dir()}
+            for f in wanted:
+                name, size, digest = f.path, f.bytes, f.sha256
+                if f.plain_path and f.content_bytes is not None and f.content_sha256 is not None:
+                    name, size, digest = f.plain_path, f.content_bytes, f.content_sha256
+                member = by_name.get(PurePosixPath(name).name.lower())
+                if member is None:
+                    if f.optional:
+                        log.warning("%s: not in the archive %s", name, where)
+                        continue
+                    raise MissingDataError(f"archive does not hold {PurePosixPath(name).name}", where=where)
+                with archive.open(member) as stream:
+                    content = stream.read(size + 1)  # never more than the card says: a bomb stays folded
+                if len(content) != size or hashlib.sha256(content).hexdigest() != digest:
+                    raise DataError(
+                        f"{member.filename} is not the file of the card", where=where, wanted=f"sha256 {digest}"
+                    )
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+                with atomic_open(target / name) as out:
+                    out.write(content)
+                if name != f.path:
+                    (target / f.path).unlink(missing_ok=True)  # a spoilt packed file would hide it
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None
