@@ -131,7 +131,7 @@ def test_folders_are_told_apart_by_what_they_hold(tmp_path: Path, rng: np.random
         0,
         LandmarkMap(ids=[1], exit_pose=[1.0, 0, 0], positions=rng.normal(size=(1, 2)), covariance=np.eye(5)),
     )
-    write_submaps(tmp_path / "run/submaps", [sub])
+    write_submaps(tmp_path / "run", [sub])
     for folder in (tmp_path / "run", tmp_path / "run/submaps"):
         (back,) = load(folder)
         np.testing.assert_array_equal(back.landmarks.positions, sub.landmarks.positions)
