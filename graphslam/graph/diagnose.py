@@ -100,9 +100,10 @@ def _null_variables(A: Array | sp.csc_matrix, lay: Layout) -> list[str]:
     owner = np.array(lay.owner_of_columns(), dtype=object)
     if lay.size == 0:
         return []
-    bad = ~(np.isfinite(diagonal) & (diagonal > 0))
-    if np.any(bad):
-        return list(dict.fromkeys(owner[bad]))
+    if not np.all(np.isfinite(diagonal)):
+        return []  # an overflow is a broken factor, not a missing one
+    if np.any(diagonal <= 0):
+        return list(dict.fromkeys(owner[diagonal <= 0]))
     s = 1.0 / np.sqrt(diagonal)
     if sp.issparse(A):
         scaled = sp.csc_matrix(sp.diags(s) @ A @ sp.diags(s))

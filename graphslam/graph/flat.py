@@ -164,7 +164,8 @@ class FlatGraph:
             self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
             hessian, H, self._H_offset, g, self._g_offset, chi2[:S],
         )  # fmt: skip
-        self._small_blocks(values, hessian, H, g, chi2[S:])
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows shows as inf or nan and is refused by name
+            self._small_blocks(values, hessian, H, g, chi2[S:])
         out = np.empty_like(chi2)
         out[self._position] = chi2
         if not hessian:

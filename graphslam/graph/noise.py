@@ -42,7 +42,9 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
     L = np.linalg.cholesky(scale * P)
     W, _ = sl.lapack.dtrtri(L, lower=1)
     W = np.tril(W)
-    if not np.all(np.isfinite(W)):
+    with np.errstate(over="ignore"):
+        usable = np.all(np.isfinite(W.T @ W))
+    if not usable:
         raise CovarianceError(f"{what} is singular to working precision", got=f"smallest pivot {np.diag(L).min():.3g}")
     return np.asarray(W, dtype=np.float64)
 

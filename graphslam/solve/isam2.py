@@ -106,20 +106,25 @@ class Isam2Solver:
         finally:
             self.seconds += time.perf_counter() - t0
 
-    def relinearize(self, *, max_updates: int = 50, tolerance: float = 1e-9) -> int:
-        """Relinearise everything until nothing moves by more than ``tolerance``; returns the number of passes."""
+    def relinearize(self, *, max_passes: int = 50, tolerance: float = 1e-9) -> int:
+        """Linearise everything anew where it stands until nothing moves by more than ``tolerance``.
+
+        Each pass is one Gauss–Newton step of the whole problem, made by building iSAM2 again from the graph's record:
+        GTSAM's own ``force_relinearize`` only overrides the skip and still passes over every variable within its
+        threshold.
+
+        Returns
+        -------
+        int
+            Passes made.
+        """
+        self.update()
         t0 = time.perf_counter()
-        self._update()
-        parameters = gtsam.ISAM2UpdateParams()
-        parameters.force_relinearize = True
         passes = 0
-        while passes < max_updates:
+        while passes < max_passes:
             passes += 1
             before = self.graph.values
-            trial = gtsam.ISAM2(self._isam)
-            trial.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), parameters)
-            self._isam = trial
-            self._write_back()
+            self._rebuild()
             if _distance(before, self.graph.values) <= tolerance:
                 break
         self.seconds += time.perf_counter() - t0

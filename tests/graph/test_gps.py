@@ -48,7 +48,7 @@ def test_factor_jacobians_by_finite_differences(rng, node, bias):
 
     np.testing.assert_allclose(factor.unwhitenedError(values), residual(state), atol=1e-12)
     J, columns, h = factor.linearize(values).jacobian()[0], [], 1e-6
-    for key in factor.keys():
+    for key in list(factor.keys()):
         name = next(n for n in state if gtsam_key(n) == key)
         for axis in range(len(state[name])):
             e = np.zeros(len(state[name]))

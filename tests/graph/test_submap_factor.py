@@ -13,7 +13,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.state import gtsam_key, key_name, vector_form
 from graphslam.graph.submap_factor import submap_factor
 from graphslam.graph.submap_model import submap_residual
-from tests.reference.graph_chain import dense_submap, end_only_submap, make_chain, correlated_covariance
+from tests.reference.graph_chain import correlated_covariance, dense_submap, end_only_submap, make_chain
 
 
 def build(rng, start: int, ids: np.ndarray):
@@ -47,7 +47,7 @@ def test_linearisation_matches_finite_differences(rng, start, ids):
     J, b = factor.linearize(values).jacobian()
     np.testing.assert_allclose(-b, r, atol=1e-12)
     h, columns = 1e-6, []
-    for key in factor.keys():
+    for key in list(factor.keys()):
         name = key_name(key)
         for axis in range(3 if name[0] == "x" else 2):
             sides = []
@@ -86,7 +86,7 @@ def test_linearised_factor_gives_back_mean_and_covariance(rng):
     np.testing.assert_allclose(g.values.landmarks, s.landmarks.positions, atol=1e-12)
     (record,) = g.records.values()
     linear = gtsam_factor(record, g.origin).linearize(to_gtsam(g.values))
-    names = [key_name(k) for k in linear.keys()]
+    names = [key_name(k) for k in list(linear.keys())]
     assert names == g.flat().layout.names()
     P = np.linalg.inv(linear.information())
     np.testing.assert_allclose(vector_form(P, g.values.poses[1:], [0]), s.landmarks.covariance, rtol=1e-9, atol=1e-14)
@@ -115,7 +115,7 @@ def test_start_pose_enters_only_through_the_relative_pose(rng):
     factor, values, *_ = build(rng, 1, ids)
     T = gtsam.Pose2(3.0, -7.0, 1.3)
     moved = gtsam.Values()
-    for key in factor.keys():
+    for key in list(factor.keys()):
         if key_name(key)[0] == "x":
             moved.insert(key, T.compose(values.atPose2(key)))
         else:

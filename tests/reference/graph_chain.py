@@ -49,7 +49,11 @@ def make_chain(
     """A loop of ``m`` submaps; ``noise = 0`` draws none (the covariances stay)."""
     angle = 2 * np.pi * laps * np.arange(m + 1) / m
     world = np.stack([radius * np.sin(angle), radius * (1 - np.cos(angle)), angle], -1)
-    points = rng.uniform([-radius - 4, -4], [radius + 4, 2 * radius + 4], size=(landmarks, 2))
+    points = np.zeros((0, 2))
+    while len(points) < landmarks:  # like trees, no two within a metre
+        p = rng.uniform([-radius - 4, -4], [radius + 4, 2 * radius + 4])
+        if np.all(np.linalg.norm(points - p, axis=1) > 1.0):
+            points = np.vstack([points, p])
     submaps = []
     for k in range(m):
         exit_pose = se2_between(world[k], world[k + 1])
