@@ -82,12 +82,13 @@ def test_equals_the_slow_twin_on_real_scans(laser: LaserScans) -> None:
 
 
 def test_whole_log_in_one_call_is_fast(laser: LaserScans) -> None:
+    """CPU time, so that a busy machine does not fail it."""
     detect_trees(laser.take(slice(0, 2)))  # compile
     best = np.inf
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         detect_trees(laser)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     assert best < 0.2, best
 
 

@@ -70,9 +70,10 @@ def test_the_real_log(real: SensorLog) -> None:
 
 @pytest.mark.data
 def test_reading_is_fast(data_dir: Path) -> None:
-    start = time.perf_counter()
+    """CPU time, so that a busy machine does not fail it."""
+    start = time.process_time()
     read_victoria_park(data_dir / "victoria_park_raw")
-    assert time.perf_counter() - start < 3.0
+    assert time.process_time() - start < 3.0
 
 
 @pytest.mark.data
