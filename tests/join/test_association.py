@@ -11,6 +11,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
 from graphslam.join.association import Association, CandidatePairs, associate, merge_close
+from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinedMap
 from graphslam.join.order import join_sequential, join_tree
@@ -52,8 +53,6 @@ def test_a_submap_out_of_reach_is_not_even_looked_at(rng: np.random.Generator) -
     a = JoinedMap.leaf(submaps[0], identified=False)
     for s in submaps[1:8]:
         leaf = JoinedMap.leaf(s, identified=False)
-        from graphslam.join.eif import join_maps
-
         a = join_maps(a, leaf, np.full(len(leaf.landmark_at), -1))
     far = JoinedMap.leaf(submaps[8], identified=False)
     asked: list[np.ndarray] = []

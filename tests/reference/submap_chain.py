@@ -1,4 +1,4 @@
-"""A chain of submaps drawn from a known truth: a wavy loop through random landmarks, Gaussian noise of full covariance."""
+"""Submaps drawn from a known truth: a wavy loop through random landmarks, Gaussian noise of full covariance."""
 
 from __future__ import annotations
 
