@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
+from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.association import Association, CandidatePairs, associate, merge_close
 from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
@@ -45,6 +47,18 @@ def test_landmarks_are_recognised_around_a_loop(join, rule: str, rng: np.random.
     given = join(submaps)
     if precision == recall == 1.0:
         np.testing.assert_allclose(joined.poses, given.poses, atol=1e-8)
+
+
+@pytest.mark.data
+def test_landmarks_of_the_published_maps_are_recognised(data_dir: Path) -> None:
+    """200 real local maps, five loops through a park, 299 trees: against the published identities."""
+    submaps = read_slsjf_local_maps(data_dir / "victoria_park_processed")
+    joined = join_sequential(submaps, association=Association(rule="joint"))
+    precision, recall = pair_scores(submaps, joined.submap_ids)
+    assert precision > 0.9995
+    assert recall > 0.985
+    assert 299 <= len(joined.landmark_ids) <= 330
+    assert joined.times["association"] > 0
 
 
 def test_a_submap_out_of_reach_is_not_even_looked_at(rng: np.random.Generator) -> None:
