@@ -129,6 +129,11 @@ class FlatGraph:
         parts.append(bias(self._p_bias).ravel())
         return [np.asarray(p, dtype=np.int64) for p in parts]
 
+    @property
+    def has_kernels(self) -> bool:
+        """Does any factor carry a robust kernel?"""
+        return bool(np.any(self._code != 0))
+
     @cached_property
     def _pattern(self) -> tuple[npt.NDArray[np.intp], ...]:
         """Where every block entry lands in a CSC matrix: (kept entries, slot, row indices, indptr)."""

@@ -224,7 +224,7 @@ def test_removal_and_merging_follow_the_graph(rng):
     other.add_gps(gps.take(np.arange(len(gps.times)) != 7), config=GpsConfig(robust=Robust("cauchy", 1.0)))
     for s in chain.submaps:
         other.add_submap(s)
-    BatchSolver(other).update()
+    BatchSolver(other).solve_to_optimum()
     np.testing.assert_allclose(g.values.poses, other.values.poses, atol=1e-6)
     for i in ids:  # the datum goes when its last fix goes
         if i in g.records:
