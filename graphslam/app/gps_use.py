@@ -9,22 +9,16 @@ import numpy.typing as npt
 
 from graphslam.app.config import GpsConfig
 from graphslam.core.records import Gps
+from graphslam.evaluate.gps_floor import fix_segments
 
 Mask = npt.NDArray[np.bool_]
-
-
-def gps_segments(times: npt.NDArray[np.float64], gap: float) -> npt.NDArray[np.int64]:
-    """Segment number of every fix: a pause longer than ``gap`` [s] starts a new one."""
-    if len(times) == 0:
-        return np.zeros(0, dtype=np.int64)
-    return np.concatenate([[0], np.cumsum(np.diff(times) > gap)]).astype(np.int64)
 
 
 def used_fixes(gps: Gps, config: GpsConfig) -> Mask:
     """Fixes that become factors ``(n,)``; the others are withheld."""
     n = len(gps.times)
     index = np.arange(n)
-    segment = gps_segments(gps.times, config.segment_gap)
+    segment = fix_segments(gps.times, config.segment_gap)
     masks = {
         "none": np.zeros(n, dtype=bool),
         "all": np.ones(n, dtype=bool),
