@@ -1,0 +1,160 @@
+"""g2o pose graphs, read and written.
+
+``VERTEX_SE2 id x y θ``, ``EDGE_SE2 i j x y θ`` + 6 information entries; ``VERTEX_SE3:QUAT id x y z qx qy qz qw``,
+``EDGE_SE3:QUAT i j x y z qx qy qz qw`` + 21; ``FIX id …``; 2-D landmarks ``VERTEX_XY id x y``,
+``EDGE_SE2_XY i l x y`` + 3, and GTSAM's ``BR i l bearing range σ_bearing σ_range``. Upper triangles row by row.
+
+g2o orders a 3-D information matrix translation first; a :class:`PoseNetwork` holds rotation first. The entries
+themselves are kept as they are, as GTSAM does: g2o's own residual uses the vector part of the quaternion, half the
+rotation vector, so the two programs print different objectives for one file (:mod:`graphslam.solve.network_model`
+offers both). Files end in blank lines and may be compressed.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from graphslam.core.errors import DataError, FormatError
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.io.network_builder import NetworkBuilder, upper_triangle
+from graphslam.io.text_records import Records, write_text
+
+# tag -> (integers, floats)
+LAYOUTS: dict[str, tuple[int, int]] = {
+    "VERTEX_SE2": (1, 3),
+    "EDGE_SE2": (2, 9),
+    "VERTEX_SE3:QUAT": (1, 7),
+    "EDGE_SE3:QUAT": (2, 28),
+    "FIX": (-1, 0),
+    "VERTEX_XY": (1, 2),
+    "EDGE_SE2_XY": (2, 5),
+    "BR": (2, 4),
+}
+_2D = ("VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "BR")
+_3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+# g2o (translation, rotation) -> ours (rotation, translation); its own inverse
+_SWAP = np.array([3, 4, 5, 0, 1, 2])
+
+
+def read_g2o(path: str | os.PathLike[str], *, repair: bool = False) -> PoseNetwork:
+    """Read a g2o file.
+
+    Parameters
+    ----------
+    path : path-like
+        Plain, or compressed with xz, gzip or bzip2 (told by content).
+    repair : bool
+        Project indefinite information matrices to positive definite ones instead of refusing them; counted in
+        ``PoseNetwork.repaired``.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        With file and line.
+    CovarianceError
+        Names the edges whose information is impossible.
+    """
+    records = Records(path, LAYOUTS, ignored=("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET"))
+    in_3d = [tag for tag in _3D if records.rows[tag]]
+    in_2d = [tag for tag in _2D if records.rows[tag]]
+    if in_2d and in_3d:
+        line = records.rows[in_3d[0]][0][0]
+        raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=records.where(line), wanted="one dimension")
+    build = NetworkBuilder(records.path, 3 if in_3d else 2, repair)
+    for tag in ("VERTEX_SE2", "VERTEX_SE3:QUAT"):
+        for line, (vertex,), pose in records.rows[tag]:
+            build.add_vertex(vertex, pose, records.where(line))
+    for line, (mark,), position in records.rows["VERTEX_XY"]:
+        if mark in build.marks:
+            raise FormatError("landmark given twice", where=records.where(line), got=mark)
+        build.marks[mark] = np.array(position)
+    for line, held, _ in records.rows["FIX"]:
+        build.fixed.update((vertex, records.where(line)) for vertex in held)
+    _read_edges(records, build)
+    _read_landmarks(records, build)
+    return build.build()
+
+
+def _read_edges(records: Records, build: NetworkBuilder) -> None:
+    for tag, width, d in (("EDGE_SE2", 3, 3), ("EDGE_SE3:QUAT", 7, 6)):
+        rows = records.rows[tag]
+        if rows:
+            values = np.array([r[2] for r in rows])
+            information = upper_triangle(values[:, width:], d)
+            if d == 6:
+                information = information[:, _SWAP][:, :, _SWAP]
+            pairs = np.array([r[1] for r in rows], dtype=np.int64)
+            build.add_edges(pairs, values[:, :width], information, [records.where(r[0]) for r in rows])
+
+
+def _read_landmarks(records: Records, build: NetworkBuilder) -> None:
+    cartesian, polar = records.rows["EDGE_SE2_XY"], records.rows["BR"]
+    if cartesian and polar:
+        line = polar[0][0]
+        raise FormatError("EDGE_SE2_XY and BR in one file", where=records.where(line), wanted="one kind of observation")
+    if cartesian:
+        values = np.array([r[2] for r in cartesian])
+        pairs = np.array([r[1] for r in cartesian], dtype=np.int64)
+        build.add_observations(pairs, values[:, :2], upper_triangle(values[:, 2:], 2))
+    for line, _, (_, distance, sigma_b, sigma_r) in polar:
+        if not (distance > 0 and sigma_b > 0 and sigma_r > 0):
+            raise FormatError("range and standard deviations must be positive", where=records.where(line))
+    if polar:
+        values = np.array([r[2] for r in polar])
+        information = np.zeros((len(polar), 2, 2))
+        information[:, [0, 1], [0, 1]] = values[:, 2:] ** -2.0
+        build.kind = "bearing-range"
+        build.add_observations(np.array([r[1] for r in polar], dtype=np.int64), values[:, :2], information)
+
+
+def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:
+    """Write a network as g2o with 17 significant digits; ``.xz``, ``.gz`` and ``.bz2`` compress.
+
+    Poses without an initial value are left out, as in a file of edges only.
+
+    Raises
+    ------
+    DataError
+        For bearing-range observations with correlated noise, which the ``BR`` record cannot hold.
+    """
+    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if network.dim == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    lines = [
+        f"{vertex} {v} {_row(p)}"
+        for v, p, known in zip(network.ids, network.poses, network.has_initial, strict=True)
+        if known
+    ]
+    lines += [
+        f"VERTEX_XY {v} {_row(p)}"
+        for v, p, known in zip(network.landmark_ids, network.landmarks, network.has_landmark, strict=True)
+        if known
+    ]
+    lines += [f"FIX {v}" for v in network.ids[network.fixed]]
+    information = network.information
+    if network.dim == 3:
+        information = information[:, _SWAP][:, :, _SWAP]
+    upper = np.triu_indices(network.tangent_dim)
+    for (i, j), z, omega in zip(network.ids[network.edges], network.measurements, information, strict=True):
+        lines.append(f"{edge} {i} {j} {_row(z)} {_row(omega[upper])}")
+    lines += _observation_lines(network)
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _observation_lines(network: PoseNetwork) -> list[str]:
+    lines = []
+    rows = zip(network.observations, network.observation_values, network.observation_information, strict=True)
+    for (i, j), z, omega in rows:
+        head = f"{network.ids[i]} {network.landmark_ids[j]} {_row(z)}"
+        if network.observation_kind == "cartesian":
+            lines.append(f"EDGE_SE2_XY {head} {_row(omega[np.triu_indices(2)])}")
+        elif omega[0, 1] != 0.0 or omega[0, 0] <= 0.0 or omega[1, 1] <= 0.0:
+            raise DataError("g2o cannot hold correlated bearing-range noise", got=f"{network.ids[i]} sees {network.landmark_ids[j]}")
+        else:
+            lines.append(f"BR {head} {_row(np.diag(omega) ** -0.5)}")
+    return lines
+
+
+def _row(values: Array) -> str:
+    return " ".join(format(float(v), ".17g") for v in values)

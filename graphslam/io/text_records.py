@@ -1,0 +1,147 @@
+"""Line-by-line text files of tagged records (g2o, TORO, iSAM), plain or compressed.
+
+The compression is told by the first bytes, not by the name, and every number that cannot be read is reported with
+its file and line.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import math
+import os
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from graphslam.core.errors import FormatError, MissingDataError
+
+_MAGIC: tuple[tuple[bytes, Callable[[bytes], bytes]], ...] = (
+    (b"\xfd7zXZ\x00", lzma.decompress),
+    (b"\x1f\x8b", gzip.decompress),
+    (b"BZh", bz2.decompress),
+)
+_WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gzip.compress, ".bz2": bz2.compress}
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Text of a file, decompressed if it begins like xz, gzip or bzip2.
+
+    Raises
+    ------
+    MissingDataError
+        No such file.
+    FormatError
+        Truncated or corrupt compression, or bytes that are not text.
+    """
+    p = Path(path)
+    try:
+        raw = p.read_bytes()
+    except FileNotFoundError:
+        raise MissingDataError("no such file", where=str(p)) from None
+    except OSError as error:
+        raise MissingDataError(f"cannot be read ({error.strerror})", where=str(p)) from None
+    for magic, decompress in _MAGIC:
+        if raw.startswith(magic):
+            try:
+                raw = decompress(raw)
+            except (OSError, EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
+                raise FormatError(f"compressed data is truncated or corrupt ({error})", where=str(p)) from None
+            break
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FormatError(f"not a text file (byte {error.start})", where=str(p)) from None
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a file, compressed if its name ends in .xz, .gz or .bz2; a reader never sees half of it."""
+    p = Path(path)
+    data = text.encode("utf-8")
+    if p.suffix in _WRITERS:
+        data = _WRITERS[p.suffix](data)
+    temporary = p.with_name(p.name + ".tmp")
+    temporary.write_bytes(data)
+    os.replace(temporary, p)
+
+
+class Records:
+    """Numbers of a text file by record tag, in file order.
+
+    Parameters
+    ----------
+    path : path-like
+    layouts : dict of str to tuple of int
+        Tag → (leading integers, following floats). A line of a known tag must have exactly that many numbers;
+        -1 integers means one or more and no floats.
+    ignored : tuple of str
+        Tags that are skipped.
+
+    Attributes
+    ----------
+    rows : dict of str to list
+        Tag → list of (line number, integers, floats).
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], layouts: dict[str, tuple[int, int]], *, ignored: tuple[str, ...] = ()
+    ) -> None:
+        self.path = str(path)
+        self.rows: dict[str, list[tuple[int, list[int], list[float]]]] = {tag: [] for tag in layouts}
+        for number, tokens in self._lines(read_text(path)):
+            tag = tokens[0]
+            if tag in ignored:
+                continue
+            if tag not in layouts:
+                raise FormatError(
+                    f"unknown record {tag[:40]!r}", where=self.where(number), wanted="one of " + ", ".join(layouts)
+                )
+            self.rows[tag].append((number, *self._numbers(number, tokens, *layouts[tag])))
+
+    @staticmethod
+    def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
+        for number, line in enumerate(text.splitlines(), start=1):
+            tokens = line.split()
+            if tokens and not tokens[0].startswith("#"):
+                yield number, tokens
+
+    def _numbers(self, number: int, tokens: list[str], integers: int, floats: int) -> tuple[list[int], list[float]]:
+        if integers < 0:
+            integers = max(len(tokens) - 1, 1)
+        if len(tokens) != 1 + integers + floats:
+            raise FormatError(
+                f"{tokens[0]} record is truncated or too long",
+                where=self.where(number),
+                got=f"{len(tokens) - 1} numbers",
+                wanted=integers + floats,
+            )
+        try:
+            whole = [int(t) for t in tokens[1 : 1 + integers]]
+            real = [float(t) for t in tokens[1 + integers :]]
+        except ValueError as error:
+            raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
+        for value in real:
+            if not math.isfinite(value):
+                raise FormatError(f"{tokens[0]} record holds {value}", where=self.where(number), wanted="finite numbers")
+        for value in whole:
+            if not 0 <= value < 2**62:
+                raise FormatError("impossible vertex id", where=self.where(number), got=value, wanted="0 or more")
+        return whole, real
+
+    def where(self, number: int) -> str:
+        """``file:line``."""
+        return f"{self.path}:{number}"
+
+    def __len__(self) -> int:
+        return sum(len(r) for r in self.rows.values())
+
+
+def tags_of(path: str | os.PathLike[str], limit: int = 100_000) -> set[str]:
+    """The set of record tags among the first ``limit`` lines; for telling formats apart."""
+    found: set[str] = set()
+    for number, tokens in Records._lines(read_text(path)):
+        if number > limit:
+            break
+        found.add(tokens[0])
+    return found

@@ -1,0 +1,253 @@
+"""Batch least squares on GTSAM's native factors: Gauss-Newton while it helps, Levenberg-Marquardt where it does not.
+
+GTSAM's own stopping rules look at the fall of the objective, which says nothing where progress is merely slow, and
+its LM returns the initial values without a word when the factorisation fails. So the iteration is driven from here,
+and an answer counts as converged only if the *predicted* remaining fall of a full Gauss-Newton step (the decrement
+``‖r‖² - min_δ ‖J δ + r‖²``, by exact sparse elimination) is negligible.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.solve.network_factors import from_values, to_graph, to_values
+
+log = logging.getLogger(__name__)
+
+Status = Literal["converged", "rejected", "stalled", "out of iterations"]
+# Converged: the next step would lower the objective by less than this share of it …
+RELATIVE = 1e-9
+# … or by less than this per residual (a network without noise has objective zero).
+ABSOLUTE = 1e-14
+# Above this ratio of extreme information eigenvalues normal equations lose the small ones: QR instead of Cholesky.
+CHOLESKY_LIMIT = 1e9
+# Gauss-Newton may climb to this multiple of the best objective, and for this many steps.
+CLIMB, PATIENCE = 1e4, 8
+# A start that after so many steps is still above the best of the others is given up.
+CHALLENGE = 25
+
+
+@dataclass(frozen=True, slots=True)
+class Polished:
+    """Where a local solver ended.
+
+    Parameters
+    ----------
+    values : gtsam.Values
+    objective : float
+        ``Σ rᵀ Ω r``.
+    decrement : float
+        Predicted further fall of the objective; infinite if the linear system could not be solved.
+    iterations : int
+        Steps taken, Gauss-Newton and LM.
+    status : str
+    """
+
+    values: gtsam.Values
+    objective: float
+    decrement: float
+    iterations: int
+    status: Status
+
+
+class BatchProblem:
+    """A network as a GTSAM graph, with the linear solver that its numbers need.
+
+    Parameters
+    ----------
+    network : PoseNetwork
+    """
+
+    def __init__(self, network: PoseNetwork) -> None:
+        self.network = network
+        self.graph = to_graph(network)
+        self.factorization = "QR" if _spread(network) > CHOLESKY_LIMIT else "CHOLESKY"
+
+    @property
+    def tolerance(self) -> float:
+        """Absolute part of the convergence test."""
+        return ABSOLUTE * self.network.residuals
+
+    def values(self, poses: Array, landmarks: Array) -> gtsam.Values:
+        """Arrays to GTSAM values."""
+        return to_values(self.network, poses, landmarks)
+
+    def arrays(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """GTSAM values to arrays."""
+        return from_values(self.network, values)
+
+    def objective(self, values: gtsam.Values) -> float:
+        """``Σ rᵀ Ω r`` (GTSAM's error is half of it)."""
+        return float(2.0 * self.graph.error(values))
+
+    def newton_step(self, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+        """One full Gauss-Newton step and the fall of the objective it predicts.
+
+        Raises
+        ------
+        RuntimeError
+            GTSAM's, if the linear system is singular to working precision.
+        """
+        params = gtsam.GaussNewtonParams()
+        params.setLinearSolverType(f"MULTIFRONTAL_{self.factorization}")
+        optimizer = gtsam.GaussNewtonOptimizer(self.graph, values, params)
+        linear = optimizer.iterate()
+        moved = optimizer.values()
+        step = values.localCoordinates(moved)
+        zero = gtsam.VectorValues.Zero(step)
+        return moved, float(2.0 * (linear.error(zero) - linear.error(step)))
+
+    def decrement(self, values: gtsam.Values) -> float:
+        """Predicted remaining fall of the objective; infinite if the linear system could not be solved."""
+        try:
+            fall = self.newton_step(values)[1]
+        except RuntimeError:
+            return float("inf")
+        # a negative prediction is rounding at a minimum, or a solve that failed
+        return abs(fall) if np.isfinite(fall) else float("inf")
+
+    def is_converged(self, objective: float, decrement: float) -> bool:
+        """Whether the decrement is negligible."""
+        return bool(decrement <= RELATIVE * objective + self.tolerance)
+
+
+def _spread(network: PoseNetwork) -> float:
+    top, low = 0.0, np.inf
+    for information in (network.information, network.observation_information):
+        if len(information):
+            w = np.linalg.eigvalsh(information)
+            top = max(top, float(w.max()))
+            positive = w[w > 0.0]
+            low = min(low, float(positive.min()) if len(positive) else np.inf)
+    return top / low
+
+
+def polish(
+    problem: BatchProblem, values: gtsam.Values, *, best_known: float = np.inf, max_iterations: int = 200
+) -> Polished:
+    """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
+
+    Parameters
+    ----------
+    best_known : float
+        Objective that another start has reached. The descent is rejected once it cannot get below it in reasonable
+        time: after 25 steps, or when its recent rate kept up for twenty times as long would not do.
+    max_iterations : int
+        Gauss-Newton and LM steps together.
+
+    Returns
+    -------
+    Polished
+        Never worse than ``values``.
+    """
+    best = _descend(problem, values, best_known, max_iterations)
+    if best.status == "stalled" and not np.isfinite(best.decrement) and problem.factorization == "CHOLESKY":
+        # the normal equations are what failed; QR squares no condition number
+        log.info("%s: Cholesky made no progress, going on with QR", problem.network.source)
+        problem.factorization = "QR"
+        again = _descend(problem, best.values, best_known, max_iterations)
+        if again.objective <= best.objective:
+            best = Polished(
+                again.values, again.objective, again.decrement, best.iterations + again.iterations, again.status
+            )
+    return best
+
+
+def _descend(problem: BatchProblem, values: gtsam.Values, best_known: float, budget: int) -> Polished:
+    objective, used, attempts = problem.objective(values), 0, 0
+    history = [objective]
+    while used < budget:
+        found = _newton(problem, values, objective, min(budget - used, 40), PATIENCE if attempts == 0 else 2)
+        used, attempts = used + found.iterations, attempts + 1
+        if found.objective < objective:
+            values, objective = found.values, found.objective
+            history.append(objective)
+        if found.status == "converged":
+            return Polished(values, objective, found.decrement, used, "converged")
+        if _hopeless(history, best_known, used):
+            return Polished(values, objective, found.decrement, used, "rejected")
+        # LM: always downhill, until Gauss-Newton is worth another try
+        before = objective
+        values, objective, steps = _damped(problem, values, objective, history, budget - used)
+        used += max(steps, 1)
+        if _hopeless(history, best_known, used):
+            return Polished(values, objective, float("inf"), used, "rejected")
+        if not objective < before:
+            decrement = problem.decrement(values)
+            done = problem.is_converged(objective, decrement)
+            return Polished(values, objective, decrement, used, "converged" if done else "stalled")
+    decrement = problem.decrement(values)
+    done = problem.is_converged(objective, decrement)
+    return Polished(values, objective, decrement, used, "converged" if done else "out of iterations")
+
+
+def _newton(
+    problem: BatchProblem, values: gtsam.Values, objective: float, budget: int, patience: int
+) -> Polished:
+    """Full Gauss-Newton steps, allowed to climb for a while.
+
+    After rotations-first the first step often trades a higher objective for the right shape, and the next ones fall
+    far below the start; a monotone method creeps instead. ``patience`` steps without a new best end the attempt.
+    """
+    best, lowest, steps, since = values, objective, 0, 0
+    while steps < budget and since < patience:
+        try:
+            moved, fall = problem.newton_step(values)
+        except RuntimeError:
+            break
+        steps += 1
+        now = problem.objective(moved)
+        # at a minimum to rounding the step may go either way by a trifle; a clearly negative fall is a failed solve
+        if values is best and abs(fall) <= RELATIVE * lowest + problem.tolerance:
+            if now < lowest:
+                best, lowest = moved, now
+            return Polished(best, lowest, max(fall, 0.0), steps, "converged")
+        if not np.isfinite(now) or fall < 0.0 or now > CLIMB * lowest:
+            break
+        values, since = moved, since + 1
+        if now < lowest:
+            best, lowest, since = moved, now, 0
+    return Polished(best, lowest, float("inf"), steps, "stalled")
+
+
+def _damped(
+    problem: BatchProblem, values: gtsam.Values, objective: float, history: list[float], budget: int
+) -> tuple[gtsam.Values, float, int]:
+    """Up to ten LM steps; fewer if they stall or make little of it."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setLinearSolverType(f"MULTIFRONTAL_{problem.factorization}")
+    params.setlambdaUpperBound(1e12)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, params)
+    steps = 0
+    for _ in range(min(10, budget)):
+        try:
+            optimizer.iterate()
+        except RuntimeError:
+            break
+        steps += 1
+        now = float(2.0 * optimizer.error())
+        if not now < objective:
+            break
+        small = objective - now < 1e-3 * objective
+        values, objective = optimizer.values(), now
+        history.append(now)
+        if small:
+            break
+    return values, objective, steps
+
+
+def _hopeless(history: list[float], best_known: float, used: int) -> bool:
+    """Whether a descent is above the best known objective and will not get below it in reasonable time."""
+    if not history[-1] > best_known * (1.0 + 1e-6):
+        return False
+    if used > CHALLENGE and history[-1] > 1.001 * best_known:
+        return True
+    recent = history[-5:]
+    return len(history) > 8 and recent[-1] - 20.0 * (recent[0] - recent[-1]) > best_known
