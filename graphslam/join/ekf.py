@@ -21,13 +21,15 @@ from tqdm.auto import tqdm
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.submap_blocks import check_identified, fuse_repeated, landmark_map_of
+from graphslam.graph.submap_blocks import landmark_map_of
 from graphslam.join.association import Association, associate
 from graphslam.join.joined_map import (
     Ids,
     JoinedMap,
     JoinResult,
     JoinTimes,
+    check_chain,
+    distinct_landmarks,
     finish,
     landmark_labels,
     landmark_scalars,
@@ -181,10 +183,7 @@ def join_ekf(
     DataError, CovarianceError
     """
     identified = association is None
-    if identified:
-        check_identified(submaps)
-    elif not submaps:
-        raise DataError("there are no submaps", got=0, wanted="at least one")
+    check_chain(submaps, identified=identified)
     times = JoinTimes()
     known: dict[int, int] = {}
     dense: DenseMap | None = None
@@ -192,12 +191,7 @@ def join_ekf(
     capacity = sum(3 + 2 * len(landmark_map_of(s)) for s in submaps) if not identified else _scalars(submaps)
     for submap in tqdm(submaps, desc="join", unit="submap", disable=not progress):
         with times.measure("update"):
-            original = landmark_map_of(submap)
-            fused = fuse_repeated(original, what=f"submap {submap.key}") if identified else original
-            entries = np.arange(len(original), dtype=np.intp)
-            if identified:
-                place = {int(j): i for i, j in enumerate(fused.ids)}
-                entries = np.array([place[int(j)] for j in original.ids], dtype=np.intp)
+            fused, entries = distinct_landmarks(submap, identified=identified)
         with times.measure("association"):
             if dense is None:
                 match = np.full(len(fused), -1, dtype=np.intp)

@@ -12,9 +12,17 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.submap import Submap
-from graphslam.graph.submap_blocks import SubmapProblem, dense_information, fuse_repeated, landmark_map_of, relabel
+from graphslam.core.submap import LandmarkMap, Submap
+from graphslam.graph.submap_blocks import (
+    SubmapProblem,
+    check_identified,
+    dense_information,
+    fuse_repeated,
+    landmark_map_of,
+    relabel,
+)
 from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.graph.symmetric_factor import SymmetricFactor
 
@@ -68,6 +76,32 @@ def pose_scalars(at: Index) -> Index:
 def landmark_scalars(at: Index) -> Index:
     """State indices ``(L, 2)`` of the landmarks that begin at ``at`` ``(L,)``."""
     return at[:, None] + np.arange(2)
+
+
+def check_chain(submaps: Sequence[Submap], *, identified: bool) -> None:
+    """Refuse an empty chain, and landmarks without an id where ids are to be trusted.
+
+    Raises
+    ------
+    DataError
+    """
+    if identified:
+        check_identified(submaps)
+    elif not submaps:
+        raise DataError("there are no submaps", got=0, wanted="at least one")
+
+
+def distinct_landmarks(submap: Submap, *, identified: bool) -> tuple[LandmarkMap, Index]:
+    """The landmark map of a submap with each landmark once, and which of them each entry became.
+
+    With ``identified``, entries of one id are fused; otherwise ids are ignored and every entry is a landmark.
+    """
+    original = landmark_map_of(submap)
+    if not identified:
+        return original, np.arange(len(original), dtype=np.intp)
+    fused = fuse_repeated(original, what=f"submap {submap.key}")
+    place = {int(j): i for i, j in enumerate(fused.ids)}
+    return fused, np.array([place[int(j)] for j in original.ids], dtype=np.intp)
 
 
 @dataclass
@@ -146,17 +180,10 @@ class JoinedMap:
         ordered : bool
             See :class:`JoinedMap`.
         """
-        original = landmark_map_of(submap)
-        what = f"submap {submap.key}"
-        fused = fuse_repeated(original, what=what) if identified else original
-        if identified:
-            place = {int(j): i for i, j in enumerate(fused.ids)}
-            entries = np.array([place[int(j)] for j in original.ids], dtype=np.intp)
-        else:
-            entries = np.arange(len(original), dtype=np.intp)
+        fused, entries = distinct_landmarks(submap, identified=identified)
         return cls(
             x=fused.mean,
-            information=sp.csc_matrix(dense_information(fused, what=what)),
+            information=sp.csc_matrix(dense_information(fused, what=f"submap {submap.key}")),
             pose_at=np.zeros(1, dtype=np.intp),
             landmark_at=3 + 2 * np.arange(len(fused), dtype=np.intp),
             ids=fused.ids if identified else np.full(len(fused), -1, dtype=np.int64),

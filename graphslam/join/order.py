@@ -6,19 +6,10 @@ from collections.abc import Sequence
 
 from tqdm.auto import tqdm
 
-from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_blocks import check_identified
 from graphslam.join.association import Association, associate
 from graphslam.join.eif import join_maps, match_by_id
-from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, finish, landmark_labels
-
-
-def _check(submaps: Sequence[Submap], association: Association | None) -> None:
-    if association is None:
-        check_identified(submaps)
-    elif not submaps:
-        raise DataError("there are no submaps", got=0, wanted="at least one")
+from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, check_chain, finish, landmark_labels
 
 
 def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
@@ -44,9 +35,9 @@ def join_sequential(
     ------
     DataError, CovarianceError
     """
-    _check(submaps, association)
-    times = JoinTimes()
     identified = association is None
+    check_chain(submaps, identified=identified)
+    times = JoinTimes()
     with times.measure("update"):
         joined = JoinedMap.leaf(submaps[0], identified=identified)
     for submap in tqdm(submaps[1:], desc="join", unit="submap", disable=not progress):
@@ -64,9 +55,9 @@ def join_tree(
 
     An odd one out goes up a level by itself. Parameters as in :func:`join_sequential`.
     """
-    _check(submaps, association)
-    times = JoinTimes()
     identified = association is None
+    check_chain(submaps, identified=identified)
+    times = JoinTimes()
     with times.measure("update"):
         level = [JoinedMap.leaf(s, identified=identified, ordered=False) for s in submaps]
     with tqdm(total=len(level) - 1, desc="join", unit="join", disable=not progress) as bar:
