@@ -31,7 +31,7 @@ REPAIR_FLOOR = 1e-9
 def _eigen_floor(information: Array) -> tuple[Array, Array]:
     """Smallest eigenvalue of every matrix and the scale it is judged by, ``(m,)`` each."""
     w = np.linalg.eigvalsh(information)
-    return w[:, 0], np.maximum(np.abs(w).max(axis=1), np.finfo(float).tiny)
+    return np.asarray(w[:, 0], dtype=np.float64), np.maximum(np.abs(w).max(axis=1), np.finfo(float).tiny)
 
 
 def _names(labels: Sequence[str], bad: Index, extra: Sequence[str] | None = None) -> str:
@@ -40,9 +40,7 @@ def _names(labels: Sequence[str], bad: Index, extra: Sequence[str] | None = None
     return ", ".join(shown) + more
 
 
-def check_informations(
-    information: ArrayLike, labels: Sequence[str], *, what: str, where: str | None = None
-) -> Array:
+def check_informations(information: ArrayLike, labels: Sequence[str], *, what: str, where: str | None = None) -> Array:
     """Return ``(m, d, d)`` information matrices, made exactly symmetric, or name the ones that are impossible.
 
     Positive *semi*-definite is accepted: a direction that was not measured has information zero.
@@ -133,10 +131,6 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
     return info, bad
 
 
-def _empty(*shape: int) -> Any:
-    return field(default_factory=lambda: np.zeros(shape))
-
-
 @dataclass(frozen=True, slots=True)
 class PoseNetwork:
     """A pose network, frozen; every array is checked on construction.
@@ -193,11 +187,11 @@ class PoseNetwork:
     information: Array
     fixed: Mask = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     landmark_ids: Ids = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    landmarks: Array = _empty(0, 2)
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
     has_landmark: Mask = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     observations: Index = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
-    observation_values: Array = _empty(0, 2)
-    observation_information: Array = _empty(0, 2, 2)
+    observation_values: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    observation_information: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     observation_kind: ObservationKind = "cartesian"
     repaired: int = 0
     noise: str = "information"

@@ -150,7 +150,9 @@ def _observation_lines(network: PoseNetwork) -> list[str]:
         if network.observation_kind == "cartesian":
             lines.append(f"EDGE_SE2_XY {head} {_row(omega[np.triu_indices(2)])}")
         elif omega[0, 1] != 0.0 or omega[0, 0] <= 0.0 or omega[1, 1] <= 0.0:
-            raise DataError("g2o cannot hold correlated bearing-range noise", got=f"{network.ids[i]} sees {network.landmark_ids[j]}")
+            raise DataError(
+                "g2o cannot hold correlated bearing-range noise", got=f"{network.ids[i]} sees {network.landmark_ids[j]}"
+            )
         else:
             lines.append(f"BR {head} {_row(np.diag(omega) ** -0.5)}")
     return lines

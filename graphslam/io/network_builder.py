@@ -76,7 +76,9 @@ class NetworkBuilder:
         """Edges ``(m, 2)`` between vertex ids; information in GTSAM's order."""
         loops = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
         if len(loops):
-            raise FormatError("an edge joins a vertex to itself", where=where[loops[0]], got=f"vertex {pairs[loops[0], 0]}")
+            raise FormatError(
+                "an edge joins a vertex to itself", where=where[loops[0]], got=f"vertex {pairs[loops[0], 0]}"
+            )
         labels = [f"{i} -> {j}" for i, j in pairs]
         information = self.sound(information, labels, "edge information matrices")
         self.edges.append((pairs, self._unit(measurements, where), information))

@@ -123,7 +123,9 @@ class Records:
             raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
         for value in real:
             if not math.isfinite(value):
-                raise FormatError(f"{tokens[0]} record holds {value}", where=self.where(number), wanted="finite numbers")
+                raise FormatError(
+                    f"{tokens[0]} record holds {value}", where=self.where(number), wanted="finite numbers"
+                )
         for value in whole:
             if not 0 <= value < 2**62:
                 raise FormatError("impossible vertex id", where=self.where(number), got=value, wanted="0 or more")

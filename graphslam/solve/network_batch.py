@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import gtsam
 import numpy as np
@@ -31,7 +31,7 @@ CHOLESKY_LIMIT = 1e9
 # Gauss-Newton may climb to this multiple of the best objective, and for this many steps.
 CLIMB, PATIENCE = 1e4, 8
 # A start that after so many steps is still above the best of the others is given up.
-CHALLENGE = 25
+CHALLENGE = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,8 @@ class Polished:
 
     Parameters
     ----------
-    values : gtsam.Values
+    values : object
+        As the problem holds them.
     objective : float
         ``Σ rᵀ Ω r``.
     decrement : float
@@ -50,11 +51,35 @@ class Polished:
     status : str
     """
 
-    values: gtsam.Values
+    values: Any
     objective: float
     decrement: float
     iterations: int
     status: Status
+
+
+class Problem(Protocol):
+    """What :func:`polish` needs of a problem; ``values`` are whatever the problem makes of them."""
+
+    network: PoseNetwork
+    factorization: str
+
+    def values(self, poses: Array, landmarks: Array) -> Any: ...
+
+    def arrays(self, values: Any) -> tuple[Array, Array]: ...
+
+    def objective(self, values: Any) -> float: ...
+
+    def newton_step(self, values: Any) -> tuple[Any, float]: ...
+
+    def decrement(self, values: Any) -> float: ...
+
+    def damped(self, values: Any, objective: float, budget: int) -> tuple[Any, list[float], int]: ...
+
+
+def is_converged(network: PoseNetwork, objective: float, decrement: float) -> bool:
+    """Whether a decrement is negligible: 1e-9 of the objective, or 1e-14 per residual."""
+    return bool(decrement <= RELATIVE * objective + ABSOLUTE * network.residuals)
 
 
 class BatchProblem:
@@ -69,11 +94,6 @@ class BatchProblem:
         self.network = network
         self.graph = to_graph(network)
         self.factorization = "QR" if _spread(network) > CHOLESKY_LIMIT else "CHOLESKY"
-
-    @property
-    def tolerance(self) -> float:
-        """Absolute part of the convergence test."""
-        return ABSOLUTE * self.network.residuals
 
     def values(self, poses: Array, landmarks: Array) -> gtsam.Values:
         """Arrays to GTSAM values."""
@@ -113,9 +133,38 @@ class BatchProblem:
         # a negative prediction is rounding at a minimum, or a solve that failed
         return abs(fall) if np.isfinite(fall) else float("inf")
 
-    def is_converged(self, objective: float, decrement: float) -> bool:
-        """Whether the decrement is negligible."""
-        return bool(decrement <= RELATIVE * objective + self.tolerance)
+    def damped(self, values: gtsam.Values, objective: float, budget: int) -> tuple[gtsam.Values, list[float], int]:
+        """Up to ten LM steps, all downhill; fewer if they stall or make little of it.
+
+        Returns
+        -------
+        values : gtsam.Values
+        objectives : list of float
+            After every step taken.
+        steps : int
+            Steps tried.
+        """
+        params = gtsam.LevenbergMarquardtParams()
+        params.setLinearSolverType(f"MULTIFRONTAL_{self.factorization}")
+        params.setlambdaUpperBound(1e12)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, values, params)
+        taken: list[float] = []
+        steps = 0
+        for _ in range(min(10, budget)):
+            try:
+                optimizer.iterate()
+            except RuntimeError:
+                break
+            steps += 1
+            now = float(2.0 * optimizer.error())
+            if not now < objective:
+                break
+            small = objective - now < 1e-3 * objective
+            values, objective = optimizer.values(), now
+            taken.append(now)
+            if small:
+                break
+        return values, taken, steps
 
 
 def _spread(network: PoseNetwork) -> float:
@@ -129,16 +178,14 @@ def _spread(network: PoseNetwork) -> float:
     return top / low
 
 
-def polish(
-    problem: BatchProblem, values: gtsam.Values, *, best_known: float = np.inf, max_iterations: int = 200
-) -> Polished:
+def polish(problem: Problem, values: Any, *, best_known: float = np.inf, max_iterations: int = 200) -> Polished:
     """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
 
     Parameters
     ----------
     best_known : float
         Objective that another start has reached. The descent is rejected once it cannot get below it in reasonable
-        time: after 25 steps, or when its recent rate kept up for twenty times as long would not do.
+        time: after 10 steps, or when its recent rate kept up for twenty times as long would not do.
     max_iterations : int
         Gauss-Newton and LM steps together.
 
@@ -160,7 +207,7 @@ def polish(
     return best
 
 
-def _descend(problem: BatchProblem, values: gtsam.Values, best_known: float, budget: int) -> Polished:
+def _descend(problem: Problem, values: Any, best_known: float, budget: int) -> Polished:
     objective, used, attempts = problem.objective(values), 0, 0
     history = [objective]
     while used < budget:
@@ -175,22 +222,22 @@ def _descend(problem: BatchProblem, values: gtsam.Values, best_known: float, bud
             return Polished(values, objective, found.decrement, used, "rejected")
         # LM: always downhill, until Gauss-Newton is worth another try
         before = objective
-        values, objective, steps = _damped(problem, values, objective, history, budget - used)
+        values, taken, steps = problem.damped(values, objective, budget - used)
+        history += taken
+        objective = history[-1]
         used += max(steps, 1)
         if _hopeless(history, best_known, used):
             return Polished(values, objective, float("inf"), used, "rejected")
         if not objective < before:
             decrement = problem.decrement(values)
-            done = problem.is_converged(objective, decrement)
+            done = is_converged(problem.network, objective, decrement)
             return Polished(values, objective, decrement, used, "converged" if done else "stalled")
     decrement = problem.decrement(values)
-    done = problem.is_converged(objective, decrement)
+    done = is_converged(problem.network, objective, decrement)
     return Polished(values, objective, decrement, used, "converged" if done else "out of iterations")
 
 
-def _newton(
-    problem: BatchProblem, values: gtsam.Values, objective: float, budget: int, patience: int
-) -> Polished:
+def _newton(problem: Problem, values: Any, objective: float, budget: int, patience: int) -> Polished:
     """Full Gauss-Newton steps, allowed to climb for a while.
 
     After rotations-first the first step often trades a higher objective for the right shape, and the next ones fall
@@ -205,7 +252,7 @@ def _newton(
         steps += 1
         now = problem.objective(moved)
         # at a minimum to rounding the step may go either way by a trifle; a clearly negative fall is a failed solve
-        if values is best and abs(fall) <= RELATIVE * lowest + problem.tolerance:
+        if values is best and is_converged(problem.network, lowest, abs(fall)):
             if now < lowest:
                 best, lowest = moved, now
             return Polished(best, lowest, max(fall, 0.0), steps, "converged")
@@ -215,32 +262,6 @@ def _newton(
         if now < lowest:
             best, lowest, since = moved, now, 0
     return Polished(best, lowest, float("inf"), steps, "stalled")
-
-
-def _damped(
-    problem: BatchProblem, values: gtsam.Values, objective: float, history: list[float], budget: int
-) -> tuple[gtsam.Values, float, int]:
-    """Up to ten LM steps; fewer if they stall or make little of it."""
-    params = gtsam.LevenbergMarquardtParams()
-    params.setLinearSolverType(f"MULTIFRONTAL_{problem.factorization}")
-    params.setlambdaUpperBound(1e12)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, params)
-    steps = 0
-    for _ in range(min(10, budget)):
-        try:
-            optimizer.iterate()
-        except RuntimeError:
-            break
-        steps += 1
-        now = float(2.0 * optimizer.error())
-        if not now < objective:
-            break
-        small = objective - now < 1e-3 * objective
-        values, objective = optimizer.values(), now
-        history.append(now)
-        if small:
-            break
-    return values, objective, steps
 
 
 def _hopeless(history: list[float], best_known: float, used: int) -> bool:

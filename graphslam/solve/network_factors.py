@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -18,7 +20,7 @@ def landmark_key(k: int) -> int:
     return int(gtsam.symbol(LANDMARK, int(k)))
 
 
-def pose_values(network: PoseNetwork, poses: Array) -> list[gtsam.Pose2] | list[gtsam.Pose3]:
+def pose_values(network: PoseNetwork, poses: Array) -> list[Any]:
     """Poses as GTSAM objects."""
     if network.dim == 2:
         return [gtsam.Pose2(x, y, t) for x, y, t in poses.tolist()]
@@ -26,6 +28,12 @@ def pose_values(network: PoseNetwork, poses: Array) -> list[gtsam.Pose2] | list[
         gtsam.Pose3(gtsam.Rot3.Quaternion(qw, qx, qy, qz), np.array([x, y, z]))
         for x, y, z, qx, qy, qz, qw in poses.tolist()
     ]
+
+
+def pose3_array(pose: gtsam.Pose3) -> Array:
+    """``(7,)`` x y z qx qy qz qw of a GTSAM pose."""
+    q: Any = pose.rotation().toQuaternion()
+    return np.array([*pose.translation(), q.x(), q.y(), q.z(), q.w()])
 
 
 def to_values(network: PoseNetwork, poses: Array, landmarks: Array) -> gtsam.Values:
@@ -48,8 +56,7 @@ def from_values(network: PoseNetwork, values: gtsam.Values) -> tuple[Array, Arra
         poses = np.empty((n, 7))
         for k in range(n):
             p = values.atPose3(k)
-            q = p.rotation().toQuaternion()
-            poses[k, :3], poses[k, 3:] = p.translation(), (q.x(), q.y(), q.z(), q.w())
+            poses[k] = pose3_array(p)
     landmarks = np.array([values.atPoint2(landmark_key(k)) for k in range(len(network.landmark_ids))])
     return poses, landmarks.reshape(-1, 2)
 
@@ -88,7 +95,7 @@ def observation_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
     if len(network.observations) and network.observation_kind != "bearing-range":
         raise SolverError("GTSAM has no native factor for Cartesian landmark observations")
     noise = _Noise(network.observation_information)
-    factors = []
+    factors: list[gtsam.NonlinearFactor] = []
     for k, ((i, j), (b, r)) in enumerate(
         zip(network.observations.tolist(), network.observation_values.tolist(), strict=True)
     ):
@@ -129,26 +136,6 @@ def variable_name(network: PoseNetwork, key: int) -> str:
     if key < len(network):
         return f"vertex {network.ids[key]}"
     return f"landmark {network.landmark_ids[gtsam.Symbol(key).index()]}"
-
-
-def decrement(network: PoseNetwork, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> float:
-    """How much the objective would still fall by the linearised model: zero at a stationary point.
-
-    ``‖r‖² - min_δ ‖J δ + r‖²``, the certificate behind "converged"; exact sparse elimination, so it cannot be fooled
-    by a small residual of an iterative solver.
-
-    Raises
-    ------
-    IndeterminateError
-        The linear system is singular.
-    """
-    linear = graph.linearize(values)
-    try:
-        step = linear.optimize()
-    except RuntimeError as error:
-        raise indeterminate(network, error) from None
-    zero = gtsam.VectorValues.Zero(step)
-    return float(2.0 * (linear.error(zero) - linear.error(step)))
 
 
 def indeterminate(network: PoseNetwork, error: Exception) -> IndeterminateError:

@@ -8,26 +8,30 @@ batch optimum, and closed by relinearising everything, which makes iSAM2 a Gauss
 from __future__ import annotations
 
 import heapq
+import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from tqdm import tqdm
 
+from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_factors import (
     anchor_factors,
     edge_factors,
-    from_values,
     indeterminate,
     landmark_key,
     observation_factors,
+    pose3_array,
     pose_values,
 )
 from graphslam.solve.network_model import compose, inverse
 from graphslam.solve.network_start import cartesian_observations, neighbours
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +45,14 @@ class Isam2Options:
     relinearize_skip : int
         Only every so many updates (GTSAM's default 10).
     batch : int
-        Poses an update.
+        Poses an update. 1 is a robot's life; more is faster and, as each update then relinearises more at once,
+        usually nearer to the optimum. 0 chooses about a thousand updates.
     factorization : {"CHOLESKY", "QR"}
     """
 
     relinearize_threshold: float = 0.1
     relinearize_skip: int = 10
-    batch: int = 1
+    batch: int = 0
     factorization: str = "CHOLESKY"
 
     def params(self) -> gtsam.ISAM2Params:
@@ -83,6 +88,24 @@ def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
 
 
 def run_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, progress: bool = False) -> gtsam.Values:
+    """:func:`feed_isam2`, with QR where Cholesky fails on the way (large or badly scaled information).
+
+    Raises
+    ------
+    IndeterminateError
+        With QR too.
+    """
+    options = options or Isam2Options()
+    try:
+        return feed_isam2(network, options, progress=progress)
+    except IndeterminateError:
+        if options.factorization == "QR":
+            raise
+        log.info("%s: iSAM2 with Cholesky failed, starting again with QR", network.source)
+        return feed_isam2(network, replace(options, factorization="QR"), progress=progress)
+
+
+def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, progress: bool = False) -> gtsam.Values:
     """Estimate of iSAM2 after the whole network has been fed to it in :func:`insertion_order`.
 
     A new pose starts from the current estimate of the neighbour with the nearest id, composed with the measurement;
@@ -107,6 +130,7 @@ def run_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, prog
     known_marks: set[int] = set()
     graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set[int]()
     steps = list(insertion_order(network))
+    batch = options.batch or max(1, round(len(network) / 1000))
     for count, (v, links) in enumerate(tqdm(steps, desc="iSAM2", unit="pose", disable=not progress, leave=False), 1):
         if v in anchors:
             poses[v] = network.poses[v]
@@ -123,7 +147,7 @@ def run_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, prog
             if mark not in known_marks:
                 known_marks.add(mark)
                 values.insert(landmark_key(mark), se2_transform(poses[v], local[k]))
-        if count % options.batch == 0 or count == len(steps):
+        if count % batch == 0 or count == len(steps):
             try:
                 isam.update(graph, values)
             except RuntimeError as error:
@@ -155,9 +179,7 @@ def _current(network: PoseNetwork, isam: gtsam.ISAM2, k: int) -> Array:
     if network.dim == 2:
         p = isam.calculateEstimatePose2(k)
         return np.array([p.x(), p.y(), p.theta()])
-    q3 = isam.calculateEstimatePose3(k)
-    q = q3.rotation().toQuaternion()
-    return np.array([*q3.translation(), q.x(), q.y(), q.z(), q.w()])
+    return pose3_array(isam.calculateEstimatePose3(k))
 
 
 def relinearise_all(
@@ -196,8 +218,3 @@ def relinearise_all(
     except RuntimeError as error:
         raise indeterminate(network, error) from None
     return best, max_updates
-
-
-def incremental_start(network: PoseNetwork, options: Isam2Options | None = None) -> tuple[Array, Array]:
-    """Arrays of :func:`run_isam2`: a start that has closed every loop when it was small."""
-    return from_values(network, run_isam2(network, options))

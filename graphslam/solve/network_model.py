@@ -110,9 +110,9 @@ def edge_jacobians(network: PoseNetwork, poses: Array) -> tuple[Array, Array, Ar
     r = edge_residuals(network, poses)
     relative = between(poses[j], poses[i])
     if network.dim == 2:
-        J_j = np.linalg.inv(se2_right_jacobian(r))
+        J_j: Array = np.asarray(np.linalg.inv(se2_right_jacobian(r)), dtype=np.float64)
         return r, -J_j @ se2_adjoint(relative), J_j
-    J_j = np.linalg.inv(se3.se3_right_jacobian(r))
+    J_j = np.asarray(np.linalg.inv(se3.se3_right_jacobian(r)), dtype=np.float64)
     return r, -J_j @ se3.se3_adjoint(relative), J_j
 
 

@@ -1,0 +1,106 @@
+"""``graphslam solve FILE``: read a pose network, solve it, say how well, write it back."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+from graphslam.core.network import PoseNetwork
+from graphslam.io.g2o import write_g2o
+from graphslam.io.isam_graph import Noise
+from graphslam.io.network_file import read_network
+from graphslam.solve.network_solve import NetworkSolution, solve_network
+
+RESIDUAL = "gtsam: Log(z^-1 x_i^-1 x_j)"
+
+
+def solve_file(
+    path: str | os.PathLike[str],
+    solver: str = "lm",
+    repair: bool = False,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    noise: Noise = "auto",
+    progress: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
+    """Solve a g2o, TORO or iSAM file.
+
+    Parameters
+    ----------
+    path : path-like
+        Plain or compressed; the format is told by the content.
+    solver : {"lm", "isam2", "gnc", "pcg"}
+    repair : bool
+        Project indefinite information matrices to positive definite ones (counted in ``"repaired"``) instead of
+        refusing the file.
+    out : path-like, optional
+        Write the solution as g2o; ``.xz``, ``.gz`` and ``.bz2`` compress.
+    noise : str
+        Meaning of TORO/iSAM noise columns.
+    **options
+        Of :func:`graphslam.solve.network_solve.solve_network`.
+
+    Returns
+    -------
+    dict
+        Ready for JSON. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is the
+        same answer under g2o's residual.
+
+    Raises
+    ------
+    MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
+    """
+    network = read_network(path, noise=noise, repair=repair)
+    solution = solve_network(network, solver, progress=progress, **options)
+    if out is not None:
+        write_g2o(out, solution.to_network())
+    report = report_of(solution)
+    if out is not None:
+        report["out"] = str(out)
+    return report
+
+
+def report_of(solution: NetworkSolution) -> dict[str, Any]:
+    """A solution as plain JSON values; infinities become None."""
+    network: PoseNetwork = solution.network
+    return {
+        "file": network.source,
+        "solver": solution.solver,
+        "dim": network.dim,
+        "poses": len(network),
+        "edges": len(network.edges),
+        "landmarks": len(network.landmark_ids),
+        "observations": len(network.observations),
+        "states": network.states,
+        "residuals": network.residuals,
+        "noise": network.noise,
+        "repaired": network.repaired,
+        "residual": RESIDUAL,
+        "objective_initial": _finite(solution.objective_initial),
+        "objective": _finite(solution.objective),
+        "objective_g2o_initial": _finite(solution.objective_g2o_initial),
+        "objective_g2o": _finite(solution.objective_g2o),
+        "iterations": solution.iterations,
+        "seconds": solution.seconds,
+        "converged": solution.converged,
+        "gap": _finite(solution.gap),
+        "decrement": _finite(solution.decrement),
+        "start": solution.start,
+        "starts": [
+            {
+                "name": s.name,
+                "objective_initial": _finite(s.objective_initial),
+                "objective": _finite(s.objective),
+                "iterations": s.iterations,
+                "status": s.status,
+            }
+            for s in solution.starts
+        ],
+        **solution.details,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

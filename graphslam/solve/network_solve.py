@@ -1,0 +1,297 @@
+"""``solve_network``: one function, four solvers, and an answer that says how good it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy import stats
+
+from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.solve.network_batch import BatchProblem, is_converged
+from graphslam.solve.network_diagnose import check_determined, check_full_rank
+from graphslam.solve.network_incremental import Isam2Options, relinearise_all, run_isam2
+from graphslam.solve.network_model import edge_costs, objective, observation_costs
+from graphslam.solve.network_multistart import (
+    SAME,
+    Optimum,
+    StartReport,
+    best_of_starts,
+    canonical_start,
+    default_starts,
+)
+from graphslam.solve.network_sparse import PcgProblem
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSolution:
+    """Answer of a solver to a pose network.
+
+    Parameters
+    ----------
+    network : PoseNetwork
+        What was solved.
+    solver : str
+    poses : (n, 3) or (n, 7)
+    landmarks : (l, 2)
+    objective : float
+        ``Σ rᵀ Ω r`` with GTSAM's residual (full logarithm), over all edges and observations.
+    objective_initial : float
+        The same at what the file says: its values, or its odometry chain if it has edges only.
+    iterations : int
+        Steps of the descent that won (all solvers count linear solves of the whole network).
+    seconds : float
+    converged : bool
+        At a stationary point (the decrement is negligible) *and* not above the best objective that any start
+        reached.
+    decrement : float
+        Predicted further fall of the objective.
+    gap : float
+        Objective minus the lowest that any start reached in this run.
+    start : str
+        Which start won.
+    starts : tuple of StartReport
+        What the others reached.
+    details : dict
+        What only this solver has to say.
+    """
+
+    network: PoseNetwork
+    solver: str
+    poses: Array
+    landmarks: Array
+    objective: float
+    objective_initial: float
+    iterations: int
+    seconds: float
+    converged: bool
+    decrement: float
+    gap: float
+    start: str
+    starts: tuple[StartReport, ...]
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def objective_g2o(self) -> float:
+        """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the same answer."""
+        return objective(self.network, self.poses, self.landmarks, "g2o")
+
+    @property
+    def objective_g2o_initial(self) -> float:
+        """g2o's objective at what the file says."""
+        return objective(self.network, *canonical_start(self.network), "g2o")
+
+    def to_network(self) -> PoseNetwork:
+        """The network with the solution as its values, ready to be written."""
+        return self.network.with_poses(self.poses, self.landmarks)
+
+    def __repr__(self) -> str:
+        state = "converged" if self.converged else f"NOT converged (gap {self.gap:.6g})"
+        return (
+            f"NetworkSolution({self.solver}: {self.objective_initial:.8g} -> {self.objective:.8g}, {state}, from "
+            f"{self.start}, {self.iterations} iterations, {self.seconds:.2f} s)"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    values: Any
+    arrays: tuple[Array, Array]
+    iterations: int
+    optimum: Optimum
+    start: str
+    details: dict[str, Any]
+
+
+Solver = Callable[[PoseNetwork, Sequence[str] | None, dict[str, Any], bool], _Answer]
+
+
+def solve_network(
+    network: PoseNetwork,
+    solver: str = "lm",
+    *,
+    starts: Sequence[str] | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> NetworkSolution:
+    """Solve a pose network.
+
+    Parameters
+    ----------
+    network : PoseNetwork
+    solver : {"lm", "isam2", "gnc", "pcg"}
+        Key of :data:`SOLVERS`.
+    starts : sequence of str, optional
+        Starts to try (:data:`graphslam.solve.network_multistart.STARTS`).
+    progress : bool
+        Progress bars on stderr.
+    **options
+        isam2: ``relinearise`` (True: close the gap), ``batch``, ``relinearize_threshold``, ``relinearize_skip``;
+        gnc: ``inlier_probability`` (0.99), ``trust_odometry`` (True); pcg: ``tolerance``, ``max_iterations``.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+        Unknown solver, start or option.
+    IndeterminateError
+        Variables that the measurements do not determine, by name.
+    """
+    if solver not in SOLVERS:
+        raise UnknownNameError("solver", solver, SOLVERS)
+    run, known = SOLVERS[solver]
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise ConfigError(f"solver {solver} has no option {unknown[0]!r}; known: {', '.join(known) or 'none'}")
+    begin = time.perf_counter()
+    check_determined(network)
+    initial = canonical_start(network)
+    check_full_rank(network, *initial)
+    answer = run(network, starts, options, progress)
+    poses, landmarks = answer.arrays
+    value = objective(network, poses, landmarks)
+    gap = value - answer.optimum.best.objective
+    decrement = answer.optimum.problem.decrement(answer.values)
+    stationary = is_converged(network, value, decrement)
+    if answer.details.pop("minimises_another_objective", False):
+        stationary = True
+    at_optimum = gap <= SAME * abs(answer.optimum.best.objective) + 1e-12 * network.residuals
+    return NetworkSolution(
+        network=network,
+        solver=solver,
+        poses=poses,
+        landmarks=landmarks,
+        objective=value,
+        objective_initial=objective(network, *initial),
+        iterations=answer.iterations,
+        seconds=time.perf_counter() - begin,
+        converged=bool(stationary and (at_optimum or solver == "gnc")),
+        decrement=decrement,
+        gap=max(gap, 0.0) if at_optimum else gap,
+        start=answer.start,
+        starts=answer.optimum.reports,
+        details=answer.details,
+    )
+
+
+def _lm(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    optimum = best_of_starts(network, starts, progress=progress)
+    best = optimum.best
+    return _Answer(best.values, optimum.problem.arrays(best.values), best.iterations, optimum, optimum.start, {})
+
+
+def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    problem = PcgProblem(network, **options)
+    optimum = best_of_starts(network, starts, problem=problem, progress=progress)
+    best, report = optimum.best, problem.report
+    details = {
+        "linear_solves": report.solves,
+        "cg_iterations": report.iterations,
+        "cg_unconverged": report.unconverged,
+        "worst_linear_residual": max(report.residuals, default=0.0),
+        "decrement_by": "direct sparse solve",
+    }
+    return _Answer(best.values, problem.arrays(best.values), best.iterations, optimum, optimum.start, details)
+
+
+def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    options = dict(options)
+    close = bool(options.pop("relinearise", True))
+    problem = _native(network, "isam2")
+    begin = time.perf_counter()
+    settings = Isam2Options(factorization=problem.factorization, **options)
+    grown = run_isam2(network, settings, progress=progress)
+    seconds = time.perf_counter() - begin
+    # the batch optimum is what the gap is measured against; iSAM2's own estimate is one of its starts
+    names = tuple(n for n in (starts if starts is not None else default_starts(network)) if n != "incremental")
+    optimum = best_of_starts(
+        network, names, given={"incremental": problem.arrays(grown)}, problem=problem, progress=progress
+    )
+    lowest, raw = optimum.best.objective, problem.objective(grown)
+    details: dict[str, Any] = {
+        "objective_incremental": raw,
+        "gap_incremental": raw - lowest,
+        "seconds_incremental": seconds,
+    }
+    values, updates, start = grown, 0, "incremental"
+    if close:
+        values, updates = relinearise_all(network, problem.graph, grown, factorization=problem.factorization)
+        own = problem.objective(values)
+        details["objective_relinearised"] = own
+        details["reseeded"] = False
+        if own > lowest * (1.0 + SAME) + 1e-12 * network.residuals:
+            # another basin is lower: iSAM2 goes on from the start that found it
+            values, more = relinearise_all(
+                network, problem.graph, optimum.best.values, factorization=problem.factorization
+            )
+            updates, start = updates + more, optimum.start
+            details["reseeded"] = True
+    return _Answer(values, problem.arrays(values), updates, optimum, start, details)
+
+
+def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    options = dict(options)
+    probability = float(options.get("inlier_probability", 0.99))
+    if not 0.0 < probability < 1.0:
+        raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
+    problem = _native(network, "gnc")
+    optimum = best_of_starts(network, starts, problem=problem, progress=progress)
+    anchors, m = len(network.anchors), len(network.edges)
+    trusted = list(range(anchors))
+    if options.get("trust_odometry", True):
+        chain = np.flatnonzero(np.abs(np.diff(network.edges, axis=1)[:, 0]) == 1)
+        trusted += (anchors + chain).tolist()
+    lm = gtsam.LevenbergMarquardtParams()
+    lm.setLinearSolverType(f"MULTIFRONTAL_{problem.factorization}")
+    params = gtsam.GncLMParams(lm)
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers(trusted)
+    try:
+        optimizer = gtsam.GncLMOptimizer(problem.graph, optimum.best.values, params)
+        optimizer.setInlierCostThresholdsAtProbability(probability)
+        values = optimizer.optimize()
+    except RuntimeError as error:
+        raise SolverError(f"{network.source}: GNC failed ({error})") from None
+    weights = np.asarray(optimizer.getWeights())[anchors:]
+    poses, landmarks = problem.arrays(values)
+    costs = np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])
+    out = np.flatnonzero(weights < 0.5)
+    # weighted least squares of the inliers, and what truncated least squares charges for each outlier
+    limit = np.where(
+        np.arange(len(weights)) < m,
+        stats.chi2.ppf(probability, network.tangent_dim),
+        stats.chi2.ppf(probability, 2),
+    )
+    names = [network.edge_name(int(k)) if k < m else network.observation_name(int(k) - m) for k in out[:20]]
+    details = {
+        "outliers": len(out),
+        "outlier_names": names,
+        "objective_inliers": float(weights @ costs),
+        "objective_truncated": float(np.sum(np.where(weights < 0.5, limit, costs))),
+        "inlier_probability": probability,
+        "minimises_another_objective": True,
+    }
+    return _Answer(values, (poses, landmarks), optimum.best.iterations, optimum, optimum.start, details)
+
+
+def _native(network: PoseNetwork, solver: str) -> BatchProblem:
+    if len(network.observations) and network.observation_kind != "bearing-range":
+        raise SolverError(
+            f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "
+            "observations; use lm or pcg"
+        )
+    return BatchProblem(network)
+
+
+# name -> (function, its options)
+SOLVERS: dict[str, tuple[Solver, tuple[str, ...]]] = {
+    "lm": (_lm, ()),
+    "isam2": (_isam2, ("relinearise", "batch", "relinearize_threshold", "relinearize_skip")),
+    "gnc": (_gnc, ("inlier_probability", "trust_odometry")),
+    "pcg": (_pcg, ("tolerance", "max_iterations")),
+}

@@ -1,0 +1,29 @@
+"""Best-known objectives ``Σ rᵀ Ω r`` (GTSAM's residual, no ½) of the recorded pose networks; docs/pose-graphs.md says
+how each was established."""
+
+from __future__ import annotations
+
+# folder/file -> objective
+BEST_KNOWN: dict[str, float] = {
+    "posegraphs/input_INTEL_g2o.g2o.xz": 215.838121,
+    "posegraphs/input_M3500_g2o.g2o.xz": 137.914878,
+    "posegraphs/intel.g2o.xz": 45.0042331,
+    "posegraphs/kitti_00.g2o.xz": 98.3221382,
+    "posegraphs/kitti_02.g2o.xz": 78.7646234,
+    "posegraphs/kitti_06.g2o.xz": 25.9469673,
+    "posegraphs/kitti_07.g2o.xz": 12.6610361,
+    "posegraphs/manhattan.g2o.xz": 3549.04107,
+    "posegraphs/parking-garage.g2o.xz": 1.26838480,
+    "posegraphs/smallGrid3D.g2o.xz": 1035.85066,
+    "posegraphs/sphere2500.g2o.xz": 1351.40193,
+    "posegraphs/sphere_bignoise_vertex3.g2o.xz": 2988337.51,
+    "posegraphs/w20000.txt.xz": 37.5267021,
+    "victoria_park_graph/victoria_park.txt.gz": 4678.43908,
+}
+# The files small enough to be solved by every solver within seconds.
+SMALL = (
+    "posegraphs/intel.g2o.xz",
+    "posegraphs/kitti_06.g2o.xz",
+    "posegraphs/kitti_07.g2o.xz",
+    "posegraphs/smallGrid3D.g2o.xz",
+)
