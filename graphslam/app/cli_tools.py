@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import typer
 
 from graphslam.app.cli_run import JSON
 from graphslam.app.terminal import emit, table
-from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
+from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, UnknownNameError
 
 
 def register(app: typer.Typer) -> None:
@@ -48,7 +48,7 @@ def evaluate(
     estimate: Path = typer.Argument(..., help="TUM file."),
     reference: Path = typer.Argument(..., help="TUM file."),
     align: str = typer.Option("se", help="none, origin, se or sim."),
-    delta: float = typer.Option(1.0, help="Distance [m] (or time [s]) of the relative error."),
+    delta: float = typer.Option(10.0, help="Distance [m] (or time [s]) of the relative error."),
     delta_unit: str = typer.Option("m", help="m or s."),
     max_diff: float = typer.Option(0.01, help="Stamps further apart are no pair [s]."),
     as_json: bool = JSON,
@@ -64,9 +64,12 @@ def evaluate(
             raise UnknownNameError(f"--{option}", given, allowed)
     absolute = ate(est, ref, alignment=cast(Alignment, align), max_diff=max_diff)
     unit = cast(Literal["m", "s"], delta_unit)
-    relative = rpe(est, ref, delta=delta, unit=unit, scale=align == "sim", max_diff=max_diff)
-    value = {"ate": absolute.as_row(), "rpe": relative.as_row()}
-    rows = [{"error": k, **v} for k, v in value.items()]
+    value: dict[str, Any] = {"ate": absolute.as_row(), "rpe": None}
+    try:
+        value["rpe"] = rpe(est, ref, delta=delta, unit=unit, scale=align == "sim", max_diff=max_diff).as_row()
+    except DataError as error:  # a path shorter than delta still has an absolute error
+        typer.echo(f"no relative error: {error}; choose another --delta", err=True)
+    rows = [{"error": k, **v} for k, v in value.items() if v]
     emit(value, table(rows), as_json=as_json)
 
 

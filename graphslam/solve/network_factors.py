@@ -10,6 +10,7 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.core.se3 import quat_normalize
 from graphslam.solve.network_model import square_root
 
 LANDMARK = "l"
@@ -33,7 +34,7 @@ def pose_values(network: PoseNetwork, poses: Array) -> list[Any]:
 def pose3_array(pose: gtsam.Pose3) -> Array:
     """``(7,)`` x y z qx qy qz qw of a GTSAM pose."""
     q: Any = pose.rotation().toQuaternion()
-    return np.array([*pose.translation(), q.x(), q.y(), q.z(), q.w()])
+    return np.array([*pose.translation(), *quat_normalize(np.array([q.x(), q.y(), q.z(), q.w()]))])
 
 
 def to_values(network: PoseNetwork, poses: Array, landmarks: Array) -> gtsam.Values:

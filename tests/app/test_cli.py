@@ -85,6 +85,11 @@ def test_eval_scores_a_trajectory_against_the_truth(run_folder):
     assert done.returncode == 0, done.stderr
     value = json.loads(done.stdout)
     assert 0 < value["ate"]["rmse"] < 2
+    assert 0 < value["rpe"]["rmse"] < 2
+    short = graphslam("eval", run_folder / "trajectory.tum", run_folder / "truth.tum", "--delta", "9000", "--json")
+    assert short.returncode == 0
+    assert json.loads(short.stdout)["rpe"] is None
+    assert "--delta" in short.stderr
 
 
 def test_human_output_is_a_table(run_folder):
