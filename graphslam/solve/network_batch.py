@@ -88,11 +88,13 @@ class BatchProblem:
     Parameters
     ----------
     network : PoseNetwork
+    used : (m + k,) bool, optional
+        Which edges and observations enter; all of them if not given.
     """
 
-    def __init__(self, network: PoseNetwork) -> None:
+    def __init__(self, network: PoseNetwork, used: np.ndarray | None = None) -> None:
         self.network = network
-        self.graph = to_graph(network)
+        self.graph = to_graph(network, used)
         self.factorization = "QR" if _spread(network) > CHOLESKY_LIMIT else "CHOLESKY"
 
     def values(self, poses: Array, landmarks: Array) -> gtsam.Values:

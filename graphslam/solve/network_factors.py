@@ -6,6 +6,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
@@ -124,11 +125,14 @@ def anchor_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
     return [make(int(k), pose, noise) for k, pose in zip(anchors, held, strict=True)]
 
 
-def to_graph(network: PoseNetwork) -> gtsam.NonlinearFactorGraph:
-    """Anchors, then edges, then observations."""
+def to_graph(network: PoseNetwork, used: npt.NDArray[np.bool_] | None = None) -> gtsam.NonlinearFactorGraph:
+    """Anchors, then edges, then observations; of these two only where ``used`` (m + k,) says so, if given."""
     graph = gtsam.NonlinearFactorGraph()
-    for factor in (*anchor_factors(network), *edge_factors(network), *observation_factors(network)):
+    for factor in anchor_factors(network):
         graph.push_back(factor)
+    for k, factor in enumerate((*edge_factors(network), *observation_factors(network))):
+        if used is None or used[k]:
+            graph.push_back(factor)
     return graph
 
 

@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
-from scipy import stats
 
 from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
@@ -17,7 +15,7 @@ from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, is_converged
 from graphslam.solve.network_diagnose import check_determined, check_full_rank
 from graphslam.solve.network_incremental import Isam2Options, relinearise_all, run_isam2
-from graphslam.solve.network_model import edge_costs, objective, observation_costs
+from graphslam.solve.network_model import objective
 from graphslam.solve.network_multistart import (
     SAME,
     Optimum,
@@ -26,6 +24,7 @@ from graphslam.solve.network_multistart import (
     canonical_start,
     default_starts,
 )
+from graphslam.solve.network_robust import truncated_least_squares
 from graphslam.solve.network_sparse import PcgProblem
 
 
@@ -49,11 +48,12 @@ class NetworkSolution:
     seconds : float
     converged : bool
         At a stationary point (the decrement is negligible) *and* not above the best objective that any start
-        reached.
+        reached. For gnc: at a stationary point of the inliers' objective.
     decrement : float
-        Predicted further fall of the objective.
+        Predicted further fall of the objective (gnc: of the inliers' objective).
     gap : float
-        Objective minus the lowest that any start reached in this run.
+        Objective minus the lowest that any start reached in this run. For gnc it is what leaving out outliers costs
+        in the objective of all measurements.
     start : str
         Which start won.
     starts : tuple of StartReport
@@ -107,6 +107,9 @@ class _Answer:
     optimum: Optimum
     start: str
     details: dict[str, Any]
+    # what the solver minimised, where that is not the whole objective
+    minimised: BatchProblem | None = None
+    minimum: float | None = None
 
 
 Solver = Callable[[PoseNetwork, Sequence[str] | None, dict[str, Any], bool], _Answer]
@@ -156,10 +159,8 @@ def solve_network(
     poses, landmarks = answer.arrays
     value = objective(network, poses, landmarks)
     gap = value - answer.optimum.best.objective
-    decrement = answer.optimum.problem.decrement(answer.values)
-    stationary = is_converged(network, value, decrement)
-    if answer.details.pop("minimises_another_objective", False):
-        stationary = True
+    decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
+    stationary = is_converged(network, value if answer.minimum is None else answer.minimum, decrement)
     at_optimum = gap <= SAME * abs(answer.optimum.best.objective) + 1e-12 * network.residuals
     return NetworkSolution(
         network=network,
@@ -170,9 +171,9 @@ def solve_network(
         objective_initial=objective(network, *initial),
         iterations=answer.iterations,
         seconds=time.perf_counter() - begin,
-        converged=bool(stationary and (at_optimum or solver == "gnc")),
+        converged=bool(stationary and (at_optimum or answer.minimised is not None)),
         decrement=decrement,
-        gap=max(gap, 0.0) if at_optimum else gap,
+        gap=max(gap, 0.0),
         start=answer.start,
         starts=answer.optimum.reports,
         details=answer.details,
@@ -235,48 +236,36 @@ def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str
 
 
 def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
-    options = dict(options)
     probability = float(options.get("inlier_probability", 0.99))
-    if not 0.0 < probability < 1.0:
-        raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
     problem = _native(network, "gnc")
     optimum = best_of_starts(network, starts, problem=problem, progress=progress)
-    anchors, m = len(network.anchors), len(network.edges)
-    trusted = list(range(anchors))
-    if options.get("trust_odometry", True):
-        chain = np.flatnonzero(np.abs(np.diff(network.edges, axis=1)[:, 0]) == 1)
-        trusted += (anchors + chain).tolist()
-    lm = gtsam.LevenbergMarquardtParams()
-    lm.setLinearSolverType(f"MULTIFRONTAL_{problem.factorization}")
-    params = gtsam.GncLMParams(lm)
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers(trusted)
-    try:
-        optimizer = gtsam.GncLMOptimizer(problem.graph, optimum.best.values, params)
-        optimizer.setInlierCostThresholdsAtProbability(probability)
-        values = optimizer.optimize()
-    except RuntimeError as error:
-        raise SolverError(f"{network.source}: GNC failed ({error})") from None
-    weights = np.asarray(optimizer.getWeights())[anchors:]
-    poses, landmarks = problem.arrays(values)
-    costs = np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])
-    out = np.flatnonzero(weights < 0.5)
-    # weighted least squares of the inliers, and what truncated least squares charges for each outlier
-    limit = np.where(
-        np.arange(len(weights)) < m,
-        stats.chi2.ppf(probability, network.tangent_dim),
-        stats.chi2.ppf(probability, 2),
+    robust = truncated_least_squares(
+        problem, optimum.best.values, probability, bool(options.get("trust_odometry", True))
     )
-    names = [network.edge_name(int(k)) if k < m else network.observation_name(int(k) - m) for k in out[:20]]
+    out = np.flatnonzero(~robust.inliers)
+    m = len(network.edges)
     details = {
         "outliers": len(out),
-        "outlier_names": names,
-        "objective_inliers": float(weights @ costs),
-        "objective_truncated": float(np.sum(np.where(weights < 0.5, limit, costs))),
+        "outlier_names": [
+            network.edge_name(int(k)) if k < m else network.observation_name(int(k) - m) for k in out[:20]
+        ],
+        "objective_inliers": robust.end.objective,
+        "objective_truncated": robust.truncated,
+        "objective_truncated_batch": robust.truncated_before,
         "inlier_probability": probability,
-        "minimises_another_objective": True,
     }
-    return _Answer(values, (poses, landmarks), optimum.best.iterations, optimum, optimum.start, details)
+    end = robust.end
+    iterations = optimum.best.iterations + end.iterations
+    return _Answer(
+        end.values,
+        problem.arrays(end.values),
+        iterations,
+        optimum,
+        optimum.start,
+        details,
+        robust.problem,
+        end.objective,
+    )
 
 
 def _native(network: PoseNetwork, solver: str) -> BatchProblem:
