@@ -5,11 +5,16 @@ Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage.
 
 from __future__ import annotations
 
+import os
 import sys
 
 import typer
 
 import graphslam
+
+# Before NumPy loads: thousands of small matrices, whose BLAS threads would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from graphslam.app import cli_data, cli_join, cli_run, cli_tools
 from graphslam.app.terminal import log_to_stderr
 from graphslam.core.errors import GraphSlamError

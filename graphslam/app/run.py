@@ -117,6 +117,9 @@ class Run:
 
         return draw_map(self, ax)
 
+    def __repr__(self) -> str:
+        return f"Run({self.name!r}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks)"
+
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td>{r.key}</td><td>{r.value:.6g}</td><td>{r.unit}</td></tr>" for r in self.metrics.itertuples()

@@ -113,6 +113,10 @@ class SensorLog:
         for k in np.lexsort((which, times)):
             yield float(times[k]), names[which[k]], int(index[k])
 
+    def __repr__(self) -> str:
+        streams = ", ".join(f"{n} ({len(s.times)})" for n, s in self.streams.items())
+        return f"SensorLog({self.name!r}: {streams}; truth {'known' if self.truth else 'unknown'})"
+
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td>{n}</td><td>{type(s).__name__}</td><td>{len(s.times)}</td>"

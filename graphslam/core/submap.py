@@ -241,12 +241,23 @@ class Submap:
             raise GeometryError(f"submap {self.key} has no landmarks to identify")
         return replace(self, landmarks=replace(self.landmarks, ids=np.asarray(ids, dtype=np.int64)))
 
+    def __repr__(self) -> str:
+        n = 0 if self.landmarks is None else len(self.landmarks)
+        return f"Submap({self.key}, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks)"
+
     def _repr_html_(self) -> str:
         s = np.sqrt(np.diag(self.exit_covariance))
         n = 0 if self.landmarks is None else len(self.landmarks)
-        facts = "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in self.report.items())
+        facts = "".join(f"<tr><td>{k}</td><td>{_short(v)}</td></tr>" for k, v in self.report.items())
         return (
             f"<b>Submap {self.key}</b> [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
             f"exit {np.array2string(self.exit_pose, precision=3)} σ {np.array2string(s, precision=4)}"
             f"<table>{facts}</table>"
         )
+
+
+def _short(value: Any) -> str:
+    """A figure of a report with as many digits as a reader needs."""
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_short(v) for v in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

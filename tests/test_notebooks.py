@@ -1,0 +1,127 @@
+"""Notebooks: stripped in the repository, and each one runs to its end in quick mode."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+
+from graphslam.app.notebook import NotebookStop, load_or_stop
+from graphslam.core.errors import UnknownNameError
+
+FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+NEEDS_DATA = {"01_victoria_park"}
+ABSOLUTE = re.compile(r"(?<![\w./])/(?:home|root|Users|tmp|work|mnt|media|opt|usr|var|srv|data)\b|\b[A-Za-z]:\\\\")
+TIMEOUT_S = 300
+every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+
+
+def execute(path: Path, where: Path, **environment: str) -> Any:
+    """Run a notebook in a kernel of its own, in an empty folder; returns it with its outputs."""
+    book = nbformat.read(path, as_version=4)
+    env = {
+        **os.environ,
+        "GRAPHSLAM_QUICK": "1",
+        "GRAPHSLAM_CACHE": str(where / "cache"),
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+        **environment,
+    }
+    client = NotebookClient(
+        book, timeout=TIMEOUT_S, kernel_name="python3", resources={"metadata": {"path": str(where)}}
+    )
+    try:
+        client.execute(env=env)
+    except CellExecutionError as error:
+        error.book = book  # type: ignore[attr-defined]
+        raise
+    return book
+
+
+def outputs(book: Any) -> list[Any]:
+    return [o for c in book.cells if c.cell_type == "code" for o in c.outputs]
+
+
+def test_there_are_notebooks() -> None:
+    assert {"00_five_minute_tour", "01_victoria_park"} <= {p.stem for p in NOTEBOOKS}
+
+
+@every_notebook
+def test_notebook_is_stripped(path: Path) -> None:
+    book = nbformat.read(path, as_version=4)
+    nbformat.validate(book)
+    assert (book.nbformat, book.nbformat_minor) >= (4, 5)  # cells have ids
+    assert book.metadata.kernelspec.name == "python3"
+    assert set(book.metadata) == {"kernelspec", "language_info"}
+    assert dict(book.metadata.language_info) == {"name": "python"}  # no version of a machine
+    for cell in book.cells:
+        assert not cell.metadata, cell.id
+        assert re.fullmatch(r"[a-z]+-[a-z0-9]+", cell.id), f"{cell.id}: an id that nobody chose"
+        if cell.cell_type == "code":
+            assert cell.outputs == [], cell.id
+            assert cell.execution_count is None, cell.id
+            assert len(cell.source.splitlines()) <= 25, f"{cell.id} is too long to read"
+    assert not ABSOLUTE.search(path.read_text(encoding="utf-8"))
+
+
+@every_notebook
+def test_first_cell_says_what_and_how_long(path: Path) -> None:
+    first = nbformat.read(path, as_version=4).cells[0]
+    assert first.cell_type == "markdown"
+    assert first.source.startswith("# ")
+    for phrase in ("You will learn", "You need", "It takes"):
+        assert f"**{phrase}**" in first.source
+
+
+def test_absolute_paths_are_found() -> None:
+    for text in ('open("/home/me/x")', "'/tmp/y'", r"C:\\Users\\me"):
+        assert ABSOLUTE.search(text), text
+    for text in ("NEES/dof", "docs/data.md", "a/b/tmp", "https://example.org/data/x"):
+        assert not ABSOLUTE.search(text), text
+
+
+@every_notebook
+def test_notebook_runs(path: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    data = {}
+    if path.stem in NEEDS_DATA:
+        data["GRAPHSLAM_DATA"] = str(request.getfixturevalue("data_dir"))
+    book = execute(path, tmp_path, **data)
+    found = outputs(book)
+    assert sum("image/png" in o.get("data", {}) for o in found) >= 7
+    text = "".join(o.text for o in found if o.output_type == "stream")
+    assert "Warning" not in text, text
+    assert "skipped" not in text, text
+    left = {p.name for p in tmp_path.iterdir()}
+    assert left <= {"cache"}, f"the notebook litters: {left}"
+
+
+def test_a_notebook_without_its_data_ends_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(CellExecutionError) as caught:
+        execute(FOLDER / "01_victoria_park.ipynb", tmp_path, GRAPHSLAM_DATA=str(tmp_path / "nothing"))
+    book = caught.value.book  # type: ignore[attr-defined]
+    (error,) = [o for o in outputs(book) if o.output_type == "error"]
+    assert error.ename == "NotebookStop"
+    assert len(error.traceback) <= 8
+    assert "graphslam data fetch victoria-park" in "\n".join(error.traceback)
+    assert "GRAPHSLAM_DATA" in "\n".join(error.traceback)
+    ran = [c.id for c in book.cells if c.cell_type == "code" and c.execution_count is not None]
+    assert ran[-1] == "vp-load"
+
+
+def test_stop_says_the_terms_and_refuses_unknown_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRAPHSLAM_DATA", str(tmp_path))
+    monkeypatch.setenv("GRAPHSLAM_CACHE", str(tmp_path))
+    with pytest.raises(NotebookStop) as caught:
+        load_or_stop("radish-intel")  # a card without a direct download
+    text = str(caught.value)
+    assert "CC BY" in text
+    assert "no direct download" in text
+    assert caught.value._render_traceback_() == text.splitlines()
+    with pytest.raises(UnknownNameError):
+        load_or_stop("victoria-prak")
