@@ -83,8 +83,9 @@ def gps_metrics(
         if T_gps_world is None:
             results["all"] = gps_residuals(trajectory, gps)
         else:
-            results["withheld"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world, score=withheld)
             results["all"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world)
+            if np.any(withheld):
+                results["withheld"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world, score=withheld)
     except DataError:  # no fix on the path: nothing to score, and the counts say so
         return results
     for name, r in results.items():
@@ -93,6 +94,7 @@ def gps_metrics(
         for key, value in (("rmse", s.rmse), ("median", s.median), ("p95", s.p95), ("max", s.maximum)):
             out.add(f"{prefix}_{key}", value, "m", "lower")
         out.add(f"{prefix}_fixes", s.count)
+        out.add(f"{prefix}_fixes_off_the_path", r.outside + r.in_gap)
     return results
 
 

@@ -32,7 +32,7 @@ from graphslam.app.metrics import (
 from graphslam.app.outputs import write_outputs
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
-from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -268,10 +268,10 @@ def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
     name = log.of_type(SteeringControls)
     if name is None:
         return None
-    try:
-        steps = steering_odometry(log[name], times, MotionNoise()).increments
-    except GraphSlamError:
+    times = times[times >= log[name].times[0]]
+    if len(times) < 2:
         return None
+    steps = steering_odometry(log[name], times, MotionNoise()).increments
     poses = np.zeros_like(steps)
     for k in range(1, len(steps)):
         poses[k] = se2_compose(poses[k - 1], steps[k])

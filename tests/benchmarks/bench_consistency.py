@@ -59,8 +59,9 @@ def report(world: str, trials: int) -> dict[str, object]:
     n_exit = 3 * f["submaps"].sum()
     le, he = (b / n_exit for b in chi2_mean_bounds(float(n_exit), 1))
     print(f"\nworld {world}, {trials} runs, gauge: first base fixed, 95 % two-sided bounds")
-    print(f"  submaps: joint NEES/n {f['local_joint'].sum() / f['local_dof'].sum():.3f} [{lj:.3f}, {hj:.3f}], "
-          f"exit NEES/3 {f['local_exit'].sum() / n_exit:.3f} [{le:.3f}, {he:.3f}], {f['submaps'].sum():.0f} maps")  # fmt: skip
+    joint, exits = f["local_joint"].sum() / f["local_dof"].sum(), f["local_exit"].sum() / n_exit
+    print(f"  {f['submaps'].sum():.0f} submaps: joint NEES/n {joint:.3f} [{lj:.3f}, {hj:.3f}],")
+    print(f"  exit NEES/3 {exits:.3f} [{le:.3f}, {he:.3f}]")
     print(f"  join χ²/dof at the optimum {f['objective'].sum() / f['join_dof'].sum():.3f}")
     verdict = "inside" if low <= nees <= high else f"OUTSIDE by {max(low - nees, nees - high):.3f}"
     print(f"  polished map: NEES/n {nees:.3f} [{low:.3f}, {high:.3f}] {verdict}; n = {dof.mean():.0f} a run")
@@ -68,8 +69,9 @@ def report(world: str, trials: int) -> dict[str, object]:
     print(f"  per run: median {np.median(per_run):.3f}, least {per_run.min():.3f}, greatest {per_run.max():.3f}")
     for method, rows in t.groupby("method", sort=False):
         own = rows["nees_unpolished"].fillna(rows["nees"])
-        print(f"    {method:15} before polish NEES/n mean {own.sum() / rows['nees_dof'].sum():8.3f} "
-              f"median {np.median(own / rows['nees_dof']):8.3f}   landmark RMSE after {rows['rmse_landmarks'].mean():.2f} m")  # fmt: skip
+        mean, median = own.sum() / rows["nees_dof"].sum(), np.median(own / rows["nees_dof"])
+        rmse = rows["rmse_landmarks"].mean()
+        print(f"    {method:15} before polish NEES/n mean {mean:8.3f} median {median:8.3f}, landmark RMSE {rmse:.2f} m")
     print(f"  polished objectives of all methods agree to {f['objective_spread'].max():.2g} (relative)")
     return {"world": world, "trials": trials, "nees_per_dof": nees, "bounds": [low, high],
             "objective_spread": float(f["objective_spread"].max())}  # fmt: skip
