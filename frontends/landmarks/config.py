@@ -89,7 +89,7 @@ class RbpfEkfConfig:
     min_hits: int = 1
     """Landmarks handed over were seen at least this often under the winning association."""
     trim: float = 0.0
-    """After a Huber pass, observations with d² above this are dropped and counted; 0 = keep all, plain least squares."""
+    """After a Huber pass, observations with d² above this are dropped and counted; 0 = keep all."""
     handover: Literal["smoothed", "moments"] = "smoothed"
     """``smoothed``: Gauss-Newton under the winning association, Laplace covariance; ``moments``: B3 (paper mode)."""
     moment_inflation: bool = False

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.app.config import BackEndConfig, GpsConfig
-from graphslam.core.geometry import Array
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
@@ -19,6 +19,8 @@ from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
+
+Ints = npt.NDArray[np.int64]
 
 
 @dataclass
@@ -113,7 +115,7 @@ class BackEnd:
                 hits[i] = hits.get(i, 0) + n
         return hits
 
-    def observation_labels(self, submaps: list[Submap]) -> tuple[Array, Array]:
+    def observation_labels(self, submaps: list[Submap]) -> tuple[Ints, Ints]:
         """(observation index in the log, landmark id) of every sighting, for audits of the association."""
         rows: list[Any] = [np.zeros((0, 2), dtype=np.int64)]
         for s in submaps:

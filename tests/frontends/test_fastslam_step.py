@@ -61,9 +61,9 @@ def test_step_equals_slow_twin(proposal, association, seed):
     fast = ParticleSet(config, SENSOR, FOV, 9.0, recorded)
     slow = [SlowParticle() for _ in range(5)]
     margin = np.deg2rad(1.0)
-    cfg = dict(proposal=proposal, gate=config.gate, gate_new=config.gate_new, confirm=config.confirm_hits,
-               misses=config.drop_misses, scans=config.drop_scans, miss_range=9.0,
-               fov=(FOV[0] + margin, FOV[1] - margin))  # fmt: skip
+    cfg = {"proposal": proposal, "gate": config.gate, "gate_new": config.gate_new, "confirm": config.confirm_hits,
+               "misses": config.drop_misses, "scans": config.drop_scans, "miss_range": 9.0,
+               "fov": (FOV[0] + margin, FOV[1] - margin)}  # fmt: skip
     dropped = matched = 0
     slots: dict[int, int] = {}
     for u, Q, obs, ids in world(rng):

@@ -84,7 +84,7 @@ class SlowParticle:
                 s = se2_compose(m, sensor)
                 mean = se2_transform(s, z[0] * np.array([np.cos(z[1]), np.sin(z[1])]))
                 J = rotation2(s[2] + z[1]) @ np.diag([1.0, z[0]])
-                self.features[slot] = dict(mean=mean, cov=J @ R @ J.T, hits=1, misses=0, born=self.scan)
+                self.features[slot] = {"mean": mean, "cov": J @ R @ J.T, "hits": 1, "misses": 0, "born": self.scan}
                 polar[slot] = None
                 self.assoc[first_obs + o] = slot
         if known is None:
