@@ -20,13 +20,8 @@ def front_end_names() -> list[str]:
     return sorted({e.name for e in entry_points(group=GROUP)})
 
 
-def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
-    """Build front end ``name`` with ``options`` checked against its own configuration class.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-    """
+def _kind(name: str) -> tuple[Any, Any]:
+    """Class of front end ``name`` and its configuration class."""
     found = [e for e in entry_points(group=GROUP) if e.name == name]
     if not found:
         raise UnknownNameError("front end", name, front_end_names())
@@ -34,7 +29,17 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
         kind = found[0].load()
     except ImportError as error:
         raise GraphSlamError(f"front end {name!r} cannot be imported ({error})") from error
-    config_type = typing.get_type_hints(kind)["config"]
+    return kind, typing.get_type_hints(kind)["config"]
+
+
+def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
+    """Build front end ``name`` with ``options`` checked against its own configuration class.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+    """
+    kind, config_type = _kind(name)
     made: FrontEnd = kind(config=cfg.build(config_type, options, "frontend"))
     return made
 
@@ -43,7 +48,8 @@ def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise."""
     values = cfg.preset(f"{log.name}.{frontend}")
     noise = log.meta.get("noise", {})
-    if log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise):
+    simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
+    if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):
         scale = float(noise.get("scale", 1.0))
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
         values = cfg.merge({"frontend": {"motion": motion}}, values)
