@@ -11,7 +11,8 @@ The six noise columns mean different things in different programs, and no file s
 
 Poses and landmarks share one index space: a node is a landmark if it is the second index of a ``LANDMARK`` line.
 ``LANDMARK pose landmark x y c_xx c_xy c_yy``: an isotropic covariance becomes bearing and range with
-σ_range = √c and σ_bearing = √(c/10), as ``load2D`` does (the noise at ten metres); any other stays Cartesian.
+σ_range = √c and σ_bearing = √(c/10), as ``load2D`` does (the noise at ten metres); any other stays Cartesian. If the
+noise is asked for as information or its square root, that is meant of landmarks too, and they stay Cartesian.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def read_isam_graph(path: str | os.PathLike[str], *, noise: Noise = "auto", repa
         }.get(name, name)
         build.add_edges(pairs, values[:, :3], information, [records.where(r[0]) for r in rows])
     if records.rows["LANDMARK"]:
-        _landmarks(records, build)
+        _landmarks(records, build, noise)
     return build.build()
 
 
@@ -103,13 +104,17 @@ def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: li
     return np.asarray(np.swapaxes(R, 1, 2) @ R)
 
 
-def _landmarks(records: Records, build: NetworkBuilder) -> None:
+def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     rows = records.rows["LANDMARK"]
     values = np.array([r[2] for r in rows])
     pairs = np.array([r[1] for r in rows], dtype=np.int64)
     labels = [f"{i} sees {j}" for i, j in pairs]
     xy, c = values[:, :2], values[:, 2:]
     covariance = upper_triangle(c, 2)
+    if noise in ("information", "sqrt-information"):
+        R = np.triu(covariance)
+        build.add_observations(pairs, xy, covariance if noise == "information" else np.swapaxes(R, 1, 2) @ R)
+        return
     if not np.all((np.abs(c[:, 0] - c[:, 2]) < 1e-4) & (c[:, 1] == 0.0)):
         build.add_observations(pairs, xy, build.invert(covariance, labels, "landmark covariance matrices"))
         return

@@ -138,7 +138,7 @@ class PcgProblem(SparseProblem):
     Vertices are grouped, ten neighbours in id order to a group, landmarks with the group that first sees them. The
     fine level solves every group for itself; the coarse level solves for one rigid motion of the world for each
     group, which is what long chains and loops are slow in. The two are combined as a balancing preconditioner
-    (Mandel 1993). Against a spanning-tree preconditioner it needs 14 to 60 times fewer iterations on the recorded
+    (Mandel 1993). Against a spanning-tree preconditioner it needs 6 to 60 times fewer iterations on the recorded
     networks.
 
     Parameters

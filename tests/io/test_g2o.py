@@ -216,6 +216,9 @@ def test_anisotropic_landmark_noise_stays_cartesian(tmp_path: Path) -> None:
     net = read_isam_graph(put(tmp_path, text, "l.txt"))
     assert net.observation_kind == "cartesian"
     assert np.allclose(net.observation_information[0], np.linalg.inv([[0.5, 0.1], [0.1, 0.25]]))
+    root = read_isam_graph(tmp_path / "l.txt", noise="sqrt-information")
+    R = np.array([[0.5, 0.1], [0.0, 0.25]])
+    assert np.allclose(root.observation_information[0], R.T @ R)
     both = put(tmp_path, text + "ODOMETRY 1 2 1 0 0 1 0 0 1 0 1\n", "m.txt")
     with pytest.raises(FormatError, match="for a pose and for a landmark; got 2"):
         read_isam_graph(both)
