@@ -46,7 +46,7 @@ class Isam2Options:
         Only every so many updates (GTSAM's default 10).
     batch : int
         Poses an update. 1 is a robot's life; more is faster and, as each update then relinearises more at once,
-        usually nearer to the optimum. 0 chooses about a thousand updates.
+        usually nearer to the optimum. 0 chooses about five hundred updates.
     factorization : {"CHOLESKY", "QR"}
     """
 
@@ -130,7 +130,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
     known_marks: set[int] = set()
     graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set[int]()
     steps = list(insertion_order(network))
-    batch = options.batch or max(1, round(len(network) / 1000))
+    batch = options.batch or max(1, round(len(network) / 500))
     for count, (v, links) in enumerate(tqdm(steps, desc="iSAM2", unit="pose", disable=not progress, leave=False), 1):
         if v in anchors:
             poses[v] = network.poses[v]
