@@ -8,7 +8,7 @@ import numpy.typing as npt
 from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
 from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, wrap_angle
 
 Ints = npt.NDArray[np.int64]
 
@@ -133,6 +133,6 @@ class ParticleSet:
     def pose_std(self) -> Array:
         """Weighted standard deviation of x, y, θ over the particles ``(3,)``."""
         d = self.pose - self.pose[self.best]
-        d[:, 2] = np.arctan2(np.sin(d[:, 2]), np.cos(d[:, 2]))
+        d[:, 2] = wrap_angle(d[:, 2])
         mean = self.weights @ d
         return np.asarray(np.sqrt(self.weights @ (d - mean) ** 2))

@@ -27,7 +27,8 @@ CFG_LENGTH = 9
 
 
 @numba.njit(cache=True, inline="always")
-def _wrap(a):
+def wrap(a):
+    """Angle to (-π, π]."""
     return math.pi - (math.pi - a) % _TWO_PI
 
 
@@ -45,7 +46,7 @@ def observe(x, y, th, ax, ay, ath, lx, ly, out):
     ux, uy = dx / r, dy / r
     ex, ey = c * ux + s * uy, -s * ux + c * uy  # line of sight in the body frame
     out[0] = r
-    out[1] = _wrap(math.atan2(dy, dx) - th - ath)
+    out[1] = wrap(math.atan2(dy, dx) - th - ath)
     out[2], out[3], out[4] = -ex, -ey, ex * ay - ey * ax
     out[5], out[6], out[7] = ey / r, -ex / r, (-ey * ay - ex * ax) / r - 1.0
     out[8], out[9], out[10], out[11] = ux, uy, -uy / r, ux / r
@@ -101,7 +102,7 @@ def _retract(m, dx, dy, dth):
     c, s = math.cos(m[2]), math.sin(m[2])
     m[0] += c * dx - s * dy
     m[1] += s * dx + c * dy
-    m[2] = _wrap(m[2] + dth)
+    m[2] = wrap(m[2] + dth)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -170,13 +171,13 @@ def _associate(
         for b in range(lo, hi + 1):
             j = head[b % BUCKETS]
             while j >= 0:
-                if abs(polar[j, 0] - r) <= rwin and abs(_wrap(polar[j, 1] - be)) <= bwin:
+                if abs(polar[j, 0] - r) <= rwin and abs(wrap(polar[j, 1] - be)) <= bwin:
                     observe(m[0], m[1], m[2], sensor[0], sensor[1], sensor[2], mean[j, 0], mean[j, 1], h)
                     p00, p01, p11 = _pose_block(h, P)
                     l00, l01, l11 = _landmark_block(h, cov[j, 0], cov[j, 1], cov[j, 2])
                     s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
                     det = s00 * s11 - s01 * s01
-                    n0, n1 = r - h[0], _wrap(be - h[1])
+                    n0, n1 = r - h[0], wrap(be - h[1])
                     d2 = (s11 * n0 * n0 - 2.0 * s01 * n0 * n1 + s00 * n1 * n1) / det
                     if d2 < nearest[o]:
                         nearest[o] = d2
@@ -251,7 +252,7 @@ def fastslam_step(
         c, s = math.cos(pose[i, 2]), math.sin(pose[i, 2])
         m[0] = pose[i, 0] + c * u[0] - s * u[1]
         m[1] = pose[i, 1] + s * u[0] + c * u[1]
-        m[2] = _wrap(pose[i, 2] + u[2])
+        m[2] = wrap(pose[i, 2] + u[2])
         P[:] = Q
         if cfg[CFG_PROPOSAL_2] < 0.5:
             _sample(m, P, normals[i], L)  # FastSLAM 1.0: the proposal is the motion prior
@@ -297,7 +298,7 @@ def fastslam_step(
             l00, l01, l11 = _landmark_block(h, cov[i, j, 0], cov[i, j, 1], cov[i, j, 2])
             s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
             det = s00 * s11 - s01 * s01
-            n0, n1 = obs[o, 0] - h[0], _wrap(obs[o, 1] - h[1])
+            n0, n1 = obs[o, 0] - h[0], wrap(obs[o, 1] - h[1])
             i00, i01, i11 = s11 / det, -s01 / det, s00 / det
             log_weight[i] -= 0.5 * (i00 * n0 * n0 + 2.0 * i01 * n0 * n1 + i11 * n1 * n1) + log_2pi + 0.5 * math.log(det)
             if cfg[CFG_PROPOSAL_2] > 0.5:
@@ -321,7 +322,7 @@ def fastslam_step(
                 g10, g11 = c1 * h[8] + c2 * h[9], c1 * h[10] + c2 * h[11]
                 k00, k01 = g00 * i00 + g01 * i01, g00 * i01 + g01 * i11
                 k10, k11 = g10 * i00 + g11 * i01, g10 * i01 + g11 * i11
-                n0, n1 = obs[o, 0] - h[0], _wrap(obs[o, 1] - h[1])
+                n0, n1 = obs[o, 0] - h[0], wrap(obs[o, 1] - h[1])
                 mean[i, j, 0] += k00 * n0 + k01 * n1
                 mean[i, j, 1] += k10 * n0 + k11 * n1
                 cov[i, j, 0] = c0 - (k00 * g00 + k01 * g01)

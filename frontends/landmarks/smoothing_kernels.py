@@ -12,14 +12,7 @@ import math
 import numba
 import numpy as np
 
-from frontends.landmarks.kernels import observe
-
-_TWO_PI = 2.0 * math.pi
-
-
-@numba.njit(cache=True, inline="always")
-def _wrap(a):
-    return math.pi - (math.pi - a) % _TWO_PI
+from frontends.landmarks.kernels import observe, wrap
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -45,10 +38,10 @@ def _odometry_residual(a, b, u, e):
     """``e = u⁻¹ ∘ (a⁻¹ ∘ b)`` as (x, y, θ), and the between pose a⁻¹ ∘ b in e[3:6]."""
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
-    bx, by, bt = c * dx + s * dy, -s * dx + c * dy, _wrap(b[2] - a[2])
+    bx, by, bt = c * dx + s * dy, -s * dx + c * dy, wrap(b[2] - a[2])
     c, s = math.cos(u[2]), math.sin(u[2])
     dx, dy = bx - u[0], by - u[1]
-    e[0], e[1], e[2] = c * dx + s * dy, -s * dx + c * dy, _wrap(bt - u[2])
+    e[0], e[1], e[2] = c * dx + s * dy, -s * dx + c * dy, wrap(bt - u[2])
     e[3], e[4], e[5] = bx, by, bt
 
 
@@ -70,7 +63,7 @@ def smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d
         observe(
             poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
         )
-        n0, n1 = ob[o, 0] - h[0], _wrap(ob[o, 1] - h[1])
+        n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
         a, b = n0 * n0 / ob[o, 2], n1 * n1 / ob[o, 3]
         d2[o] = a + b
         parts[1] += weight[o] * a
@@ -122,7 +115,7 @@ def _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B,
         observe(
             poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
         )
-        n0, n1 = ob[o, 0] - h[0], _wrap(ob[o, 1] - h[1])
+        n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for r_ in range(3):
             a0, a1 = h[2 + r_] * w0, h[5 + r_] * w1
@@ -213,7 +206,7 @@ def smooth_kernel(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, ma
                 dx, dy = scale * step[k, 0], scale * step[k, 1]
                 new_poses[k, 0] = poses[k, 0] + c * dx - s * dy
                 new_poses[k, 1] = poses[k, 1] + s * dx + c * dy
-                new_poses[k, 2] = _wrap(poses[k, 2] + scale * step[k, 2])
+                new_poses[k, 2] = wrap(poses[k, 2] + scale * step[k, 2])
             for j in range(len(landmarks)):
                 new_lm[j, 0] = landmarks[j, 0] + scale * x[3 + 2 * j]
                 new_lm[j, 1] = landmarks[j, 1] + scale * x[4 + 2 * j]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,8 @@ def open_run(path: str | Path) -> Run:
         map=m,
         metrics=pd.read_json(root / "metrics.json", orient="records"),
         report=report,
+        events=_events(root / "events.jsonl"),
+        ledger=pd.read_csv(root / "ledger.csv", keep_default_na=False) if (root / "ledger.csv").is_file() else None,
         folder=root,
         truth=read_truth(root),
         truth_path=_path(root / "truth.tum"),
@@ -156,3 +159,12 @@ def open_run(path: str | Path) -> Run:
 
 def _path(file: Path) -> Trajectory | None:
     return read_tum(file, dim=2) if file.is_file() else None
+
+
+def _events(file: Path) -> list[dict[str, Any]]:
+    if not file.is_file():
+        return []
+    try:
+        return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    except ValueError as error:
+        raise FormatError(f"a line is not JSON ({error})", where=str(file)) from None

@@ -271,7 +271,7 @@ def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
     times = times[times >= log[name].times[0]]
     if len(times) < 2:
         return None
-    steps = steering_odometry(log[name], times, MotionNoise()).increments
+    steps = steering_odometry(log[name], times, MotionNoise(speed=0.0, steering=0.0)).increments
     poses = np.zeros_like(steps)
     for k in range(1, len(steps)):
         poses[k] = se2_compose(poses[k - 1], steps[k])

@@ -70,9 +70,9 @@ class Run:
         ``run.json``: versions, seed, times, counts of records read, used and dropped.
     events : list of dict
     ledger : DataFrame or None
-        Which factor spent which stream when; None for a run read back from disk.
+        Which factor spent which stream when.
     gps : mapping of str to GpsResiduals
-        ``all`` and, where GPS was in the graph, ``withheld``.
+        ``all`` and, where GPS was in the graph, ``withheld``; empty for a run read back from disk.
     folder : Path or None
     log : SensorLog or None
     truth : MapTruth or None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -22,30 +24,43 @@ def controls(model, speed=SPEED, steering=STEERING, encoder=0.0):
     return SteeringControls(times=T, speed=speed, steering=steering, geometry=g)
 
 
-def integrate(model, encoder, t0, t1, n=4000):
-    """Midpoint integration of the differential equations with held controls: slow and obvious."""
+def integrate(encoder, t0, t1, n=4000):
+    """Midpoint integration of the rear-axle differential equations with held controls: slow and obvious."""
     x = np.zeros(3)
     dt = (t1 - t0) / n
     for k in range(n):
         i = np.searchsorted(T, t0 + (k + 0.5) * dt, side="right") - 1
-        v, a = SPEED[i], STEERING[i]
-        if model == "rear-axle":
-            v = v / (1 - np.tan(a) * encoder / 2.83)
-            w = v * np.tan(a) / 2.83
-            h = x[2] + 0.5 * w * dt
-            x = x + dt * np.array([v * np.cos(h), v * np.sin(h), w])
-        else:
-            x = x + dt * np.array([v * np.cos(a + x[2]), v * np.sin(a + x[2]), v * np.sin(a) / 2.83])
+        v = SPEED[i] / (1 - np.tan(STEERING[i]) * encoder / 2.83)
+        w = v * np.tan(STEERING[i]) / 2.83
+        h = x[2] + 0.5 * w * dt
+        x = x + dt * np.array([v * np.cos(h), v * np.sin(h), w])
     return x
 
 
-@pytest.mark.parametrize(("model", "encoder", "tolerance"), [("rear-axle", 0.76, 1e-5), ("front-steer", 0.0, 5e-3)])
-def test_increments_equal_a_fine_integrator(model, encoder, tolerance):
-    # the front-steer model is *defined* as Euler steps of the control rate, hence its wider tolerance
-    quiet = MotionNoise(speed=0.0, steering=0.0)
-    o = steering_odometry(controls(model, encoder=encoder), STAMPS, quiet)
+def euler_steps(t0, t1):
+    """The front-steer model as Combined SLAM defines it: x' = x + V dt cos(G + φ), one step a held control."""
+    x = np.zeros(3)
+    knots = np.unique(np.concatenate([T[(t0 < T) & (t1 > T)], [t0, t1]]))
+    for a, b in itertools.pairwise(knots):
+        i = np.searchsorted(T, a, side="right") - 1
+        v, g = SPEED[i], STEERING[i]
+        x = x + (b - a) * v * np.array([np.cos(g + x[2]), np.sin(g + x[2]), np.sin(g) / 2.83])
+    return x
+
+
+QUIET = MotionNoise(speed=0.0, steering=0.0)
+
+
+def test_rear_axle_increments_equal_a_fine_integrator():
+    o = steering_odometry(controls("rear-axle", encoder=0.76), STAMPS, QUIET)
     for k in range(1, len(STAMPS)):
-        np.testing.assert_allclose(o.increments[k], integrate(model, encoder, STAMPS[k - 1], STAMPS[k]), atol=tolerance)
+        np.testing.assert_allclose(o.increments[k], integrate(0.76, STAMPS[k - 1], STAMPS[k]), atol=1e-5)
+
+
+def test_front_steer_increments_equal_the_defined_steps():
+    o = steering_odometry(controls("front-steer"), STAMPS, QUIET)
+    for k in range(1, len(STAMPS)):
+        np.testing.assert_allclose(o.increments[k], euler_steps(STAMPS[k - 1], STAMPS[k]), atol=1e-12)
 
 
 @pytest.mark.parametrize("model", ["rear-axle", "front-steer"])
@@ -54,8 +69,7 @@ def test_covariance_is_confirmed_by_monte_carlo(model, per_increment):
     rng = np.random.default_rng(7)
     noise = MotionNoise(speed=0.1, steering=np.deg2rad(2.0), per_increment=per_increment)
     o = steering_odometry(controls(model), STAMPS, noise)
-    quiet = MotionNoise(speed=0.0, steering=0.0)
-    clean = steering_odometry(controls(model), STAMPS, quiet).increments
+    clean = steering_odometry(controls(model), STAMPS, QUIET).increments
     errors = []
     held = np.clip(np.searchsorted(STAMPS, T, side="right") - 1, 0, len(STAMPS) - 2)
     for _ in range(6000):
