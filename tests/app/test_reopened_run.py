@@ -1,0 +1,31 @@
+"""A run read back from disk has its ledger and its events."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import graphslam as gs
+from graphslam.core.errors import FormatError
+
+
+def test_ledger_and_events_come_back(tmp_path: Path) -> None:
+    log = gs.simulate("landmark-field", preset="quick", gps_rate=1.0)
+    config = {"gps": {"use": "every-second"}}
+    run = gs.run(log, out=tmp_path / "run", solver="batch", config=config, progress=False)
+    again = gs.open_run(tmp_path / "run")
+    assert run.ledger is not None
+    assert again.ledger is not None
+    pd.testing.assert_frame_equal(again.ledger, run.ledger, check_dtype=False)
+    assert {"submap", "datum"} <= {e["event"] for e in again.events}
+    assert [e["event"] for e in again.events] == [e["event"] for e in run.events]
+    assert repr(again) == repr(run)
+    assert f"{len(run.submaps)} submaps" in repr(run)
+    assert str(len(log["controls"].times)) in repr(log)
+    assert repr(run.submaps[0]).startswith("Submap(0, [0.00, ")
+    with (tmp_path / "run" / "events.jsonl").open("a") as stream:
+        stream.write("{half a li")
+    with pytest.raises(FormatError, match=r"events\.jsonl"):
+        gs.open_run(tmp_path / "run")

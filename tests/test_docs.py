@@ -1,0 +1,103 @@
+"""The documentation: its Python runs, its links lead somewhere, and it names options and files that there are."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from frontends.landmarks.config import RbpfEkfConfig
+from graphslam.app import config as cfg
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ["concepts.md", "how-to.md", "limits.md"]
+BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
+every_page = pytest.mark.parametrize("name", PAGES)
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+def anchor(heading: str) -> str:
+    """GitHub's: lower case, no punctuation, hyphens for spaces."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@every_page
+def test_links_lead_somewhere(name: str) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", page(name)):
+        if target.startswith(("http://", "https://")):
+            continue
+        path, _, part = target.partition("#")
+        file = (ROOT / "docs" / (path or name)).resolve()
+        assert file.is_file(), f"{name}: {target}"
+        if part:
+            headings = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.M)
+            assert part in {anchor(h) for h in headings}, f"{name}: {target}"
+
+
+@pytest.mark.parametrize("name", ["concepts.md", "how-to.md"])
+def test_python_of_the_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
+    """Blocks that name a file are that file; the rest is one script, run in an empty folder."""
+    script = []
+    for code in BLOCK.findall(page(name)):
+        named = re.match(r"# file: (\S+)\n", code)
+        if named:
+            (tmp_path / named[1]).write_text(code, encoding="utf-8")
+        else:
+            script.append(code)
+    assert script
+    if name == "how-to.md":
+        script.append(own_front_end(tmp_path))
+    environment = {**os.environ, "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(script)], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def own_front_end(folder: Path) -> str:
+    """Install the page's front end as its package would (an entry point), and what to run with it."""
+    (toml,) = re.findall(r"^```toml\n\[project\.entry-points\..*?\]\n(.*?)^```$", page("how-to.md"), re.M | re.S)
+    info = folder / "own-0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 0\n")
+    (info / "entry_points.txt").write_text("[graphslam.frontends]\n" + toml.replace('"', ""))
+    return """
+one = gs.run("my-log", frontend="dead-reckoning", config={"frontend": {"seconds": 5.0}}, progress=False)
+assert len(one.submaps) == 10, one
+half = gs.run("my-log", frontend="dead-reckoning", out="half", progress=False)
+resumed = gs.run("my-log", frontend="dead-reckoning", out="half", resume=True, progress=False)
+assert np.array_equal(resumed.map.trajectory.poses, half.map.trajectory.poses)
+true = gs.run(source, frontend="dead-reckoning", progress=False)  # a simulated log states its own noise
+assert 0.05 < true.metric("nees_per_dof") < 3.5, true.metric("nees_per_dof")
+"""
+
+
+def test_options_of_the_how_to_exist_with_the_values_it_gives() -> None:
+    rows = re.findall(r"^\| `((?:frontend|backend)\.[\w.]+)`(?:, `\.(\w+)`)? \| ([^|]+) \|", page("how-to.md"), re.M)
+    assert len(rows) >= 7
+    roots = {"frontend": RbpfEkfConfig(), "backend": cfg.BackEndConfig()}
+    for key, second, stated in rows:
+        first, *rest = key.split(".")
+        for option in [rest, [*rest[:-1], second]] if second else [rest]:
+            value = roots[first]
+            for part in option:
+                value = getattr(value, part)
+            if not second:
+                assert float(value) == (0.0 if stated.strip() == "false" else float(stated)), key
+
+
+def test_run_folder_holds_the_files_that_the_how_to_names(tmp_path: Path) -> None:
+    import graphslam as gs
+
+    table = page("how-to.md").split("## The run folder")[1].split("## ")[0]
+    named = set(re.findall(r"`([\w.]+\.(?:toml|json|npz|tum|csv|g2o|jsonl))`", table))
+    run = gs.run(gs.simulate("landmark-field", preset="quick"), out=tmp_path / "run", progress=False, solver="batch")
+    there = {p.name for p in run.folder.iterdir() if p.is_file()}
+    assert named == there
