@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,14 @@ from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps import GpsResiduals
 from graphslam.io.atomic import read_json, read_npz, write_npz
 from graphslam.io.map_graph import write_map_graph
 from graphslam.io.submap_store import read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
 
 MAP_FORMAT = "graphslam.map/1"
+GPS_FORMAT = "graphslam.gps-residuals/1"
 ASSOCIATION_FORMAT = "graphslam.association/1"
 
 
@@ -41,6 +44,9 @@ def write_outputs(folder: RunFolder, run: Run) -> None:
     for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):
         if path is not None:
             write_tum(folder.path / name, path)
+    for name, r in run.gps.items():
+        arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
+        write_npz(folder.path / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays})
     folder.write_lines("events.jsonl", run.events)
     if run.ledger is not None:
         folder.write_text("ledger.csv", run.ledger.to_csv(index=False))
@@ -151,9 +157,24 @@ def open_run(path: str | Path) -> Run:
         events=_events(root / "events.jsonl"),
         ledger=pd.read_csv(root / "ledger.csv", keep_default_na=False) if (root / "ledger.csv").is_file() else None,
         folder=root,
+        gps={p.stem.removeprefix("gps_"): _gps(p) for p in sorted(root.glob("gps_*.npz"))},
         truth=read_truth(root),
         truth_path=_path(root / "truth.tum"),
         dead_reckoning=_path(root / "dead_reckoning.tum"),
+    )
+
+
+def _gps(file: Path) -> GpsResiduals:
+    a = read_npz(file, fmt=GPS_FORMAT)
+    return GpsResiduals(
+        times=a["times"],
+        residuals=a["residuals"],
+        points=a["points"],
+        T_gps_map=a["T_gps_map"],
+        lever=a["lever"],
+        fitted=int(a["fitted"]),
+        outside=int(a["outside"]),
+        in_gap=int(a["in_gap"]),
     )
 
 

@@ -32,6 +32,7 @@ from graphslam.app.metrics import (
 from graphslam.app.outputs import write_outputs
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
+from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter, SensorLog
@@ -80,10 +81,24 @@ def run(
     GraphSlamError
         Or one of its children; says what, where, got, wanted.
     """
+    with one_blas_thread():
+        return _run(source, frontend, solver, seed, out, config or {}, resume, progress)
+
+
+def _run(
+    source: str | Path | SensorLog,
+    frontend: str,
+    solver: str,
+    seed: int,
+    out: str | Path | None,
+    config: Mapping[str, Any],
+    resume: bool,
+    progress: bool,
+) -> Run:
     begin = time.perf_counter()
     log = load_log_source(source)
     seconds = {"load": time.perf_counter() - begin}
-    options = cfg.merge(recommended(log, frontend), config or {})
+    options = cfg.merge(recommended(log, frontend), config)
     settings: cfg.RunConfig = cfg.build(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)

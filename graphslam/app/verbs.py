@@ -14,6 +14,7 @@ from graphslam.app.pipeline import load_log_source
 from graphslam.app.pipeline import run as run
 from graphslam.app.run import Run
 from graphslam.app.submap_sources import submap_source
+from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
@@ -53,14 +54,16 @@ def compare(
     """
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
-    return comparing.compare(s.submaps, methods=methods, truth=truth or s.truth, **options)
+    with one_blas_thread():
+        return comparing.compare(s.submaps, methods=methods, truth=truth or s.truth, **options)
 
 
 def join(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
     """Join submaps by one method; see :func:`graphslam.app.compare.join`."""
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
-    return comparing.join(s.submaps, method, **options)
+    with one_blas_thread():
+        return comparing.join(s.submaps, method, **options)
 
 
 def solve(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:

@@ -102,7 +102,7 @@ class SensorLog:
         for name, s in self.streams.items():
             i, j = np.searchsorted(s.times, t_start, "left"), np.searchsorted(s.times, t_end, "right")
             cut[name] = s.take(slice(int(i), int(j)))
-        return replace(self, streams=cut)
+        return replace(self, streams=cut, read={})  # the counts were those of the whole log
 
     def events(self) -> Iterator[tuple[float, str, int]]:
         """Merge the streams in time order: yields (time, stream, record index); ties in order of the streams' names."""

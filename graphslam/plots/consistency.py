@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import ArrayLike
@@ -59,6 +60,7 @@ def plot_consistency(
         ax.set_yscale("log")
     else:
         ax.set_ylim(bottom=0.0)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("submap")
     ax.set_ylabel(
         f"mean NEES/n of {first.quantity}" if figure == "nees" else f"mean consistency index of {first.quantity}"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_mean_bounds
@@ -102,6 +103,7 @@ def _number(submap: Submap, key: str) -> float:
 
 
 def _finish(ax: Axes, label: str, title: str | None) -> Axes:
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("submap")
     ax.set_ylabel(label)
     if title:

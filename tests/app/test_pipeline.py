@@ -19,7 +19,7 @@ from graphslam.io.tum import read_tum
 FILES = {
     *("config.toml", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "nodes.tum", "trajectory.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("submaps", "figures"),
+    *("submaps", "figures", "gps_all.npz"),
 }
 
 
@@ -75,6 +75,7 @@ def test_reopened_run_is_the_run(result):
     assert [list(s.landmarks.ids) for s in again.submaps] == [list(s.landmarks.ids) for s in result.submaps]
     assert again.metric("nees") == pytest.approx(result.metric("nees"))
     assert again._repr_html_()
+    np.testing.assert_array_equal(again.gps["all"].residuals, result.gps["all"].residuals)
     np.testing.assert_allclose(
         read_tum(result.folder / "trajectory.tum", dim=2).poses, result.map.trajectory.poses, atol=1e-8
     )
