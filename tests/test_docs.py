@@ -98,6 +98,8 @@ def test_run_folder_holds_the_files_that_the_how_to_names(tmp_path: Path) -> Non
 
     table = page("how-to.md").split("## The run folder")[1].split("## ")[0]
     named = set(re.findall(r"`([\w.]+\.(?:toml|json|npz|tum|csv|g2o|jsonl))`", table))
-    run = gs.run(gs.simulate("landmark-field", preset="quick"), out=tmp_path / "run", progress=False, solver="batch")
+    log = gs.simulate("landmark-field", preset="quick", gps_rate=1.0, gps_sigma=0.3)
+    options = {"gps": {"use": "every-second"}}  # so that every file is there that a run can have
+    run = gs.run(log, out=tmp_path / "run", progress=False, solver="batch", config=options)
     there = {p.name for p in run.folder.iterdir() if p.is_file()}
     assert named == there

@@ -177,6 +177,7 @@ def _front_to_back(
     if submaps:
         logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
         bar.update(submaps[-1].interval[1] - t_first)
+    bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
     front_s, resumed, cost = 0.0, len(submaps), []
     stream = front.submaps(log, seed=seed.child("frontend"), after=submaps[-1] if submaps else None, drops=drops)
     while True:
