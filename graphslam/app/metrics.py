@@ -98,6 +98,18 @@ def gps_metrics(
     return results
 
 
+def dead_reckoning_metrics(out: Metrics, path: Trajectory | None, gps: Gps) -> None:
+    """What the wheels alone would have given, scored like the map: the figure to compare it with."""
+    if path is None or len(gps.times) < 2:
+        return
+    try:
+        s = gps_residuals(path, gps).statistics
+    except DataError:
+        return
+    out.add("gps_dead_reckoning_rmse", s.rmse, "m")
+    out.add("gps_dead_reckoning_median", s.median, "m")
+
+
 def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
     """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth."""
     if log.truth is None or not submaps:

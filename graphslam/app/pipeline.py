@@ -21,6 +21,7 @@ from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.gps_use import split, used_fixes
 from graphslam.app.metrics import (
     Metrics,
+    dead_reckoning_metrics,
     front_end_metrics,
     gps_metrics,
     map_truth,
@@ -220,9 +221,11 @@ def _judge(
     scans = sum(int(s.report.get("scans", 0)) for s in submaps[resumed:])
     time_metrics(out, seconds, log.duration, scans, [cost])
     residuals = {}
+    reckoned = dead_reckoning(log, global_map.trajectory.times)
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
+        dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
     if truth is not None:
@@ -256,7 +259,7 @@ def _judge(
         log=log,
         truth=truth,
         truth_path=truth_path(log, global_map.trajectory.times),
-        dead_reckoning=dead_reckoning(log, global_map.trajectory.times),
+        dead_reckoning=reckoned,
         solution=solution,
         graph=back.graph,
     )
