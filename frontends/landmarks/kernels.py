@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 # Association outcome of one observation, as stored in ``assoc`` (slots are ≥ 0)
-IGNORED, UNSEEN = -1, -2
+IGNORED = -1
 BUCKETS = 64
 _TWO_PI = 2.0 * math.pi
 

@@ -157,9 +157,7 @@ def truth_metrics(out: Metrics, solution: Solution, truth: MapTruth, *, identiti
     out.add("ci", nees / chi2_quantile(0.95, dof), "", "lower")
 
 
-def time_metrics(
-    out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, per_scan: Sequence[Array]
-) -> None:
+def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, cost: Array) -> None:
     """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log."""
     for stage, value in seconds.items():
         out.add(f"seconds_{stage}", value, "s", "lower")
@@ -168,7 +166,6 @@ def time_metrics(
         out.add("times_real_time", duration / total, "x", "higher")
     if scans:
         out.add("frontend_ms_per_scan", 1e3 * seconds.get("frontend", 0.0) / scans, "ms", "lower")
-    cost = np.concatenate(per_scan) if per_scan else np.zeros(0)
     if len(cost) >= 8:
         quarter = len(cost) // 4
         out.add(

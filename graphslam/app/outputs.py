@@ -18,8 +18,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
+from graphslam.graph.network import to_network
 from graphslam.io.atomic import read_json, read_npz, write_npz
-from graphslam.io.map_graph import write_map_graph
+from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
 
@@ -36,9 +37,8 @@ def write_outputs(folder: RunFolder, run: Run) -> None:
     folder.write_text("landmarks.csv", landmarks_csv(m))
     write_npz(folder.path / "map.npz", _map_arrays(m))
     write_npz(folder.path / "association.npz", _association_arrays(run.submaps))
-    if run.solution is not None:
-        v = run.solution.values
-        write_map_graph(folder.path / "graph.g2o", run.submaps, v.poses, v.landmark_ids, v.landmarks)
+    if run.graph is not None:
+        write_g2o(folder.path / "graph.g2o", to_network(run.graph))
     if run.truth is not None:
         write_truth(folder.path, run.truth)
     for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):

@@ -6,6 +6,7 @@ import logging
 import platform
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import MissingDataError
-from graphslam.core.geometry import se2_compose
+from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, SteeringControls
@@ -111,19 +112,20 @@ def _run(
         back.add_gps(split(gps, settings.gps)[0], settings.gps)
 
     drops = DropCounter()
-    submaps, timing = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
+    submaps, work = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
     if not submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
     solution = back.finish()
-    seconds |= timing | {f"backend_{k}": v for k, v in back.seconds.items()}
+    seconds["frontend"] = work.seconds
+    seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}
     seconds["backend"] = sum(back.seconds.values())
     seconds["total"] = time.perf_counter() - begin
 
-    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, drops, effective)
-    if folder is not None:
-        write_outputs(folder, result)
-        object.__setattr__(result, "folder", folder.path)
-    return result
+    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, work, drops, effective)
+    if folder is None:
+        return result
+    write_outputs(folder, result)
+    return replace(result, folder=folder.path)
 
 
 def load_log_source(source: str | Path | SensorLog) -> SensorLog:
@@ -157,6 +159,24 @@ def effective_config(
     }
 
 
+@dataclass(frozen=True, slots=True)
+class FrontEndWork:
+    """What the front end did in this session.
+
+    Parameters
+    ----------
+    seconds : float
+    resumed : int
+        Submaps that were there already.
+    per_scan : (k,)
+        Seconds a scan of each submap but the first, which may have compiled.
+    """
+
+    seconds: float
+    resumed: int
+    per_scan: Array
+
+
 def _front_to_back(
     log: SensorLog,
     front: Any,
@@ -165,7 +185,7 @@ def _front_to_back(
     folder: RunFolder | None,
     drops: DropCounter,
     progress: bool,
-) -> tuple[list[Submap], dict[str, Any]]:
+) -> tuple[list[Submap], FrontEndWork]:
     """Feed every submap to the back end as soon as it is finished and stored."""
     store = None if folder is None else folder.submaps
     submaps = store.complete_prefix() if store is not None else []
@@ -196,7 +216,7 @@ def _front_to_back(
         bar.update(submap.interval[1] - submap.interval[0])
         bar.set_postfix(submaps=len(submaps), landmarks=len(back.graph.values.landmarks))
     bar.close()
-    return submaps, {"frontend": front_s, "resumed_submaps": resumed, "cost": np.array(cost[1:])}
+    return submaps, FrontEndWork(front_s, resumed, np.array(cost[1:]))
 
 
 def _judge(
@@ -207,19 +227,19 @@ def _judge(
     submaps: list[Submap],
     back: BackEnd,
     solution: Solution,
-    seconds: dict[str, Any],
+    seconds: dict[str, float],
+    work: FrontEndWork,
     drops: DropCounter,
     effective: dict[str, Any],
 ) -> Run:
     """Metrics, residuals, and the value that the user gets."""
     hits = back.landmark_hits(submaps)
     global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
-    cost, resumed = seconds.pop("cost"), seconds.pop("resumed_submaps")
     out = Metrics()
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))
-    scans = sum(int(s.report.get("scans", 0)) for s in submaps[resumed:])
-    time_metrics(out, seconds, log.duration, scans, [cost])
+    scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
+    time_metrics(out, seconds, log.duration, scans, work.per_scan)
     residuals = {}
     reckoned = dead_reckoning(log, global_map.trajectory.times)
     if gps is not None:
@@ -238,7 +258,7 @@ def _judge(
         **effective["run"],
         "versions": versions(),
         "seconds": seconds,
-        "resumed_submaps": resumed,
+        "resumed_submaps": work.resumed,
         "records_read": dict(log.read) or {k: len(s.times) for k, s in log.streams.items()},
         "records_dropped": {**log.dropped, **drops.counts},
         "source_meta": dict(log.meta),

@@ -221,12 +221,6 @@ def se3_right_jacobian(xi: ArrayLike) -> Array:
     return out
 
 
-def matrix_to_pose(M: ArrayLike) -> Array:
-    """Homogeneous matrices ``(..., 4, 4)`` or ``(..., 3, 4)`` → poses ``(..., 7)``."""
-    m = np.asarray(M, dtype=np.float64)
-    return np.concatenate([m[..., :3, 3], matrix_to_quat(m[..., :3, :3])], -1)
-
-
 def pose_to_matrix(T: ArrayLike) -> Array:
     """Poses ``(..., 7)`` → homogeneous matrices ``(..., 4, 4)``."""
     p = np.asarray(T, dtype=np.float64)

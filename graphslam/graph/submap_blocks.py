@@ -245,7 +245,7 @@ class SubmapProblem:
         entries += [(later - 1, i, later - 1, j) for i in (0, 1, 2) for j in (0, 1, 2)]
         pattern.place(entries)
         self.pattern = pattern
-        self._moved, self._later, self._first_pair = moved, later, first_pair
+        self._moved, self._first_pair = moved, first_pair
 
     # ---------------------------------------------------------------- values
 

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ import pytest
 
 from graphslam.app.worlds import simulate
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.joined_map import read_joined
 from graphslam.io.log_store import save_log
-from graphslam.io.tum import write_tum
+from graphslam.io.tum import read_tum, write_tum
 
 
 def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
@@ -72,7 +74,10 @@ def test_join_and_compare_print_the_documented_json(run_folder):
     (row,) = json.loads(done.stdout)["methods"]
     assert set(row) == keys
     assert row["objective_polished"] <= row["objective"]
-    assert (run_folder.parent / "joined" / "nodes.tum").is_file()
+    joined = read_joined(run_folder.parent / "joined")
+    assert len(joined["landmarks"]) == len(joined["landmark_ids"]) == row["landmarks"]
+    nodes = read_tum(run_folder.parent / "joined" / "nodes.tum", dim=2)
+    np.testing.assert_allclose(nodes.poses, joined["poses"], atol=1e-8)
     done = graphslam("compare", run_folder / "submaps", "--methods", "batch,eif-tree", "--no-memory", "--json")
     rows = json.loads(done.stdout)["methods"]
     assert [r["method"] for r in rows] == ["batch", "eif-tree"]
@@ -111,6 +116,10 @@ def test_doctor_finds_this_machine_in_order():
     states = {c["check"]: c["state"] for c in json.loads(done.stdout)["checks"]}
     assert states["gtsam"] == "ok"
     assert states["front ends"] == "ok"
+    if find_spec("open3d"):  # the extra is installed: it must import, also where the system has no libusb
+        assert states["open3d"] == "ok"
+    elif os.environ.get("CI"):
+        pytest.fail("CI installs the lidar extra, and Open3D is not there")
 
 
 def test_wrong_usage_exits_2():

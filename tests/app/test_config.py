@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -86,6 +87,19 @@ def test_presets_are_valid():
         run = cfg.build(cfg.RunConfig, cfg.preset(name))
         make_front_end("rbpf-ekf", run.frontend)
     assert cfg.preset("never-heard-of") == {}
+
+
+def test_every_file_that_is_no_code_ships_in_the_wheel():
+    """Presets, cards and py.typed: what package-data does not name is missing from an installed package, in silence."""
+    root = Path(__file__).resolve().parents[2]
+    globs = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folders = {name: root.joinpath(*name.split(".")) for name in globs} | {"graphslam.cards": root / "datasets"}
+    shipped = {p for name, patterns in globs.items() for g in patterns for p in folders[name].glob(g)}
+    there = {p for top in ("graphslam", "frontends") for p in (root / top).rglob("*") if p.is_file()}
+    there |= set((root / "datasets").glob("*.toml"))
+    data = {p for p in there if p.suffix != ".py" and "__pycache__" not in p.parts}
+    assert len(data) > 20
+    assert data <= shipped
 
 
 def test_broken_toml_is_refused(tmp_path):
