@@ -74,6 +74,21 @@ class SymmetricFactor:
             block[:, first : first + len(columns)] = self.solve(unit)[ix]
         return 0.5 * (block + block.T)
 
+    def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:
+        """Blocks ``(k, width, width)`` of ``A⁻¹`` on the diagonal that begin at ``first`` ``(k,)``."""
+        at = np.asarray(first, dtype=np.intp)
+        blocks = np.zeros((len(at), width, width))
+        some = max(1, _COLUMNS // width)
+        within = np.arange(width)
+        for k in range(0, len(at), some):
+            rows = at[k : k + some, None] + within
+            unit = np.zeros((self.shape[0], rows.size))
+            unit[rows.ravel(), np.arange(rows.size)] = 1.0
+            X = self.solve(unit).reshape(self.shape[0], len(rows), width)
+            B = X[rows, np.arange(len(rows))[:, None]]
+            blocks[k : k + some] = 0.5 * (B + B.swapaxes(1, 2))
+        return blocks
+
 
 def elimination_order(rows: Index, columns: Index, n: int) -> Index:
     """Minimum-degree order of a symmetric pattern, from its entries in either or both triangles.

@@ -12,6 +12,7 @@ noise that is correlated with it; given the known part, ``v_n = G v_o + w`` with
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,11 +29,13 @@ from graphslam.join.joined_map import (
     JoinedMap,
     JoinResult,
     JoinTimes,
+    OnJoin,
     check_chain,
     distinct_landmarks,
     finish,
     landmark_labels,
     landmark_scalars,
+    last_pose,
 )
 
 Index = npt.NDArray[np.intp]
@@ -44,7 +47,7 @@ class DenseMap:
     Parameters
     ----------
     first : LandmarkMap
-        Each landmark once.
+        Each landmark once; -1 where it is nobody's.
     entries : (n,)
         Which landmark each entry of the submap became.
     capacity : int
@@ -60,6 +63,7 @@ class DenseMap:
         self._n = n
         self.pose_at: Index = np.zeros(1, dtype=np.intp)
         self.landmark_at: Index = 3 + 2 * np.arange(len(first), dtype=np.intp)
+        self.ids: Ids = first.ids
         self.entries: tuple[Index, ...] = (entries,)
 
     @property
@@ -79,6 +83,19 @@ class DenseMap:
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices``."""
         return self._P[np.ix_(indices, indices)]
+
+    def pose(self) -> Array:
+        """Last end pose ``(3,)``."""
+        return last_pose(self)
+
+    def pose_covariance(self) -> Array:
+        """Covariance ``(3, 3)`` of the last end pose as a vector."""
+        return self.covariance_block(self.pose_at[-1] + np.arange(3))
+
+    def landmark_marginals(self) -> Array:
+        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        at = landmark_scalars(self.landmark_at)
+        return self._P[at[:, :, None], at[:, None, :]]
 
     def join(self, submap: LandmarkMap, entries: Index, match: Index) -> None:
         """One measurement update and one augmentation.
@@ -142,6 +159,7 @@ class DenseMap:
         self._append(x_new, F @ P[columns], F, columns, B.T @ Q_w @ B, len(new))
         place = np.where(match >= 0, match, len(self.landmark_at) - len(new) + np.cumsum(match < 0) - 1)
         self.entries = self.entries + (place[entries].astype(np.intp),)
+        self.ids = np.concatenate([self.ids, submap.ids[new]])
 
     def _append(self, x_new: Array, P_new_old: Array, F: Array, columns: Index, Q_new: Array, landmarks: int) -> None:
         n, k = self._n, len(x_new)
@@ -166,7 +184,11 @@ def _about_start(q: Array, Rt: Array) -> Array:
 
 
 def join_ekf(
-    submaps: Sequence[Submap], *, association: Association | None = None, progress: bool = False
+    submaps: Sequence[Submap],
+    *,
+    association: Association | None = None,
+    on_join: OnJoin | None = None,
+    progress: bool = False,
 ) -> JoinResult:
     """Join submaps one after the other with a dense extended Kalman filter.
 
@@ -175,6 +197,8 @@ def join_ekf(
     submaps : sequence of Submap
     association : Association, optional
         Recognise landmarks; default: by the ids they bear.
+    on_join : callable, optional
+        See :func:`~graphslam.join.order.join_sequential`.
     progress : bool
         Show a progress bar.
 
@@ -187,11 +211,12 @@ def join_ekf(
     times = JoinTimes()
     known: dict[int, int] = {}
     dense: DenseMap | None = None
-    ids: list[Ids] = []
     capacity = sum(3 + 2 * len(landmark_map_of(s)) for s in submaps) if not identified else _scalars(submaps)
-    for submap in tqdm(submaps, desc="join", unit="submap", disable=not progress):
+    for k, submap in enumerate(tqdm(submaps, desc="join", unit="submap", disable=not progress)):
         with times.measure("update"):
             fused, entries = distinct_landmarks(submap, identified=identified)
+            if not identified:
+                fused = replace(fused, ids=np.full(len(fused), -1, dtype=np.int64))
         with times.measure("association"):
             if dense is None:
                 match = np.full(len(fused), -1, dtype=np.intp)
@@ -200,16 +225,18 @@ def join_ekf(
             else:
                 leaf = JoinedMap.leaf(submap, identified=False)
                 match = associate(dense, leaf, association)
-            for j in fused.ids[match < 0]:
-                known.setdefault(int(j), len(known))
-            ids.append(fused.ids[match < 0])
+            if identified:
+                for j in fused.ids[match < 0]:
+                    known.setdefault(int(j), len(known))
         with times.measure("update"):
             if dense is None:
                 dense = DenseMap(fused, entries, capacity)
             else:
                 dense.join(fused, entries, match)
+        if on_join is not None:
+            on_join(k, dense)
     assert dense is not None
-    labels = landmark_labels(dense, np.concatenate(ids), identified=identified)
+    labels = landmark_labels(dense, dense.ids, identified=identified)
     return finish(submaps, dense, labels, method="ekf", times=times, covariance=dense.covariance)
 
 

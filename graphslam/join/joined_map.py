@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -52,20 +52,46 @@ class JoinTimes:
 
 
 class MapView(Protocol):
-    """What association needs of a map, in information or in covariance form.
+    """What association and scoring need of a map, in information or in covariance form.
 
-    The state ``x`` is in the frame of the map's first base. ``pose_at`` ``(m,)`` and ``landmark_at`` ``(L,)`` say where
-    each end pose and landmark begins in it. ``entries[k]`` says which landmark each entry of submap k became.
+    The state ``x`` ``(n,)`` is in the frame of the map's first base, headings not wrapped. ``pose_at`` ``(m,)`` and
+    ``landmark_at`` ``(L,)`` say where each end pose (x, y, θ) and landmark (x, y) begins in it; landmarks stand in the
+    order of first sighting. ``ids`` ``(L,)`` int64 are the ids they were joined by, -1 where they were recognised
+    instead. ``entries[k]`` ``(n_k,)`` says which landmark each entry of submap k became.
     """
 
     x: Array
     pose_at: Index
     landmark_at: Index
+    ids: Ids
     entries: tuple[Index, ...]
 
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` of ``x``."""
         ...
+
+    def pose(self) -> Array:
+        """Last end pose ``(3,)`` as a vector (x, y, θ), heading in [-π, π)."""
+        ...
+
+    def pose_covariance(self) -> Array:
+        """Covariance ``(3, 3)`` of the last end pose as a vector (not a right tangent)."""
+        ...
+
+    def landmark_marginals(self) -> Array:
+        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        ...
+
+
+OnJoin = Callable[[int, MapView], None]
+"""Called with k and the map once submap k (from 0) is in. The view is valid during the call only."""
+
+
+def last_pose(view: MapView) -> Array:
+    """Last end pose ``(3,)`` of a map, heading in [-π, π)."""
+    pose = view.x[view.pose_at[-1] : view.pose_at[-1] + 3].copy()
+    pose[2] = wrap_angle(pose[2])
+    return pose
 
 
 def pose_scalars(at: Index) -> Index:
@@ -145,6 +171,18 @@ class JoinedMap:
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` by sparse solves (Algorithm 1)."""
         return self.factor().inverse_block(indices)
+
+    def pose(self) -> Array:
+        """Last end pose ``(3,)``."""
+        return last_pose(self)
+
+    def pose_covariance(self) -> Array:
+        """Covariance ``(3, 3)`` of the last end pose as a vector."""
+        return self.covariance_block(self.pose_at[-1] + np.arange(3))
+
+    def landmark_marginals(self) -> Array:
+        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        return self.factor().inverse_diagonal_blocks(self.landmark_at, 2)
 
     def reordered(self) -> JoinedMap:
         """The same map in a fresh elimination order; the scalars of a pose or landmark stay together."""

@@ -9,7 +9,15 @@ from tqdm.auto import tqdm
 from graphslam.core.submap import Submap
 from graphslam.join.association import Association, associate
 from graphslam.join.eif import join_maps, match_by_id
-from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, check_chain, finish, landmark_labels
+from graphslam.join.joined_map import (
+    JoinedMap,
+    JoinResult,
+    JoinTimes,
+    OnJoin,
+    check_chain,
+    finish,
+    landmark_labels,
+)
 
 
 def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
@@ -19,7 +27,11 @@ def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: Jo
 
 
 def join_sequential(
-    submaps: Sequence[Submap], *, association: Association | None = None, progress: bool = False
+    submaps: Sequence[Submap],
+    *,
+    association: Association | None = None,
+    on_join: OnJoin | None = None,
+    progress: bool = False,
 ) -> JoinResult:
     """Join submaps one after the other: every submap is a measurement of the map so far.
 
@@ -28,6 +40,9 @@ def join_sequential(
     submaps : sequence of Submap
     association : Association, optional
         Recognise landmarks; default: by the ids they bear.
+    on_join : callable, optional
+        ``on_join(k, view)`` is called after submap k (from 0, the first included) is in, outside the clock; the
+        :class:`~graphslam.join.joined_map.MapView` is valid during the call only.
     progress : bool
         Show a progress bar.
 
@@ -40,10 +55,14 @@ def join_sequential(
     times = JoinTimes()
     with times.measure("update"):
         joined = JoinedMap.leaf(submaps[0], identified=identified)
-    for submap in tqdm(submaps[1:], desc="join", unit="submap", disable=not progress):
+    if on_join is not None:
+        on_join(0, joined)
+    for k, submap in enumerate(tqdm(submaps[1:], desc="join", unit="submap", disable=not progress), start=1):
         with times.measure("update"):
             leaf = JoinedMap.leaf(submap, identified=identified)
         joined = _join(joined, leaf, association, times)
+        if on_join is not None:
+            on_join(k, joined)
     labels = landmark_labels(joined, joined.ids, identified=identified)
     return finish(submaps, joined, labels, method="eif-sequential", times=times, information=joined.information)
 
