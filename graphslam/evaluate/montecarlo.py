@@ -33,12 +33,15 @@ class Measurement:
     value : float
     submap : int
         Submap (or step) the figure belongs to; -1 for a figure of the whole run.
+    timing : bool
+        A measured time: never the same twice, so it goes to a table of its own and the other one stays reproducible.
     """
 
     algorithm: str
     quantity: str
     value: float
     submap: int = -1
+    timing: bool = False
 
 
 Trial = Callable[[int], Iterable[Measurement]]

@@ -1,0 +1,8 @@
+"""Registered studies, looked up lazily: a name, and the ``module:object`` that defines it."""
+
+from __future__ import annotations
+
+STUDIES: dict[str, str] = {
+    "combined-slam": "graphslam.app.studies.combined_slam:STUDY",
+    "association-ambiguity": "graphslam.app.studies.association_ambiguity:STUDY",
+}
