@@ -52,6 +52,13 @@ class StoppingConfig:
     """End after this many scans (a vehicle that stands still gathers no distance)."""
     min_scans: int = 20
     """No criterion counts before this many scans."""
+    scans: int = 0
+    """With a number: the submap ends after exactly this many scans and nothing else counts, so that every algorithm
+    of a study cuts the log at the same places; 0 = off."""
+
+    def __post_init__(self) -> None:
+        if self.scans < 0:
+            raise ConfigError(f"stopping.scans = {self.scans}; wanted ≥ 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -130,6 +130,11 @@ class ParticleSet:
         """Number of distinct particles of the submap's start that still have descendants."""
         return len(np.unique(self.ancestor))
 
+    @property
+    def confirmed(self) -> int:
+        """Number of features of the standard particle that are no longer provisional."""
+        return int(np.count_nonzero(self.hits[self.best] >= self.config.confirm_hits))
+
     def pose_std(self) -> Array:
         """Weighted standard deviation of x, y, θ over the particles ``(3,)``."""
         d = self.pose - self.pose[self.best]

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from frontends.detectors.trees import detect_trees
 from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.filter import ParticleSet
+from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
 from frontends.landmarks.stopping import Stopping
 from frontends.landmarks.summarise import Association, Smoothed, moment_matched, smooth, winning_association
-from frontends.motion import steering_odometry
-from graphslam.core.errors import CovarianceError, MissingDataError
+from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 
@@ -28,24 +27,10 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
-    """A log made ready for the filter: observations that count, increments between scans, names of the streams used."""
-
-    observations: LandmarkObservations
-    original: Ints  # index of each observation in the stream before the unused ones were dropped
-    rows: Array  # (q, 4) range, bearing, filter variances
-    smoothing_variances: Array  # (q, 2)
-    odometry: Odometry
-    t_start: float
-    uses: frozenset[str]
-
-
-@dataclass(frozen=True, slots=True)
 class RbpfEkf:
     """The front end ``rbpf-ekf``.
 
-    Needs a stream of :class:`SteeringControls` and one of :class:`LandmarkObservations` or, with the tree detector,
-    of :class:`LaserScans`.
+    Needs a stream of controls and one of landmark observations or, with the tree detector, of laser scans.
     """
 
     config: RbpfEkfConfig = field(default_factory=RbpfEkfConfig)
@@ -55,7 +40,7 @@ class RbpfEkf:
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`."""
-        prepared = self.prepare(log, drops if drops is not None else DropCounter())
+        prepared = prepare(log, self.config, drops if drops is not None else DropCounter())
         times = prepared.observations.times
         if after is None:
             key, scan, t_start = 0, 0, prepared.t_start
@@ -74,62 +59,7 @@ class RbpfEkf:
         ------
         MissingDataError
         """
-        stream = log.of_type(LandmarkObservations)
-        if stream is not None:
-            return stream, log[stream]
-        stream = log.of_type(LaserScans)
-        if stream is None:
-            raise MissingDataError("no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans")
-        return stream, detect_trees(log[stream], self.config.detector)
-
-    def prepare(self, log: SensorLog, drops: DropCounter) -> Prepared:
-        """Detect, drop what cannot be used (counted), and integrate the controls between scans."""
-        c = self.config
-        controls_name = log.of_type(SteeringControls)
-        if controls_name is None:
-            raise MissingDataError(
-                "no speed and steering to dead-reckon from", where=log.name, wanted="SteeringControls"
-            )
-        controls: SteeringControls = log[controls_name]
-        stream = log.of_type(LandmarkObservations)
-        if stream is not None:
-            observations: LandmarkObservations = log[stream]
-        else:
-            stream = log.of_type(LaserScans)
-            if stream is None:
-                raise MissingDataError(
-                    "no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans"
-                )
-            observations = detect_trees(log[stream], c.detector)
-        early = int(np.searchsorted(observations.times, controls.times[0] - c.control_hold, side="left"))
-        if early:
-            drops.drop(stream, "before the first control", early)
-        scans = observations.take(slice(early, None))
-        first_row = int(observations.offsets[early])
-        usable = scans.ranges <= c.max_range
-        drops.drop(stream, f"observations beyond {c.max_range:g} m", int((~usable).sum()))
-        if c.association == "known":
-            if scans.ids is None:
-                raise MissingDataError("known association needs identities", where=f"{log.name}/{stream}", wanted="ids")
-            unknown = usable & (scans.ids < 0)
-            drops.drop(stream, "observations without identity", int(unknown.sum()))
-            usable &= ~unknown
-        scans, kept = _only(scans, usable)
-        if len(scans.times) == 0:
-            raise MissingDataError("no scan to work on", where=f"{log.name}/{stream}")
-        own = scans.sigmas**2
-        filter_var = own if c.noise is None else c.noise.variances(scans.ranges)
-        smooth_var = filter_var if c.smoothing_noise is None else c.smoothing_noise.variances(scans.ranges)
-        t_start = float(min(controls.times[0], scans.times[0]))
-        controls = replace(controls, times=np.concatenate([[t_start], controls.times[1:]]))  # held backwards
-        stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
-        odometry = steering_odometry(controls, stamps, c.motion)
-        if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
-            odometry = odometry.take(slice(1, None))
-        rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
-        return Prepared(
-            scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({controls_name, stream})
-        )
+        return landmark_stream(log, self.config.detector)
 
     def _build(self, data: Prepared, key: int, first: int, t_start: float, seed: SeedTree) -> tuple[Submap, int]:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
@@ -138,13 +68,13 @@ class RbpfEkf:
         particles = ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, seed.generator())
         mean_var = data.rows[:, 2:].mean(axis=0) if len(data.rows) else np.ones(2)
         epsilon = np.sqrt([mean_var[0], mean_var[0], mean_var[1]])
-        stopping = Stopping(c.stopping, c.confirm_hits, epsilon)
+        stopping = Stopping(c.stopping, epsilon)
         slots: dict[int, int] = {}
         ended, scan = None, first
         previous = t_start
         while ended is None and scan < len(obs.times):
             rows = obs.scan(scan)
-            known = self._known_slots(obs, rows, slots)
+            known = self._known(obs, rows, slots)
             u, Q = data.odometry.increments[scan], data.odometry.covariances[scan]
             particles.step(u, Q, data.rows[rows], known)
             ended = stopping.reason(particles, float(obs.times[scan]) - previous, u, rows.stop - rows.start)
@@ -153,12 +83,11 @@ class RbpfEkf:
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
         return self._summarise(data, particles, key, first, scan, t_start, slots, report), scan
 
-    def _known_slots(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
-        """Slot of every observation in known-association mode (first sighting opens one), else -1."""
-        n = rows.stop - rows.start
-        if self.config.association != "known" or obs.ids is None:
-            return np.full(n, -1, dtype=np.int64)
-        return np.array([slots.setdefault(int(i), len(slots)) for i in obs.ids[rows]], dtype=np.int64)
+    def _known(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
+        """Slot of every observation in known-association mode, else -1."""
+        if self.config.association != "known":
+            return np.full(rows.stop - rows.start, -1, dtype=np.int64)
+        return known_slots(obs, rows, slots)
 
     def _summarise(
         self,
@@ -241,21 +170,6 @@ class RbpfEkf:
             uses=data.uses,
             report=report,
         )
-
-
-def _only(scans: LandmarkObservations, keep: npt.NDArray[np.bool_]) -> tuple[LandmarkObservations, Ints]:
-    """The observations ``keep`` (all scans stay) and their indices."""
-    rows = np.flatnonzero(keep)
-    before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
-    cut = replace(
-        scans,
-        offsets=before[scans.offsets],
-        ranges=scans.ranges[rows],
-        bearings=scans.bearings[rows],
-        sigmas=scans.sigmas[rows],
-        ids=None if scans.ids is None else scans.ids[rows],
-    )
-    return cut, rows.astype(np.int64)
 
 
 def _paper_gaussian(

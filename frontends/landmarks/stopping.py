@@ -2,11 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from frontends.landmarks.config import StoppingConfig
-from frontends.landmarks.filter import ParticleSet
 from graphslam.core.geometry import Array
+
+
+class GrowingMap(Protocol):
+    """What a filter tells of itself while it builds a submap."""
+
+    @property
+    def scans(self) -> int:
+        """Scans taken in so far."""
+
+    @property
+    def confirmed(self) -> int:
+        """Features that are no longer provisional (of the standard particle, where there are several)."""
+
+    @property
+    def resamplings(self) -> int:
+        """Resamplings so far; 0 for a filter without particles."""
+
+    @property
+    def ancestors(self) -> int | None:
+        """Distinct first particles that still have descendants; None for a filter without particles."""
+
+    def pose_std(self) -> Array:
+        """Standard deviation of x, y [m] and heading [rad], ``(3,)``."""
 
 
 class Stopping:
@@ -15,22 +39,22 @@ class Stopping:
     Parameters
     ----------
     config : StoppingConfig
-    confirm_hits : int
-        Sightings that make a feature count.
     measurement_sigma : (3,)
         ε: mean measurement noise as x, y [m] and heading [rad].
     """
 
-    def __init__(self, config: StoppingConfig, confirm_hits: int, measurement_sigma: Array) -> None:
-        self.config, self.confirm_hits, self.epsilon = config, confirm_hits, measurement_sigma
+    def __init__(self, config: StoppingConfig, measurement_sigma: Array) -> None:
+        self.config, self.epsilon = config, measurement_sigma
         self.without_features = 0.0
         self.distance = 0.0
 
-    def reason(self, particles: ParticleSet, dt: float, u: Array, n_obs: int) -> str | None:
+    def reason(self, growing: GrowingMap, dt: float, u: Array, n_obs: int) -> str | None:
         """Why the submap ends after this scan, or None.
 
         Parameters
         ----------
+        growing : GrowingMap
+            The filter, after the scan.
         dt : float
             Seconds since the last scan.
         u : (3,)
@@ -41,21 +65,27 @@ class Stopping:
         c = self.config
         self.distance += float(np.hypot(u[0], u[1]))
         self.without_features = 0.0 if n_obs else self.without_features + dt
-        if particles.scans < c.min_scans:
+        if c.scans:
+            return "scans" if growing.scans >= c.scans else None
+        if growing.scans < c.min_scans:
             return None
         if self.without_features > 0.0:
             # (i) TIME = TIME_max · min(1, ε_x/σ_x, ε_y/σ_y, ε_θ/σ_θ)
-            sigma = np.maximum(particles.pose_std(), 1e-12)
+            sigma = np.maximum(growing.pose_std(), 1e-12)
             if self.without_features > c.time_max * min(1.0, float(np.min(self.epsilon / sigma))):
                 return "no-features"
-        # (ii) diversity
-        if c.max_resamplings and particles.resamplings >= c.max_resamplings:
-            return "diversity"
-        if c.min_ancestors and particles.ancestors <= c.min_ancestors < particles.config.particles:
+        # (ii) diversity: only resampling can lose it
+        if growing.resamplings > 0 and self._diversity_lost(growing):
             return "diversity"
         # (iii) enough features in the standard particle
-        if int(np.count_nonzero(particles.hits[particles.best] >= self.confirm_hits)) >= c.num_features:
+        if growing.confirmed >= c.num_features:
             return "features"
         if self.distance >= c.max_distance:
             return "distance"
-        return "scans" if particles.scans >= c.max_scans else None
+        return "scans" if growing.scans >= c.max_scans else None
+
+    def _diversity_lost(self, growing: GrowingMap) -> bool:
+        c = self.config
+        if c.max_resamplings and growing.resamplings >= c.max_resamplings:
+            return True
+        return bool(c.min_ancestors and growing.ancestors is not None and growing.ancestors <= c.min_ancestors)

@@ -13,6 +13,7 @@ from frontends.landmarks.rbpf_ekf import RbpfEkf
 from frontends.landmarks.stopping import Stopping
 from frontends.landmarks.summarise import common_features, moment_matched, winning_association
 from graphslam.app.worlds import simulate
+from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
@@ -86,7 +87,7 @@ def test_moment_matching_equals_the_moments_of_a_large_sample(inflate):
 
 
 def stopping(**config):
-    return Stopping(StoppingConfig(min_scans=1, **config), 3, np.array([0.5, 0.5, 0.1]))
+    return Stopping(StoppingConfig(min_scans=1, **config), np.array([0.5, 0.5, 0.1]))
 
 
 def test_each_criterion_names_itself():
@@ -102,7 +103,33 @@ def test_each_criterion_names_itself():
     assert stopping(min_ancestors=1).reason(p, 0.2, u, 1) == "diversity"
     assert stopping(max_distance=0.9).reason(p, 0.2, u, 1) == "distance"
     assert stopping(max_scans=5).reason(p, 0.2, u, 1) == "scans"
-    assert Stopping(StoppingConfig(min_scans=6, max_scans=5), 3, np.ones(3)).reason(p, 0.2, u, 1) is None
+    assert Stopping(StoppingConfig(min_scans=6, max_scans=5), np.ones(3)).reason(p, 0.2, u, 1) is None
+
+
+def test_a_fixed_number_of_scans_overrules_every_other_criterion():
+    p = particle_set()
+    p.hits[0, :9] = 3
+    p.resamplings, p.ancestor[:] = 9, 0
+    everything = {"num_features": 1, "max_resamplings": 1, "min_ancestors": 3, "max_distance": 0.1, "max_scans": 1}
+    s = Stopping(StoppingConfig(min_scans=1, scans=4, **everything), np.ones(3))
+    reasons = []
+    for p.scans in range(1, 5):
+        reasons.append(s.reason(p, 100.0, np.ones(3), 0))
+    assert reasons == [None, None, None, "scans"]
+    with pytest.raises(ConfigError, match="scans"):
+        StoppingConfig(scans=-1)
+
+
+def test_a_filter_without_particles_can_be_watched():
+    class Plain:
+        scans, confirmed, resamplings, ancestors = 3, 5, 0, None
+
+        def pose_std(self):
+            return np.ones(3)
+
+    u = np.array([1.0, 0.0, 0.0])
+    assert stopping(min_ancestors=3, max_resamplings=1, num_features=6).reason(Plain(), 0.2, u, 1) is None
+    assert stopping(num_features=5).reason(Plain(), 0.2, u, 1) == "features"
 
 
 def test_time_without_features_shrinks_with_pose_uncertainty():

@@ -1,0 +1,189 @@
+"""A log made ready for a landmark filter: which observations count, their variances, and the motion between scans.
+
+Every landmark front end starts here, so that all of them work on the same observations and the same increments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.detectors.trees import TreeDetectorConfig, detect_trees
+from frontends.landmarks.config import RangeBearingNoise
+from frontends.motion import MotionNoise, steering_odometry
+from graphslam.core.errors import MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, SteeringControls
+
+Ints = npt.NDArray[np.int64]
+
+
+class PrepareConfig(Protocol):
+    """What :func:`prepare` reads of a front end's configuration."""
+
+    @property
+    def association(self) -> str:
+        """``known`` uses the identities in the log and nothing without one; any other word ignores them."""
+
+    @property
+    def max_range(self) -> float:
+        """Observations beyond are not used [m]."""
+
+    @property
+    def control_hold(self) -> float:
+        """Scans up to this long before the first control are used, with that control held backwards [s]."""
+
+    @property
+    def motion(self) -> MotionNoise:
+        """Noise of the dead-reckoning increments."""
+
+    @property
+    def noise(self) -> RangeBearingNoise | None:
+        """Observation noise in the filter; None: the log's sigmas."""
+
+    @property
+    def smoothing_noise(self) -> RangeBearingNoise | None:
+        """Observation noise in the smoothing; None: as in the filter."""
+
+    @property
+    def detector(self) -> TreeDetectorConfig:
+        """Used where the log holds raw scans."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A log made ready for a filter.
+
+    Parameters
+    ----------
+    observations : LandmarkObservations
+        Those that count; all scans stay, also empty ones.
+    original : (q,) int64
+        Index of each observation in the log's stream, before the unused ones were dropped.
+    rows : (q, 4)
+        Range, bearing, and their variances in the filter.
+    smoothing_variances : (q, 2)
+        Variances of range and bearing in the smoothing.
+    odometry : Odometry
+        Record k is the motion into scan k (the first from ``t_start``).
+    t_start : float
+        Stamp of the first base [s].
+    uses : frozenset of str
+        Names of the streams worked on.
+    """
+
+    observations: LandmarkObservations
+    original: Ints
+    rows: Array
+    smoothing_variances: Array
+    odometry: Odometry
+    t_start: float
+    uses: frozenset[str]
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.observations.times)
+
+
+def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, LandmarkObservations]:
+    """Name of the stream to work on, and the landmark observations in it (detected, where it holds raw scans).
+
+    Raises
+    ------
+    MissingDataError
+        If the log has neither landmark observations nor laser scans.
+    """
+    stream = log.of_type(LandmarkObservations)
+    if stream is not None:
+        return stream, log[stream]
+    stream = log.of_type(LaserScans)
+    if stream is None:
+        raise MissingDataError("no landmarks to map", where=log.name, wanted="LandmarkObservations or LaserScans")
+    return stream, detect_trees(log[stream], detector)
+
+
+def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepared:
+    """Detect, drop what cannot be used (counted), and integrate the motion between scans.
+
+    Parameters
+    ----------
+    log : SensorLog
+        With a stream of controls and one of landmark observations or laser scans.
+    config : PrepareConfig
+    drops : DropCounter
+        Where scans and observations that are not used are counted.
+
+    Raises
+    ------
+    MissingDataError
+        If a stream is missing, identities are asked for and not there, or no scan is left.
+    """
+    controls_name = log.of_type(SteeringControls)
+    if controls_name is None:
+        raise MissingDataError("no speed and steering to dead-reckon from", where=log.name, wanted="SteeringControls")
+    controls: SteeringControls = log[controls_name]
+    stream, observations = landmark_stream(log, config.detector)
+    early = int(np.searchsorted(observations.times, controls.times[0] - config.control_hold, side="left"))
+    if early:
+        drops.drop(stream, "before the first control", early)
+    scans = observations.take(slice(early, None))
+    first_row = int(observations.offsets[early])
+    usable = scans.ranges <= config.max_range
+    drops.drop(stream, f"observations beyond {config.max_range:g} m", int((~usable).sum()))
+    if config.association == "known":
+        if scans.ids is None:
+            raise MissingDataError("known association needs identities", where=f"{log.name}/{stream}", wanted="ids")
+        unknown = usable & (scans.ids < 0)
+        drops.drop(stream, "observations without identity", int(unknown.sum()))
+        usable &= ~unknown
+    scans, kept = _only(scans, usable)
+    if len(scans.times) == 0:
+        raise MissingDataError("no scan to work on", where=f"{log.name}/{stream}")
+    own = scans.sigmas**2
+    filter_var = own if config.noise is None else config.noise.variances(scans.ranges)
+    smooth_var = filter_var if config.smoothing_noise is None else config.smoothing_noise.variances(scans.ranges)
+    t_start = float(min(controls.times[0], scans.times[0]))
+    controls = replace(controls, times=np.concatenate([[t_start], controls.times[1:]]))  # held backwards
+    stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
+    odometry = steering_odometry(controls, stamps, config.motion)
+    if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
+        odometry = odometry.take(slice(1, None))
+    rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
+    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({controls_name, stream}))
+
+
+def known_slots(observations: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
+    """Slot of every observation ``rows`` by its identity; the first sighting of an identity opens the next slot.
+
+    Parameters
+    ----------
+    observations : LandmarkObservations
+        With identities.
+    slots : dict
+        Identity to slot; grows.
+
+    Returns
+    -------
+    (k,) int64
+    """
+    assert observations.ids is not None
+    return np.array([slots.setdefault(int(i), len(slots)) for i in observations.ids[rows]], dtype=np.int64)
+
+
+def _only(scans: LandmarkObservations, keep: npt.NDArray[np.bool_]) -> tuple[LandmarkObservations, Ints]:
+    """The observations ``keep`` (all scans stay) and their indices."""
+    rows = np.flatnonzero(keep)
+    before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
+    cut = replace(
+        scans,
+        offsets=before[scans.offsets],
+        ranges=scans.ranges[rows],
+        bearings=scans.bearings[rows],
+        sigmas=scans.sigmas[rows],
+        ids=None if scans.ids is None else scans.ids[rows],
+    )
+    return cut, rows.astype(np.int64)
