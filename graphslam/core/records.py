@@ -230,7 +230,7 @@ class Gps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkObservations:
-    """Range-bearing observations of point landmarks, several per scan (ragged).
+    """Range-bearing or range-only observations of point landmarks, several per scan (ragged).
 
     Parameters
     ----------
@@ -239,9 +239,10 @@ class LandmarkObservations:
     offsets : (n + 1,) int64
         Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
     ranges, bearings : (q,)
-        Metres, radians in the sensor frame.
+        Metres, radians in the sensor frame; the bearing of a range-only observation is 0.
     sigmas : (q, 2)
-        Standard deviations of range [m] and bearing [rad].
+        Standard deviations of range [m] and bearing [rad]; a bearing σ of ``inf`` says that the observation carries no
+        bearing (:meth:`range_only` builds such a stream).
     ids : (q,) int64 or None
         Known identity; -1 where unknown; None if the sensor gives none.
     max_range : float
@@ -270,7 +271,16 @@ class LandmarkObservations:
             )
         object.__setattr__(self, "offsets", offsets)
         for name, shape in (("ranges", (q,)), ("bearings", (q,)), ("sigmas", (q, 2))):
-            object.__setattr__(self, name, _finite(_array(getattr(self, name), shape, name), name))
+            object.__setattr__(self, name, _array(getattr(self, name), shape, name))
+        blind = np.isposinf(self.sigmas[:, 1])
+        _finite(self.ranges, "ranges")
+        _finite(self.bearings, "bearings")
+        _finite(np.where(blind[:, None], self.sigmas[:, :1], self.sigmas), "sigmas")
+        if np.any(blind & (self.bearings != 0.0)):
+            k = int(np.flatnonzero(blind & (self.bearings != 0.0))[0])
+            raise DataError(
+                f"observation {k} has a bearing and infinite σ of it", got=self.bearings[k], wanted="0 where σ is inf"
+            )
         if q and np.any(self.sigmas <= 0):
             k = int(np.argwhere(self.sigmas <= 0)[0][0])
             raise DataError(f"sigma of observation {k} is not positive", got=self.sigmas[k], wanted="> 0")
@@ -299,3 +309,34 @@ class LandmarkObservations:
             sigmas=self.sigmas[r],
             ids=None if self.ids is None else self.ids[r],
         )
+    @classmethod
+    def range_only(
+        cls,
+        *,
+        times: Array,
+        offsets: npt.NDArray[np.int64],
+        ranges: Array,
+        range_sigma: npt.ArrayLike,
+        ids: npt.NDArray[np.int64] | None = None,
+        **rest: Any,
+    ) -> LandmarkObservations:
+        """Observations without bearings: bearing 0 with infinite σ.
+
+        Parameters
+        ----------
+        times, offsets, ranges, ids
+            As in the class.
+        range_sigma : float or (q,)
+            σ of each range [m].
+        **rest
+            Further fields of the class.
+        """
+        q = len(ranges)
+        sigmas = np.column_stack([np.broadcast_to(np.asarray(range_sigma, dtype=np.float64), q), np.full(q, np.inf)])
+        return cls(times=times, offsets=offsets, ranges=ranges, bearings=np.zeros(q), sigmas=sigmas, ids=ids, **rest)
+
+    @property
+    def has_bearing(self) -> npt.NDArray[np.bool_]:
+        """Which observations carry a bearing ``(q,)``."""
+        return np.asarray(np.isfinite(self.sigmas[:, 1]))
+
