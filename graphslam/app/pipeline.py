@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from frontends.motion import MotionNoise, steering_odometry
+from frontends import motion
 from graphslam.app import config as cfg
 from graphslam.app.audit import audit_association
 from graphslam.app.back_end import BackEnd
@@ -39,7 +39,7 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.core.records import Gps, SteeringControls
+from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.catalog import load
@@ -303,14 +303,16 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
 
 
 def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
-    """Path from the controls alone, in the frame of the first base."""
-    name = log.of_type(SteeringControls)
-    if name is None:
+    """Path from the log's motion stream alone, in the frame of the first base; None without one."""
+    try:
+        stream = motion.motion_stream(log)[1]
+    except MissingDataError:
         return None
-    times = times[times >= log[name].times[0]]
+    last = stream.times[-1] if isinstance(stream, Odometry) else np.inf  # the last control is held
+    times = times[(times >= stream.times[0]) & (times <= last)]
     if len(times) < 2:
         return None
-    steps = steering_odometry(log[name], times, MotionNoise(speed=0.0, steering=0.0)).increments
+    steps = motion.dead_reckoning(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[0].increments
     poses = np.zeros_like(steps)
     for k in range(1, len(steps)):
         poses[k] = se2_compose(poses[k - 1], steps[k])

@@ -163,6 +163,37 @@ class SteeringControls:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityControls:
+    """Speed and yaw rate of a base that moves along its own x axis, held from each stamp to the next (zero-order hold).
+
+    Commanded or measured; without a covariance of its own, as :class:`SteeringControls`: the noise belongs to the
+    front end's motion model.
+
+    Parameters
+    ----------
+    times : (n,)
+    speed : (n,)
+        Along x of the base [m/s], negative backwards.
+    yaw_rate : (n,)
+        [rad/s], positive counter-clockwise.
+    """
+
+    times: Array
+    speed: Array
+    yaw_rate: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        n = len(self.times)
+        for name in ("speed", "yaw_rate"):
+            object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
+
+    def take(self, index: Any) -> VelocityControls:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], speed=self.speed[index], yaw_rate=self.yaw_rate[index])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Odometry:
     """Motion between stamps: record k is ``T_body(k-1)_body(k)``; record 0 is identity.
 
@@ -290,25 +321,6 @@ class LandmarkObservations:
                 raise DataError("ids and observations differ in number", got=self.ids.shape, wanted=f"({q},)")
         object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
 
-    def scan(self, k: int) -> slice:
-        """Rows of scan k."""
-        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
-
-    def take(self, index: Any) -> LandmarkObservations:
-        """See :class:`Stream`."""
-        keep = np.arange(len(self.times))[index]
-        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
-        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
-        return replace(
-            self,
-            times=self.times[keep],
-            offsets=offsets,
-            ranges=self.ranges[r],
-            bearings=self.bearings[r],
-            sigmas=self.sigmas[r],
-            ids=None if self.ids is None else self.ids[r],
-        )
     @classmethod
     def range_only(
         cls,
@@ -340,3 +352,22 @@ class LandmarkObservations:
         """Which observations carry a bearing ``(q,)``."""
         return np.asarray(np.isfinite(self.sigmas[:, 1]))
 
+    def scan(self, k: int) -> slice:
+        """Rows of scan k."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def take(self, index: Any) -> LandmarkObservations:
+        """See :class:`Stream`."""
+        keep = np.arange(len(self.times))[index]
+        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
+        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
+        return replace(
+            self,
+            times=self.times[keep],
+            offsets=offsets,
+            ranges=self.ranges[r],
+            bearings=self.bearings[r],
+            sigmas=self.sigmas[r],
+            ids=None if self.ids is None else self.ids[r],
+        )

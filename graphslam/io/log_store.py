@@ -17,7 +17,15 @@ import numpy as np
 
 from graphslam.core.errors import DataError, FormatError, GraphSlamError
 from graphslam.core.log import SensorLog, Truth
-from graphslam.core.records import AckermannGeometry, Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.records import (
+    AckermannGeometry,
+    Gps,
+    LandmarkObservations,
+    LaserScans,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+)
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.atomic import read_json, read_npz, write_json, write_npz
 
@@ -33,6 +41,7 @@ Arrays = Mapping[str, Any]
 _FIELDS: dict[str, tuple[type, tuple[str, ...]]] = {
     "laser-scans": (LaserScans, ("times", "ranges", "bearings", "T_base_sensor")),
     "steering-controls": (SteeringControls, ("times", "speed", "steering")),
+    "velocity-controls": (VelocityControls, ("times", "speed", "yaw_rate")),
     "odometry": (Odometry, ("times", "increments", "covariances")),
     "gps": (Gps, ("times", "positions", "sigma", "lever")),
     "landmark-observations": (

@@ -16,6 +16,7 @@ from graphslam.core.records import (
     LaserScans,
     Odometry,
     SteeringControls,
+    VelocityControls,
     check_times,
 )
 from graphslam.core.trajectory import Trajectory
@@ -36,6 +37,11 @@ def laser(**changes: Any) -> LaserScans:
 def controls(**changes: Any) -> SteeringControls:
     values: dict[str, Any] = {"times": [0.0, 1.0], "speed": [1.0, 1.0], "steering": [0.0, 0.1], "geometry": CAR}
     return SteeringControls(**{**values, **changes})
+
+
+def velocities(**changes: Any) -> VelocityControls:
+    values: dict[str, Any] = {"times": [0.0, 1.0], "speed": [1.0, 1.0], "yaw_rate": [0.0, 0.1]}
+    return VelocityControls(**{**values, **changes})
 
 
 def gps(**changes: Any) -> Gps:
@@ -64,7 +70,7 @@ def landmarks(**changes: Any) -> LandmarkObservations:
     return LandmarkObservations(**{**values, **changes})
 
 
-MAKERS = [laser, controls, gps, odometry, landmarks]
+MAKERS = [laser, controls, velocities, gps, odometry, landmarks]
 
 
 @pytest.mark.parametrize("make", MAKERS)
@@ -92,6 +98,7 @@ def test_bad_stamps_are_refused(make: Any, spoil: Any, what: str) -> None:
         (laser, {"times": [0.0, 1.0]}, "wrong shape"),
         (laser, {"T_base_sensor": [0.0, 0.0]}, "T_base_sensor"),
         (controls, {"speed": [1.0, np.nan]}, "speed of record 1 is not finite"),
+        (velocities, {"yaw_rate": [np.inf, 0.0]}, "yaw_rate of record 0 is not finite"),
         (controls, {"steering": [np.inf, 0.0]}, "steering of record 0 is not finite"),
         (controls, {"steering": [0.0]}, "steering has the wrong shape"),
         (gps, {"sigma": [1.0, 0.0]}, "sigma of record 1 is not positive"),

@@ -12,7 +12,15 @@ import pytest
 
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.log import SensorLog, Truth
-from graphslam.core.records import AckermannGeometry, Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.records import (
+    AckermannGeometry,
+    Gps,
+    LandmarkObservations,
+    LaserScans,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+)
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.atomic import atomic_open, write_npz
 from graphslam.io.log_store import load_log, save_log
@@ -42,6 +50,7 @@ def full_log(rng: np.random.Generator) -> SensorLog:
                 times=t, ranges=ranges, bearings=bearings, max_range=80.0, T_base_sensor=[3.78, 0.5, 0.1]
             ),
             "controls": SteeringControls(times=t, speed=rng.normal(size=5), steering=rng.normal(size=5), geometry=car),
+            "velocity": VelocityControls(times=t, speed=rng.normal(size=5), yaw_rate=rng.normal(size=5)),
             "odometry": Odometry(times=t, increments=rng.normal(size=(5, 3)), covariances=rng.normal(size=(5, 3, 3))),
             "odometry3": Odometry(times=t, increments=poses3, covariances=rng.normal(size=(5, 6, 6))),
             "gps": Gps(times=t, positions=rng.normal(size=(5, 2)), sigma=rng.uniform(1, 2, 5), lever=[1.0, 2.0]),

@@ -30,3 +30,48 @@ def integrate(controls: SteeringControls, times: np.ndarray) -> np.ndarray:
                 k += 1
         out.append((x, y, phi))
     return np.array(out)
+
+
+def drive_arcs(speed, rate, dt, steps=400) -> np.ndarray:
+    """Pose ``(3,)`` after speeds and yaw rates held for ``dt`` each: tiny straight steps, midpoint heading."""
+    x = y = th = 0.0
+    for v, w, h in zip(speed, rate, dt):
+        for _ in range(steps):
+            d = h / steps
+            x += v * d * math.cos(th + 0.5 * w * d)
+            y += v * d * math.sin(th + 0.5 * w * d)
+            th += w * d
+    return np.array([x, y, th])
+
+
+def drive_arcs_covariance(speed, rate, dt, noise) -> np.ndarray:
+    """Right-tangent covariance ``(3, 3)`` of :func:`drive_arcs`: finite differences on every error, one by one."""
+
+    def pose(dv, dw):
+        return drive_arcs(speed + dv, rate + dw, dt, steps=20)
+
+    base = pose(0.0 * speed, 0.0 * rate)
+    moving = (speed != 0) | (rate != 0)
+    errors = []  # each a (dv, dw) of one standard deviation
+    if noise.per_increment:
+        constant = [(noise.speed * moving, 0 * rate), (0 * speed, noise.yaw_rate * moving)]
+        errors = [*constant, (noise.speed_fraction * speed, 0 * rate), (0 * speed, noise.yaw_rate_fraction * rate)]
+    else:
+        for k in np.flatnonzero(moving):
+            one = np.eye(len(speed))[k]
+            errors.append((one * math.hypot(noise.speed, noise.speed_fraction * speed[k]), 0 * rate))
+            errors.append((0 * speed, one * math.hypot(noise.yaw_rate, noise.yaw_rate_fraction * rate[k])))
+    P = np.zeros((3, 3))
+    c, s = math.cos(base[2]), math.sin(base[2])
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    for dv, dw in errors:
+        j = turn @ (pose(1e-4 * dv, 1e-4 * dw) - pose(-1e-4 * dv, -1e-4 * dw)) / 2e-4
+        P += np.outer(j, j)
+    d = float(np.sum(np.abs(speed) * dt))
+    return P + np.diag(
+        [
+            noise.floor_position**2,
+            noise.floor_position**2 + (noise.lateral * d) ** 2,
+            noise.floor_heading**2 + (noise.heading * d) ** 2,
+        ]
+    )
