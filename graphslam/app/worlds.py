@@ -27,7 +27,7 @@ def simulate(world: str, *, seed: int = 0, preset: str | None = None, **changes:
         ``landmark-field``.
     seed : int
     preset : str, optional
-        ``A``, ``B``, ``C``, ``demo`` or ``quick``.
+        ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard`` confuse an association.
     **changes
         Any figure of the world's configuration.
 

@@ -12,196 +12,23 @@ one half of them each; ``C`` is ``A`` with the sensor of the classic simulator.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.random import SeedTree
 from graphslam.core.records import AckermannGeometry, Gps, LandmarkObservations, SteeringControls, Stream
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.vehicle import follow_route, offset_from_route, wavy_loop
+from graphslam.sim.landmark_config import LandmarkFieldConfig
+from graphslam.sim.landmark_layout import landmark_layout
+from graphslam.sim.landmark_presets import PRESETS, landmark_field_preset
+from graphslam.sim.vehicle import follow_route
 
-_POSITIVE = (
-    *("lap_length", "laps", "wheelbase", "speed", "control_rate", "max_steering", "steering_rate", "look_ahead"),
-    *("max_range", "scan_rate", "sigma_speed", "sigma_steering", "sigma_range", "sigma_bearing", "gps_sigma"),
-)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LandmarkFieldConfig:
-    """World, vehicle, sensors and noise of the landmark field; the defaults are world ``A``."""
-
-    lap_length: float = 2230.0
-    """Length of one lap of the route [m]."""
-    laps: float = 2.0
-    """Distance driven / lap_length; more than 1 closes the loop."""
-    route_waves: int = 9
-    """Waves per lap: r(θ) = R (1 + route_amplitude · sin(route_waves · θ))."""
-    route_amplitude: float = 0.05
-    """Wave height relative to the mean radius R."""
-
-    landmarks: int = 554
-    """Number of features, uniform along the route, on either side with equal probability."""
-    lateral_min: float = 3.0
-    """Least lateral distance of a feature from the route [m]."""
-    lateral_max: float = 20.0
-    """Greatest lateral distance of a feature from the route [m]; uniform between the two."""
-    layout_seed: int | None = None
-    """Seed of the feature layout. None: the run's own seed. A number holds the layout over Monte-Carlo runs."""
-
-    wheelbase: float = 4.0
-    """L of φ' = φ + V dt sin(G)/L [m]."""
-    speed: float = 3.0
-    """True speed V, constant [m/s]."""
-    control_rate: float = 40.0
-    """Controls per second [Hz]; dt = 1/control_rate."""
-    max_steering: float = math.radians(30.0)
-    """Limit of the true steering angle: |G| ≤ max_steering [rad]."""
-    steering_rate: float = math.radians(20.0)
-    """Limit of its rate: |ΔG| ≤ steering_rate · dt [rad/s]."""
-    look_ahead: float = 6.0
-    """Distance to the point of the route that the vehicle steers at [m]."""
-
-    max_range: float = 30.0
-    """Features farther than this are not seen [m]."""
-    min_range: float = 1.0
-    """Features nearer than this are not seen [m]."""
-    field_of_view: float = math.pi
-    """Full opening angle, centred on the heading: |bearing| ≤ field_of_view/2 [rad]."""
-    scan_rate: float = 5.0
-    """Scans per second [Hz]; divides control_rate. The first scan comes one period after the start."""
-    detection_probability: float = 1.0
-    """Probability that a visible feature is reported, independent per scan and feature."""
-    clutter_rate: float = 0.0
-    """Mean number of false observations per scan (Poisson), uniform over the area of the sensor's sector; id -1."""
-
-    sigma_speed: float = 0.3
-    """σ of the measured speed, independent per control record [m/s]."""
-    sigma_steering: float = math.radians(3.0)
-    """σ of the measured steering angle, independent per control record [rad]."""
-    sigma_range: float = 0.5
-    """σ of a measured range, independent per observation [m]."""
-    sigma_bearing: float = math.radians(5.0)
-    """σ of a measured bearing, independent per observation [rad]."""
-    noise_scale: float = 1.0
-    """Every drawn error is multiplied by it, the stated σ are not: 1 is honest, 0 gives exact data to check models
-    with, 2 a vehicle whose data sheet lies by a factor of 2."""
-
-    gps_rate: float = 0.0
-    """GPS fixes per second [Hz]; 0 is no GPS. Divides control_rate."""
-    gps_sigma: float = 1.0
-    """σ of each coordinate of a fix, independent per fix [m]."""
-    gps_lever: tuple[float, float] = (0.0, 0.0)
-    """Antenna in the base frame [m]."""
-    gps_frame: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """T_gps_base0: pose of the first base in the frame of the fixes [m, m, rad]."""
-
-    def __post_init__(self) -> None:
-        for name, n in (("gps_lever", 2), ("gps_frame", 3)):  # a configuration file gives lists
-            value = tuple(float(v) for v in getattr(self, name))
-            self._require(name, len(value) == n and all(map(math.isfinite, value)), f"{n} finite numbers")
-            object.__setattr__(self, name, value)
-        for name in _POSITIVE:
-            self._require(name, getattr(self, name) > 0, "> 0")
-        for name in ("route_waves", "landmarks", "min_range", "clutter_rate", "noise_scale", "gps_rate"):
-            self._require(name, getattr(self, name) >= 0, "≥ 0")
-        for name in [*_POSITIVE, "clutter_rate", "noise_scale", "gps_rate", "lateral_max"]:
-            self._require(name, math.isfinite(getattr(self, name)), "a finite number")
-        self._require("route_amplitude", 0 <= self.route_amplitude < 1, "in [0, 1)")
-        self._require("lateral_min", 0 <= self.lateral_min <= self.lateral_max, "in [0, lateral_max]")
-        self._require("min_range", self.min_range < self.max_range, "< max_range")
-        self._require("field_of_view", 0 < self.field_of_view <= 2 * math.pi, "in (0, 2π]")
-        self._require("detection_probability", 0 <= self.detection_probability <= 1, "in [0, 1]")
-        self._require("look_ahead", self.look_ahead < self.lap_length / 4, "< lap_length / 4")
-        self._require("scan_rate", _divides(self.scan_rate, self.control_rate), "a divisor of control_rate")
-        if self.gps_rate:
-            self._require("gps_rate", _divides(self.gps_rate, self.control_rate), "0 or a divisor of control_rate")
-        self._require("laps", self.steps >= self.scan_stride, "long enough for one scan")
-
-    def _require(self, name: str, ok: bool, wanted: str) -> None:
-        if not ok:
-            raise ConfigError(f"landmark field: {name} = {getattr(self, name)}; wanted {wanted}")
-
-    @property
-    def distance(self) -> float:
-        """Distance driven [m]."""
-        return self.laps * self.lap_length
-
-    @property
-    def steps(self) -> int:
-        """Number of control steps."""
-        return round(self.distance / self.speed * self.control_rate)
-
-    @property
-    def scan_stride(self) -> int:
-        """Control steps per scan."""
-        return round(self.control_rate / self.scan_rate)
-
-
-def _divides(rate: float, base: float) -> bool:
-    ratio = base / rate
-    return ratio >= 1 - 1e-9 and abs(ratio - round(ratio)) < 1e-9 * ratio
-
-
-_A = LandmarkFieldConfig()
-PRESETS: Mapping[str, LandmarkFieldConfig] = {
-    # two laps of 2.23 km, 0.5 m / 5° (the stated noise), about 15 features per 35 m of way
-    "A": _A,
-    # one lap of 5.3 km (1.65 km across, as the paper's field) and 5.5 % overlap, about 7 features per 44 m
-    "B": dataclasses.replace(_A, lap_length=5300.0, laps=1.055),
-    # A with the sensor of the classic simulator
-    "C": dataclasses.replace(_A, sigma_range=0.1, sigma_bearing=math.radians(1.0)),
-    # 480 m and a fifth of it again: closes a loop, the whole pipeline takes seconds
-    "demo": dataclasses.replace(
-        _A,
-        lap_length=480.0,
-        laps=1.2,
-        route_waves=5,
-        route_amplitude=0.08,
-        landmarks=120,
-        sigma_range=0.3,
-        sigma_bearing=math.radians(3.0),
-    ),
-    # smaller still, for tests and notebooks in quick mode
-    "quick": dataclasses.replace(
-        _A,
-        lap_length=120.0,
-        laps=1.3,
-        route_waves=3,
-        route_amplitude=0.08,
-        landmarks=40,
-        lateral_max=12.0,
-        max_range=20.0,
-        sigma_range=0.2,
-        sigma_bearing=math.radians(2.0),
-    ),
-}
-
-
-def landmark_field_preset(name: str, **changes: Any) -> LandmarkFieldConfig:
-    """The preset of that name with some fields changed.
-
-    Raises
-    ------
-    UnknownNameError
-        Unknown preset.
-    ConfigError
-        Unknown field or impossible value.
-    """
-    if name not in PRESETS:
-        raise UnknownNameError("landmark-field preset", name, PRESETS)
-    known = {f.name for f in dataclasses.fields(LandmarkFieldConfig)}
-    for key in changes:
-        if key not in known:
-            raise ConfigError(f"landmark field has no field {key!r}; known: {', '.join(sorted(known))}")
-    return dataclasses.replace(PRESETS[name], **changes)
+__all__ = ["PRESETS", "LandmarkFieldConfig", "landmark_field_preset", "landmark_layout", "simulate_landmark_field"]
 
 
 @dataclass(slots=True)
@@ -223,24 +50,13 @@ class _World:
         return self.seeds.child("noise", stream).generator()
 
 
-def landmark_layout(config: LandmarkFieldConfig, seed: int) -> tuple[Array, Array]:
-    """Route ``(m, 2)`` and features ``(n, 2)`` in the first base's frame, from the layout's own branch of the seed."""
-    route = wavy_loop(config.lap_length, config.route_waves, config.route_amplitude)
-    layout_seed = seed if config.layout_seed is None else config.layout_seed
-    rng = SeedTree(layout_seed).child("landmark-field", "layout").generator()
-    s = rng.uniform(0.0, config.lap_length, config.landmarks)
-    side = rng.choice([-1.0, 1.0], config.landmarks)
-    lateral = rng.uniform(config.lateral_min, config.lateral_max, config.landmarks)
-    return route, offset_from_route(route, s, side * lateral)
-
-
 def _measure_controls(world: _World) -> SteeringControls:
     c, rng = world.config, world.noise("controls")
     n = len(world.steering)
     return SteeringControls(
         times=world.stamps(np.arange(n)),
-        speed=c.speed + c.noise_scale * c.sigma_speed * rng.standard_normal(n),
-        steering=world.steering + c.noise_scale * c.sigma_steering * rng.standard_normal(n),
+        speed=c.speed_factor * c.speed + c.noise_scale * c.sigma_speed * rng.standard_normal(n),
+        steering=world.steering + c.steering_bias + c.noise_scale * c.sigma_steering * rng.standard_normal(n),
         geometry=AckermannGeometry(wheelbase=c.wheelbase, model="front-steer"),
     )
 

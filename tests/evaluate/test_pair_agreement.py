@@ -10,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.core.errors import DataError
-from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam.evaluate.association import (
+    AssociationErrors,
+    association_errors,
+    majority_identity,
+    match_observations,
+    pair_agreement,
+)
 
 labels = st.lists(st.integers(-1, 4), min_size=2, max_size=14)
 
@@ -50,3 +56,33 @@ def test_observations_are_matched_by_scan_and_each_row_once():
     got = match_observations(t, np.array([5.0, 5.1, 7.0]), np.zeros(3), rt, np.array([5.09, 5.25, 7.0]), np.zeros(3))
     # row 0 of the reference is nearest to observation 1; observation 0 then takes the other; 3.0 s is another scan
     assert got.tolist() == [1, 0, -1]
+
+
+@given(st.data())
+def test_errors_inside_a_map_equal_a_count_one_by_one(data):
+    a = data.draw(labels)
+    b = data.draw(st.lists(st.integers(-1, 4), min_size=len(a), max_size=len(a)))
+    min_hits = data.draw(st.integers(1, 3))
+    identity = {}
+    for j in sorted({x for x in a if x >= 0}):
+        held = [y for x, y in zip(a, b) if x == j]
+        identity[j] = min(set(held), key=lambda y: (-held.count(y), y))
+    got = association_errors(a, b, min_hits=min_hits)
+    real = [i for i in identity.values() if i >= 0]
+    assert got.sightings == sum(x >= 0 for x in a)
+    assert got.wrong == sum(x >= 0 and y != identity[x] for x, y in zip(a, b))
+    assert got.landmarks == len(identity)
+    assert got.spurious == sum(i < 0 for i in identity.values())
+    assert got.duplicated == len(real) - len(set(real))
+    assert got.missed == sum(b.count(y) >= min_hits and y not in real for y in set(b) if y >= 0)
+    names, what = majority_identity(a, b)
+    assert dict(zip(names.tolist(), what.tolist())) == identity
+
+
+def test_hand_case_of_errors_inside_a_map():
+    #                      right  right wrong clutter-in-real | clutter, clutter, real-in-clutter | duplicate of 7 | unused
+    got = association_errors([0, 0, 0, 0, 1, 1, 1, 2, -1, -1], [7, 7, 8, -1, -1, -1, 9, 7, 8, 8], min_hits=3)
+    assert got == AssociationErrors(sightings=8, wrong=3, landmarks=3, spurious=1, duplicated=1, missed=1)
+    assert got.wrong_share == pytest.approx(3 / 8)
+    assert (got + got).wrong == 6
+    assert np.isnan(association_errors([-1], [3]).wrong_share)

@@ -126,11 +126,12 @@ def test_every_preset_closes_a_loop_and_sees_old_features(name: str) -> None:
     log = simulate_landmark_field(c, 0)
     obs = log["landmarks"]
     scan = np.repeat(np.arange(len(obs.times)), np.diff(obs.offsets))
-    first, last = np.full(c.landmarks, -1), np.full(c.landmarks, -1)
-    first[obs.ids[::-1]], last[obs.ids] = scan[::-1], scan
+    real, scan = obs.ids[obs.ids >= 0], scan[obs.ids >= 0]
+    first, last = np.full(c.features, -1), np.full(c.features, -1)
+    first[real[::-1]], last[real] = scan[::-1], scan
     one_lap = c.lap_length / c.speed * c.scan_rate
     again = np.sum((last - first > 0.8 * one_lap) & (first >= 0))
-    assert again >= 0.03 * c.landmarks
+    assert again >= 0.03 * c.features
     assert np.mean(np.diff(obs.offsets) > 0) > 0.9  # hardly ever blind: B sees 2.9 features a scan
 
 
@@ -214,6 +215,73 @@ def test_features_lie_in_the_lateral_band() -> None:
     assert d.min() > 2.8
     assert d.max() < 20.1
     assert np.mean(d) == pytest.approx(11.5, abs=5 * 17 / math.sqrt(12 * 554))
+
+
+def test_pairs_stand_at_the_stated_distance_and_never_nearer_to_the_road() -> None:
+    c = dataclasses.replace(PRESETS["pairs"], pair_fraction=0.6, pair_distance=2.0)
+    route, p = landmark_layout(c, 3)
+    _, plain = landmark_layout(dataclasses.replace(c, pair_fraction=0.0), 3)
+    n = 2 * (int(0.6 * 150) // 2)
+    assert np.allclose(np.linalg.norm(p[0:n:2] - p[1:n:2], axis=1), 2.0, atol=1e-9)
+    assert np.array_equal(p[n:], plain[n:])  # the rest stays where it was
+    assert np.array_equal(p[0:n:2], plain[0:n:2])
+    assert not np.any(np.all(p[1:n:2] == plain[1:n:2], axis=1))
+    d = np.min(np.linalg.norm(p[:, None] - route[None, ::3], axis=2), axis=1)
+    assert d.min() > c.lateral_min - 0.2
+    away = np.arctan2(*(p[1:n:2] - p[0:n:2]).T[::-1])
+    assert stats.kstest(away / (2 * np.pi) + 0.5, "uniform").pvalue > P_VALUE  # the road has every direction
+
+
+def test_rows_are_regular_along_the_route_on_both_sides() -> None:
+    c = dataclasses.replace(PRESETS["rows"], row_jitter=0.0, row_spacing=7.0, row_lateral=5.0)
+    route, p = landmark_layout(c, 3)
+    rows = p[c.landmarks :].reshape(2, c.row_periods, 2)
+    assert c.row_periods == 86
+    assert c.features == 30 + 172 == len(p)
+    far = np.linalg.norm(rows[:, :, None] - route[None, None], axis=3)
+    assert np.allclose(far.min(axis=2), 5.0, atol=0.1)
+    s = 0.1 * np.argmin(far, axis=2)  # arc length of the nearest point
+    assert np.allclose(np.diff(s, axis=1), 600 / 86, atol=0.5)
+    assert np.allclose(np.linalg.norm(rows[0] - rows[1], axis=1), 10.0, atol=1e-6)  # opposite each other
+    jittered = landmark_layout(dataclasses.replace(c, row_jitter=0.3), 3)[1][c.landmarks :] - p[c.landmarks :]
+    assert_normal(jittered.ravel(), 0.3, "row jitter")
+    assert np.array_equal(p[:30], landmark_layout(dataclasses.replace(c, row_spacing=0.0), 3)[1])
+
+
+def test_a_map_of_a_row_shifted_by_one_period_looks_the_same() -> None:
+    """What makes it hard: a row shifted along the route has its trees near trees again, the scattered have not."""
+    route, p = landmark_layout(PRESETS["rows"], 0)
+    forward = offset_from_route(route, np.arange(0.0, 600.0, 4.0) + 4.0, np.zeros(150))
+    here = offset_from_route(route, np.arange(0.0, 600.0, 4.0), np.zeros(150))
+    left, scattered = p[30:180], p[:30]
+
+    def shifted(points: np.ndarray) -> np.ndarray:
+        nearest = np.argmin(np.linalg.norm(points[:, None] - here[None], axis=2), axis=1)
+        return points + forward[nearest] - here[nearest]
+
+    gap = np.min(np.linalg.norm(shifted(left)[:, None] - left[None], axis=2), axis=1)
+    assert np.quantile(gap, 0.9) < 1.0  # a quarter of the spacing
+    alone = np.min(np.linalg.norm(shifted(scattered)[:, None] - scattered[None], axis=2), axis=1)
+    assert np.median(alone) > 2.0
+
+
+def test_systematic_errors_are_the_stated_ones_and_no_part_of_the_noise() -> None:
+    a = simulate_landmark_field(QUICK, 1)["controls"]
+    c = dataclasses.replace(QUICK, speed_factor=1.05, steering_bias=math.radians(-0.5))
+    b = simulate_landmark_field(c, 1)["controls"]
+    assert np.allclose(b.speed - a.speed, 0.05 * QUICK.speed, atol=1e-12)
+    assert np.allclose(b.steering - a.steering, math.radians(-0.5), atol=1e-12)
+
+
+def test_the_worlds_that_confuse_state_an_honest_noise() -> None:
+    """Their presets draw nothing that the stated σ do not cover, and truth names the clutter."""
+    for name in ("clutter", "pairs", "rows", "hard"):
+        c = PRESETS[name]
+        assert (c.noise_scale, c.speed_factor, c.steering_bias) == (1.0, 1.0, 0.0)
+        log = simulate_landmark_field(c, 1)
+        assert 600 <= log.truth.trajectory.length() <= 900
+        assert np.any(log["landmarks"].ids < 0) == (c.clutter_rate > 0)
+        assert len(log.truth.landmarks) == c.features
 
 
 def test_same_seed_same_bytes_other_seed_other_noise() -> None:
@@ -312,6 +380,13 @@ def test_a_world_without_features_has_empty_scans() -> None:
         ("landmarks", -1),
         ("gps_lever", (1.0,)),
         ("route_amplitude", 1.0),
+        ("pair_fraction", 1.5),
+        ("pair_distance", 0.0),
+        ("row_spacing", 61.0),
+        ("row_spacing", -1.0),
+        ("row_jitter", 3.0),
+        ("speed_factor", 0.0),
+        ("steering_bias", math.nan),
     ],
 )
 def test_impossible_configuration_names_the_field(field: str, value: object) -> None:
