@@ -75,6 +75,9 @@ class RbpfEkfConfig:
     """χ² gate of an association (2 dof: 99.7 %)."""
     gate_new: float = 30.0
     """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
+    outlier_gate: float = 0.0
+    """With known association: an observation with d² above this (χ², 2 dof; the same tail where it has one channel) is
+    an outlier to that particle and not used; 0 = use all."""
     confirm_hits: int = 3
     """A feature is provisional until it has been seen this often."""
     drop_misses: int = 5

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
 from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, wrap_angle
 
 Ints = npt.NDArray[np.int64]
@@ -64,6 +65,10 @@ class ParticleSet:
             miss_range,
             field_of_view[0] + margin,
             field_of_view[1] - margin,
+            equal_tail_gate(config.gate, 2, 1),
+            equal_tail_gate(config.gate_new, 2, 1),
+            config.outlier_gate or np.inf,
+            equal_tail_gate(config.outlier_gate or np.inf, 2, 1),
         )
 
     def _make_room(self, n_obs: int) -> None:
@@ -96,9 +101,10 @@ class ParticleSet:
         self._make_room(max(n_obs, highest - int(self.count.max())))
         fastslam_step(
             self.pose, self.log_weight, self.mean, self.cov, self.hits, self.misses, self.born, self.count, self.assoc,
-            self.path, self.scans, self.observations, observations, known, u, Q,
+            self.scans, self.observations, observations, known, u, Q,
             self.rng.standard_normal((len(self.pose), 3)), self.sensor, self._cfg,
         )  # fmt: skip
+        self.path[:, self.scans] = self.pose
         self.scans += 1
         self.observations += n_obs
         self.log_weight -= self.log_weight.max()

@@ -195,6 +195,11 @@ def chi2_quantile(probability: float, dof: float) -> float:
     return float(stats.chi2.ppf(probability, dof))
 
 
+def equal_tail_gate(gate: float, dof: int, other_dof: int) -> float:
+    """χ² gate for ``other_dof`` that fails as many good observations as ``gate`` does for ``dof``."""
+    return float(stats.chi2.isf(stats.chi2.sf(gate, dof), other_dof))
+
+
 def chi2_mean_bounds(dof: float, runs: int, confidence: float = 0.95) -> tuple[float, float]:
     """Two-sided bounds of the *mean* of ``runs`` independent chi-square values of ``dof`` each.
 

@@ -7,7 +7,7 @@ import pytest
 
 from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.filter import ParticleSet
-from frontends.landmarks.kernels import observe
+from frontends.landmarks.measurement_kernels import observe
 from graphslam.core.geometry import se2_compose, wrap_angle
 from tests.reference.fastslam import SlowParticle, measure, numeric_jacobians
 
