@@ -128,11 +128,11 @@ def _run(
     return replace(result, folder=folder.path)
 
 
-def load_log_source(source: str | Path | SensorLog) -> SensorLog:
-    """A log from a card name, a folder on disk, or itself."""
+def load_log_source(source: str | Path | SensorLog, **options: Any) -> SensorLog:
+    """A log from a card name, a folder on disk, or itself; ``options`` are for the reader."""
     if isinstance(source, SensorLog):
         return source
-    log = load(source)
+    log = load(source, **options)
     if not isinstance(log, SensorLog):
         raise MissingDataError(
             f"{source} holds no sensor log", got=type(log).__name__, wanted="a log of sensor streams"

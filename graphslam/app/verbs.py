@@ -13,6 +13,8 @@ from graphslam.app.outputs import open_run as open_run
 from graphslam.app.pipeline import load_log_source
 from graphslam.app.pipeline import run as run
 from graphslam.app.run import Run
+from graphslam.app.study import open_study as open_study
+from graphslam.app.study import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate as simulate
@@ -20,17 +22,17 @@ from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 
-__all__ = ["compare", "join", "load", "open_run", "run", "simulate", "solve"]
+__all__ = ["compare", "join", "load", "open_run", "open_study", "run", "simulate", "solve", "study"]
 
 
-def load(source: str | Path) -> SensorLog:
-    """A sensor log by card name, or from a folder.
+def load(source: str | Path, **options: Any) -> SensorLog:
+    """A sensor log by card name, or from a folder; ``options`` are for its reader.
 
     Raises
     ------
     UnknownNameError, MissingDataError, FormatError
     """
-    return load_log_source(source)
+    return load_log_source(source, **options)
 
 
 def compare(

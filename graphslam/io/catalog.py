@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import importlib
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,10 +32,14 @@ class Reader:
         ``module:function``; the function takes the folder. Imported when used.
     markers : tuple of str
         A folder that holds one of these files is of this kind.
+    parts : mapping of str to mapping
+        Logs inside one data set, by the name that stands after the card's (``mrclam-dataset7/robot1``), and what the
+        function is told for each.
     """
 
     target: str
     markers: tuple[str, ...] = ()
+    parts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __call__(self, path: Path, **options: Any) -> Any:
         module, _, function = self.target.partition(":")
@@ -52,6 +57,10 @@ READERS: dict[str, Reader] = {
         "graphslam.io.victoria_park_published:read_ufastslam_detections",
         ("ufastslam_ObservationDistance.txt.gz", "ufastslam_ObservationDistance.txt"),
     ),
+    "mrclam": Reader(
+        "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
+    ),
+    "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
 }
 """Readers of folders by name. A pose network is a file: :func:`load` gives its path."""
 
@@ -152,8 +161,8 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
     Parameters
     ----------
     source : str or path
-        A card's name; ``card/file`` for one file of a card (the ending may be left out, as ``posegraphs/intel``); or
-        an existing file or folder.
+        A card's name; ``card/file`` for one file of a card (the ending may be left out, as ``posegraphs/intel``);
+        ``card/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
     options
         For the reader.
 
@@ -183,8 +192,15 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
         if c.reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
         return READERS[c.reader](locate(c), **options)
-    if text.partition("/")[0] in known and not Path(text).exists():
-        return _named_file(card(text.partition("/")[0]), text.partition("/")[2])
+    name, slash, part = text.partition("/")
+    if slash and name in known and not Path(text).exists():
+        c = card(name)
+        parts = READERS[c.reader].parts if c.reader in READERS else {}
+        if not parts:
+            return _named_file(c, part)
+        if part not in parts:
+            raise UnknownNameError(f"part of data set {name!r}", part, parts)
+        return READERS[str(c.reader)](locate(c), **{**parts[part], **options})
     path = Path(text)
     if path.is_file():
         return path

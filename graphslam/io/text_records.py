@@ -1,4 +1,4 @@
-"""Line-by-line text files of tagged records (g2o, TORO, iSAM), plain or compressed.
+"""Line-by-line text files, plain or compressed: tagged records (g2o, TORO, iSAM) and plain tables of numbers.
 
 The compression is told by the first bytes, not by the name, and every number that cannot be read is reported with
 its file and line.
@@ -15,7 +15,11 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.geometry import Array
 
 _MAGIC: tuple[tuple[bytes, Callable[[bytes], bytes]], ...] = (
     (b"\xfd7zXZ\x00", lzma.decompress),
@@ -53,6 +57,69 @@ def read_text(path: str | os.PathLike[str]) -> str:
         return raw.decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(f"not a text file (byte {error.start})", where=str(p)) from None
+
+
+def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
+    """``name`` in ``folder``, plain or compressed.
+
+    Raises
+    ------
+    MissingDataError
+    """
+    for ending in ("", *_WRITERS):
+        path = Path(folder) / (name + ending)
+        if path.is_file():
+            return path
+    endings = ", ".join(_WRITERS)
+    raise MissingDataError("no such file", where=str(Path(folder) / name), wanted=f"{name}, plain or with {endings}")
+
+
+def read_table(path: str | os.PathLike[str], columns: int) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Rows of ``columns`` numbers, one a line; blank lines and lines that begin with ``#`` are skipped.
+
+    Returns
+    -------
+    values : (n, columns)
+        Numbers may be NaN or infinite: the caller decides what to drop.
+    lines : (n,) int64
+        Line of every row, counted from 1, for messages.
+
+    Raises
+    ------
+    MissingDataError
+        No such file.
+    FormatError
+        A line with another number of values, or with something that is no number: names file and line.
+    """
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != columns:
+            raise FormatError(
+                "line is truncated or too long",
+                where=f"{path}, line {number}",
+                got=f"{len(words)} values: {line.strip()[:60]!r}",
+                wanted=f"{columns} values",
+            )
+        rows.append(words)
+        lines.append(number)
+    try:
+        values = np.array(rows, dtype=np.float64).reshape(-1, columns)
+    except ValueError:
+        k, word = next((k, w) for k, words in enumerate(rows) for w in words if not _is_number(w))
+        raise FormatError("not a number", where=f"{path}, line {lines[k]}", got=repr(word[:40])) from None
+    return values, np.array(lines, dtype=np.int64)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

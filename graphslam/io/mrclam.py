@@ -1,0 +1,205 @@
+"""UTIAS multi-robot cooperative localisation and mapping (Leung, Halpern, Barfoot and Liu, 2011).
+
+Five robots among fifteen landmarks, each an upright tube with a barcode that a camera reads at a range and a bearing.
+One log a robot. The clock of odometry, measurements and Vicon is common to all of them: Unix seconds.
+
+* ``controls``: commanded forward speed and turn rate, held from stamp to stamp.
+* ``landmarks``: range and bearing (positive left) of landmarks; the identity is the *subject* of the barcode, 6 to 20.
+  The second column of a measurement is the barcode, whatever the header says. Measurements of one stamp are one scan.
+* truth: the robot's centre by Vicon, and the surveyed landmarks, both in the Vicon frame.
+
+What is refused and what is dropped: a file that is missing, truncated, or holds a line of another length is a
+:class:`FormatError` or :class:`MissingDataError` that names file and line. Isolated bad records (not finite, repeated
+or out of order, ranges that are not positive) are dropped and counted; sightings of barcodes that the table does not
+know, and of other robots, are dropped and counted unless asked for.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog, Truth
+from graphslam.core.records import LandmarkObservations, Stream, VelocityControls
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.clock import usable_records
+from graphslam.io.text_records import find_text_file, read_table
+
+ROBOTS = 5
+RANGE_SIGMA, BEARING_SIGMA = 0.15, 0.02
+"""Stated σ of a range [m] and a bearing [rad]; the recording states none. See :func:`read_mrclam`."""
+FIELD_OF_VIEW = (-0.6, 0.6)
+"""Bearings of all measurements of the set lie inside [rad]."""
+_MAX_RANGE = 9.0  # nothing in the 15 m x 8 m hall was read from farther away
+
+Ints = npt.NDArray[np.int64]
+
+
+def read_mrclam(
+    folder: str | os.PathLike[str],
+    *,
+    robot: int | None = None,
+    robots: bool = False,
+    range_sigma: float = RANGE_SIGMA,
+    bearing_sigma: float = BEARING_SIGMA,
+    range_bias: float = 0.0,
+    name: str = "mrclam-dataset7",
+    drops: DropCounter | None = None,
+) -> SensorLog:
+    """Read the log of one robot.
+
+    Parameters
+    ----------
+    folder : path
+        Holds ``Barcodes.dat``, ``Landmark_Groundtruth.dat`` and ``Robot<k>_Odometry.dat``, ``_Measurement.dat``,
+        ``_Groundtruth.dat``, plain or compressed. Landmarks and path without truth files are a log without truth.
+    robot : int
+        1 to 5.
+    robots : bool
+        Keep sightings of other robots, as a stream ``robots`` of its own with ids 1 to 5.
+    range_sigma, bearing_sigma : float
+        σ put on every measurement [m], [rad].
+    range_bias : float
+        Subtracted from every range [m].
+    name : str
+        The log is called ``<name>/robot<k>``.
+    drops : DropCounter, optional
+        Counts into this one, besides ``SensorLog.dropped``.
+
+    Raises
+    ------
+    ConfigError, MissingDataError, FormatError, DataError
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise MissingDataError("no such folder", where=str(root), wanted="the folder of an MRCLAM data set")
+    if robot is None or robot not in range(1, ROBOTS + 1):
+        raise ConfigError(f"{name} holds one log a robot: name one, {name}/robot1 … robot{ROBOTS}, got robot={robot}")
+    if not (range_sigma > 0 and bearing_sigma > 0 and np.isfinite(range_bias)):
+        raise ConfigError(f"σ of range {range_sigma}, bearing {bearing_sigma}, bias {range_bias}; wanted σ > 0")
+    counter = DropCounter()
+    controls, n_controls = _controls(root, robot, counter)
+    table, n_measured = _measurements(root, robot, counter)
+    subject = table[:, 1].astype(np.int64)
+    sigma = (range_sigma, bearing_sigma)
+    table[:, 2] -= range_bias
+    streams: dict[str, Stream] = {
+        "controls": controls,
+        "landmarks": _observations(table[subject > ROBOTS], sigma),
+    }
+    others = table[(subject >= 1) & (subject <= ROBOTS)]
+    if robots:
+        streams["robots"] = _observations(others, sigma)
+    else:
+        counter.drop("landmarks", "sightings of other robots", len(others))
+    if drops is not None:
+        drops.counts.update(counter.counts)
+    return SensorLog(
+        name=f"{name}/robot{robot}",
+        streams=streams,
+        truth=_truth(root, robot, counter),
+        read={"controls": n_controls, "landmarks": n_measured},
+        dropped=dict(counter.counts),
+        meta={
+            "source": root.name,
+            "robot": robot,
+            "range_sigma": range_sigma,
+            "bearing_sigma": bearing_sigma,
+            "range_bias": range_bias,
+        },
+    )
+
+
+def _controls(root: Path, robot: int, counter: DropCounter) -> tuple[VelocityControls, int]:
+    path = find_text_file(root, f"Robot{robot}_Odometry.dat")
+    times, speed, rate = read_table(path, 3)[0].T
+    bad = {"speed or turn rate is not finite": ~(np.isfinite(speed) & np.isfinite(rate))}
+    keep = usable_records(times, bad, stream="controls", where=str(path), drops=counter)
+    return VelocityControls(times=times[keep], speed=speed[keep], yaw_rate=rate[keep]), len(times)
+
+
+def _measurements(root: Path, robot: int, counter: DropCounter) -> tuple[Array, int]:
+    """Rows stamp, subject, range, bearing in order of time, and how many were read."""
+    subject_of = _barcodes(root)
+    path = find_text_file(root, f"Robot{robot}_Measurement.dat")
+    table, lines = read_table(path, 4)
+    if len(table) == 0:
+        raise DataError("holds no measurement", where=str(path), wanted="at least one")
+    code = table[:, 1]
+    odd = np.flatnonzero(np.isfinite(code) & (code != np.round(code)))
+    if len(odd):
+        k = int(odd[0])
+        raise FormatError("barcode is no whole number", where=f"{path}, line {lines[k]}", got=code[k])
+    # a scan has several rows of one stamp: what may not happen is that time runs backwards
+    times, row_of = np.unique(table[:, 0], return_inverse=True)
+    first = np.zeros(len(times), dtype=np.int64)
+    first[row_of[::-1]] = np.arange(len(table))[::-1]
+    in_file = np.argsort(first, kind="stable")
+    keep_stamp = np.zeros(len(times), dtype=np.bool_)
+    keep_stamp[in_file] = usable_records(times[in_file], {}, stream="landmarks", where=str(path), drops=counter)
+    good = keep_stamp[row_of]
+    for reason, bad in (
+        ("range or bearing is not finite", ~np.isfinite(table[:, 1:]).all(axis=1)),
+        ("range is not positive", ~(table[:, 2] > 0)),
+    ):
+        counter.drop("landmarks", reason, int((good & bad).sum()))
+        good &= ~bad
+    subject = np.array([subject_of.get(int(c), -1) if np.isfinite(c) else -1 for c in code], dtype=np.int64)
+    counter.drop("landmarks", "barcode that the table does not know", int((good & (subject < 0)).sum()))
+    good &= subject >= 0
+    out = np.column_stack([table[:, 0], subject, table[:, 2:]])[good]
+    return out[np.argsort(out[:, 0], kind="stable")], len(table)
+
+
+def _barcodes(root: Path) -> dict[int, int]:
+    """Barcode → subject."""
+    path = find_text_file(root, "Barcodes.dat")
+    table, lines = read_table(path, 2)
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1) | (table != np.round(table)).any(axis=1))
+    if len(bad):
+        raise FormatError("subject or barcode is no whole number", where=f"{path}, line {lines[bad[0]]}")
+    codes = table[:, 1].astype(np.int64).tolist()
+    if len(set(codes)) != len(codes):
+        raise FormatError("a barcode stands twice", where=str(path), wanted="each once")
+    return dict(zip(codes, table[:, 0].astype(np.int64).tolist()))
+
+
+def _observations(table: Array, sigma: tuple[float, float]) -> LandmarkObservations:
+    """Rows stamp, subject, range, bearing as scans of equal stamps."""
+    times, first = np.unique(table[:, 0], return_index=True)
+    return LandmarkObservations(
+        times=times,
+        offsets=np.append(first, len(table)).astype(np.int64),
+        ranges=table[:, 2],
+        bearings=table[:, 3],
+        sigmas=np.tile(sigma, (len(table), 1)),
+        ids=table[:, 1].astype(np.int64),
+        max_range=_MAX_RANGE,
+        field_of_view=FIELD_OF_VIEW,
+    )
+
+
+def _truth(root: Path, robot: int, counter: DropCounter) -> Truth | None:
+    """Vicon path and surveyed landmarks; None where either file is not there."""
+    try:
+        path = find_text_file(root, f"Robot{robot}_Groundtruth.dat")
+        surveyed = find_text_file(root, "Landmark_Groundtruth.dat")
+    except MissingDataError:
+        return None
+    table = read_table(path, 4)[0]
+    bad = {"pose is not finite": ~np.isfinite(table[:, 1:]).all(axis=1)}
+    keep = usable_records(table[:, 0], bad, stream="truth", where=str(path), drops=counter)
+    marks, lines = read_table(surveyed, 5)
+    wrong = np.flatnonzero(~np.isfinite(marks).all(axis=1))
+    if len(wrong):
+        raise FormatError("landmark is not finite", where=f"{surveyed}, line {lines[wrong[0]]}")
+    return Truth(
+        trajectory=Trajectory(table[keep, 0], table[keep, 1:]),
+        landmark_ids=marks[:, 0].astype(np.int64),
+        landmarks=marks[:, 1:3],
+    )
