@@ -62,8 +62,28 @@ class StoppingConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RbpfEkfConfig:
-    """FastSLAM local maps, summarised as one Gaussian each."""
+class DelayedStart:
+    """When the ranges to a beacon, kept until then, make a landmark. A single range says too little."""
+
+    min_ranges: int = 5
+    """At least this many ranges, outliers not counted."""
+    spread: float = 0.1
+    """The fit's largest σ is at most this part of the mean range: beyond it the circle is too curved for a Gaussian."""
+    margin: float = 16.0
+    """Every other minimum (the mirror image above all) fits worse by this much in χ²."""
+    support: float = 0.9
+    """Share of the particles' weight whose fits must satisfy both."""
+
+    def __post_init__(self) -> None:
+        if self.min_ranges < 3:
+            raise ConfigError(f"delayed.min_ranges = {self.min_ranges}; wanted ≥ 3")
+        if not (self.spread > 0 and self.margin > 0 and 0 < self.support <= 1):
+            raise ConfigError(f"delayed start needs spread > 0, margin > 0 and 0 < support ≤ 1, got {self}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterConfig:
+    """What a particle filter over one map needs, whatever becomes of the map."""
 
     particles: int = 40
     """Number of particles N."""
@@ -72,7 +92,7 @@ class RbpfEkfConfig:
     association: Literal["likelihood", "known"] = "likelihood"
     """Per-particle maximum likelihood, or the identities in the log."""
     gate: float = 11.8
-    """χ² gate of an association (2 dof: 99.7 %)."""
+    """χ² gate of an association (2 dof: 99.7 %; the same tail for an observation of one channel)."""
     gate_new: float = 30.0
     """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
     outlier_gate: float = 0.0
@@ -84,6 +104,8 @@ class RbpfEkfConfig:
     """A provisional feature goes after this many scans in which it should have been seen and was not."""
     drop_scans: int = 10
     """A provisional feature goes if it is not confirmed this many scans after its birth."""
+    delayed: DelayedStart = field(default_factory=DelayedStart)
+    """Range-only observations: when the ranges to a beacon make a landmark."""
     max_range: float = 45.0
     """Observations beyond are not used [m]."""
     ess_fraction: float = 0.5
@@ -94,18 +116,8 @@ class RbpfEkfConfig:
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None
     """Observation noise in the filter; None: the log's sigmas."""
-    smoothing_noise: RangeBearingNoise | None = None
-    """Observation noise in the smoothing; None: as in the filter."""
     min_hits: int = 1
     """Landmarks handed over were seen at least this often under the winning association."""
-    trim: float = 0.0
-    """After a Huber pass, observations with d² above this are dropped and counted; 0 = keep all."""
-    handover: Literal["smoothed", "moments"] = "smoothed"
-    """``smoothed``: Gauss-Newton under the winning association, Laplace covariance; ``moments``: B3 (paper mode)."""
-    moment_inflation: bool = False
-    """Paper mode only: multiply the between-particle part by 1 + 40/N."""
-    stopping: StoppingConfig = field(default_factory=StoppingConfig)
-    """When a submap ends."""
     detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
     """Tree detector, used when the log holds raw scans instead of landmark observations."""
 
@@ -116,9 +128,51 @@ class RbpfEkfConfig:
             raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
         if self.association not in ("likelihood", "known"):
             raise ConfigError(f"association = {self.association!r}; known: likelihood, known")
-        if self.handover not in ("smoothed", "moments"):
-            raise ConfigError(f"handover = {self.handover!r}; known: smoothed, moments")
         if not 0 < self.gate <= self.gate_new:
             raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
+        if not self.outlier_gate >= 0:
+            raise ConfigError(f"outlier_gate = {self.outlier_gate}; wanted ≥ 0")
         if not 0 < self.ess_fraction <= 1:
             raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfSlamConfig(FilterConfig):
+    """One particle filter with one map over the whole log."""
+
+    @property
+    def smoothing_noise(self) -> None:
+        """A single map is not smoothed."""
+        return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfEkfConfig(FilterConfig):
+    """FastSLAM local maps, summarised as one Gaussian each."""
+
+    smoothing_noise: RangeBearingNoise | None = None
+    """Observation noise in the smoothing; None: as in the filter."""
+    trim: float = 0.0
+    """After a Huber pass, observations with d² above this (2 dof; the same tail where there is one channel) are dropped
+    and counted; 0 = keep all."""
+    handover: Literal["smoothed", "moments", "pooled"] = "smoothed"
+    """``smoothed``: Gauss-Newton under the winning association, Laplace covariance; ``moments``: B3 (paper mode);
+    ``pooled``: moments of ``pooled`` independent filters."""
+    moment_inflation: bool = False
+    """Paper mode only: multiply the between-particle part by 1 + 40/N."""
+    pooled: int = 0
+    """Number K of independent filters over the same scans, the first of them the one that decides; their pooled moments
+    stand in the report as an alarm. Costs K times the filter's time; 0 = off."""
+    stopping: StoppingConfig = field(default_factory=StoppingConfig)
+    """When a submap ends."""
+
+    def __post_init__(self) -> None:
+        FilterConfig.__post_init__(self)
+        if self.handover not in ("smoothed", "moments", "pooled"):
+            raise ConfigError(f"handover = {self.handover!r}; known: smoothed, moments, pooled")
+        if self.pooled < 0 or self.pooled == 1:
+            raise ConfigError(
+                f"pooled = {self.pooled}; wanted 0 (off) or ≥ 2: one filter has no spread between filters"
+            )
+        if self.handover == "pooled" and not self.pooled:
+            raise ConfigError('handover = "pooled" needs pooled ≥ 2 filters')

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.config import RbpfEkfConfig
+from frontends.landmarks.config import FilterConfig
 from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
 from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam.core.gaussian import equal_tail_gate
@@ -19,7 +19,7 @@ class ParticleSet:
 
     Parameters
     ----------
-    config : RbpfEkfConfig
+    config : FilterConfig
     sensor : (3,)
         ``T_base_sensor``.
     field_of_view : (2,)
@@ -32,7 +32,7 @@ class ParticleSet:
 
     def __init__(
         self,
-        config: RbpfEkfConfig,
+        config: FilterConfig,
         sensor: Array,
         field_of_view: tuple[float, float],
         miss_range: float,

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from frontends.landmarks.config import RangeBearingNoise
-from frontends.motion import MotionNoise, steering_odometry
+from frontends.motion import MotionNoise, dead_reckoning, motion_stream
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, SteeringControls
+from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
 
 Ints = npt.NDArray[np.int64]
 
@@ -112,7 +112,7 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     Parameters
     ----------
     log : SensorLog
-        With a stream of controls and one of landmark observations or laser scans.
+        With a stream of controls or odometry, and one of landmark observations or laser scans.
     config : PrepareConfig
     drops : DropCounter
         Where scans and observations that are not used are counted.
@@ -120,40 +120,53 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     Raises
     ------
     MissingDataError
-        If a stream is missing, identities are asked for and not there, or no scan is left.
+        If a stream is missing, identities are asked for and not there, or no scan is left; also where ranges without
+        bearings are to be associated by likelihood alone, since a range cannot found a landmark without an identity.
     """
-    controls_name = log.of_type(SteeringControls)
-    if controls_name is None:
-        raise MissingDataError("no speed and steering to dead-reckon from", where=log.name, wanted="SteeringControls")
-    controls: SteeringControls = log[controls_name]
+    _, motion = motion_stream(log)
     stream, observations = landmark_stream(log, config.detector)
-    early = int(np.searchsorted(observations.times, controls.times[0] - config.control_hold, side="left"))
-    if early:
-        drops.drop(stream, "before the first control", early)
-    scans = observations.take(slice(early, None))
+    where = f"{log.name}/{stream}"
+    if len(motion.times) == 0:
+        raise MissingDataError("motion stream is empty", where=log.name)
+    early = int(np.searchsorted(observations.times, motion.times[0] - config.control_hold, side="left"))
+    late = len(observations.times)
+    if isinstance(motion, Odometry):  # controls are held to the end; recorded odometry ends where it ends
+        late = int(np.searchsorted(observations.times, motion.times[-1] + config.control_hold, side="right"))
+    drops.drop(stream, "before the first control", early)
+    drops.drop(stream, "after the last odometry", len(observations.times) - late)
+    scans = observations.take(slice(early, late))
     first_row = int(observations.offsets[early])
     usable = scans.ranges <= config.max_range
     drops.drop(stream, f"observations beyond {config.max_range:g} m", int((~usable).sum()))
     if config.association == "known":
         if scans.ids is None:
-            raise MissingDataError("known association needs identities", where=f"{log.name}/{stream}", wanted="ids")
+            raise MissingDataError("known association needs identities", where=where, wanted="ids")
         unknown = usable & (scans.ids < 0)
         drops.drop(stream, "observations without identity", int(unknown.sum()))
         usable &= ~unknown
+    elif len(scans.ranges) and not np.any(scans.has_bearing):
+        raise MissingDataError(
+            "ranges alone cannot be associated by likelihood", where=where, wanted='association = "known"'
+        )
     scans, kept = _only(scans, usable)
     if len(scans.times) == 0:
-        raise MissingDataError("no scan to work on", where=f"{log.name}/{stream}")
-    own = scans.sigmas**2
-    filter_var = own if config.noise is None else config.noise.variances(scans.ranges)
-    smooth_var = filter_var if config.smoothing_noise is None else config.smoothing_noise.variances(scans.ranges)
-    t_start = float(min(controls.times[0], scans.times[0]))
-    controls = replace(controls, times=np.concatenate([[t_start], controls.times[1:]]))  # held backwards
+        raise MissingDataError("no scan to work on", where=where)
+    filter_var = _variances(scans, config.noise)
+    smooth_var = filter_var if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
+    t_start = float(min(motion.times[0], scans.times[0]))
     stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
-    odometry = steering_odometry(controls, stamps, config.motion)
+    odometry, motion_name = dead_reckoning(log, stamps, config.motion, hold=config.control_hold)
     if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
         odometry = odometry.take(slice(1, None))
     rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
-    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({controls_name, stream}))
+    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({motion_name, stream}))
+
+
+def _variances(scans: LandmarkObservations, noise: RangeBearingNoise | None) -> Array:
+    """``(q, 2)`` variances of range and bearing, from the model or the log; an absent bearing stays absent."""
+    if noise is None:
+        return np.asarray(scans.sigmas**2)
+    return np.where(scans.has_bearing[:, None] | [True, False], noise.variances(scans.ranges), np.inf)
 
 
 def known_slots(observations: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
