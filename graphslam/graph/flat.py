@@ -48,6 +48,31 @@ class System:
         return float(self.chi2.sum())
 
 
+@dataclass(frozen=True)
+class FactorBlocks:
+    """Every factor by itself, linearised at one point, robust kernels left aside.
+
+    Parameters
+    ----------
+    records : tuple of Record
+        In the order of the blocks.
+    columns : tuple of (k,) int
+        Free and fixed columns of each factor; -1 = fixed.
+    H : tuple of (k, k)
+        ``Jᵀ Λ J``.
+    d2 : (f,)
+        ``rᵀ Λ r``.
+    weight : (f,)
+        Weight that the factor's kernel gives it in :attr:`System.A`; 1 without one.
+    """
+
+    records: tuple[Record, ...]
+    columns: tuple[Index, ...]
+    H: tuple[Array, ...]
+    d2: Array
+    weight: Array
+
+
 def _offsets(lengths: Sequence[int]) -> Index:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
@@ -186,13 +211,43 @@ class FlatGraph:
         data = np.bincount(slot, weights=H[keep], minlength=len(indices))
         return System(sp.csc_matrix((data, indices, indptr), shape=(n, n)), gradient, out)
 
+    def factor_blocks(self, values: Values) -> FactorBlocks:
+        """Every factor by itself at ``values``: what leverages and class-wise dof are made of."""
+        H, g, chi2 = np.zeros(self._H_offset[-1]), np.zeros(self._g_offset[-1]), np.zeros(len(self.records))
+        S, B = len(self._submaps), len(self._betweens)
+        submap_blocks(
+            np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), self._start,
+            self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
+            True, H, self._H_offset, g, self._g_offset, chi2[:S],
+        )  # fmt: skip
+        self._small_blocks(values, True, H, g, chi2[S:])
+        (r_b, _), (r_f, _) = self._whitened_terms(values)
+        d2 = chi2.copy()
+        d2[S : S + B + len(r_f)] = np.concatenate([np.sum(r_b**2, axis=1), np.sum(r_f**2, axis=1)])
+        weight = np.ones(len(d2))
+        weight[S : S + len(self._code)] = robust_terms(d2[S : S + len(self._code)], self._code, self._k)[1]
+        columns = [self._columns[a:b] for a, b in zip(self._g_offset, self._g_offset[1:])]
+        blocks = [H[a:b].reshape(len(c), len(c)) for a, b, c in zip(self._H_offset, self._H_offset[1:], columns)]
+        return FactorBlocks(
+            tuple(self.records[k] for k in self._position),
+            tuple(columns),
+            tuple(b / w for b, w in zip(blocks, weight)),
+            d2,
+            weight,
+        )
+
+    def _whitened_terms(self, values: Values) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Whitened residuals and Jacobians of between factors and of GPS fixes."""
+        r_b, J_b = self._between_terms(values)
+        F = len(self._fixes)
+        r_f, J_f = gps_jacobians(values, self._f_node, self._f_arm, self._f_z, self._f_bias) if F else (_R0, _J0)
+        b = np.einsum("kij,kj->ki", self._b_W, r_b), self._b_W @ J_b
+        return b, (np.einsum("kij,kj->ki", self._f_W, r_f), self._f_W @ J_f)
+
     def _small_blocks(self, values: Values, hessian: bool, H: Array, g: Array, chi2: Array) -> None:
         """Between factors, GPS fixes and bias priors, all of a kind at once."""
         S, B, F = len(self._submaps), len(self._betweens), len(self._fixes)
-        r_b, J_b = self._between_terms(values)
-        r_f, J_f = gps_jacobians(values, self._f_node, self._f_arm, self._f_z, self._f_bias) if F else (_R0, _J0)
-        r_b, J_b = np.einsum("kij,kj->ki", self._b_W, r_b), self._b_W @ J_b
-        r_f, J_f = np.einsum("kij,kj->ki", self._f_W, r_f), self._f_W @ J_f
+        (r_b, J_b), (r_f, J_f) = self._whitened_terms(values)
         d2 = np.concatenate([np.sum(r_b**2, axis=1), np.sum(r_f**2, axis=1)])
         chi2[: B + F], w = robust_terms(d2, self._code, self._k)
         bias = values.biases[self._p_bias] if len(self._p_bias) else np.zeros((0, 2))

@@ -80,7 +80,7 @@ def test_errors_inside_a_map_equal_a_count_one_by_one(data):
 
 
 def test_hand_case_of_errors_inside_a_map():
-    #                      right  right wrong clutter-in-real | clutter, clutter, real-in-clutter | duplicate of 7 | unused
+    # four of 7 (one is of 8, one clutter); two of clutter and one of 9; a duplicate of 7; 8 twice, unused
     got = association_errors([0, 0, 0, 0, 1, 1, 1, 2, -1, -1], [7, 7, 8, -1, -1, -1, 9, 7, 8, 8], min_hits=3)
     assert got == AssociationErrors(sightings=8, wrong=3, landmarks=3, spurious=1, duplicated=1, missed=1)
     assert got.wrong_share == pytest.approx(3 / 8)

@@ -1,0 +1,166 @@
+"""Is a solved graph honest where no truth is known? χ² per class of factor, and the tools of such tests.
+
+Residuals at the optimum are smaller than the noise, because the unknowns were fitted to them: a class of factors keeps
+``rows - leverage`` degrees of freedom, its leverage being the share of the unknowns that it determined. Withheld GPS
+(:mod:`graphslam.evaluate.gps_innovation`) and loops against each other
+(:mod:`graphslam.evaluate.loop_consistency`) are the other two tests that need nothing but the data.
+
+All are two-sided: below the bounds an estimate is pessimistic, and its gates let in what they should keep out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from graphslam.core.geometry import Array
+from graphslam.evaluate.consistency import Verdict
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.pose_graph import PoseGraph
+
+
+def two_sided(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
+    """Bounds of ``χ²_dof / dof`` and the verdict on ``ratio``."""
+    a = (1.0 - confidence) / 2.0
+    low, high = (float(stats.chi2.ppf(q, dof) / dof) for q in (a, 1.0 - a))
+    return low, high, "over-confident" if ratio > high else "pessimistic" if ratio < low else "consistent"
+
+
+def correlated_dof(covariance: Array, d: int) -> float:
+    """Degrees of freedom of a sum of ``n / d`` normalised squares that are correlated with each other.
+
+    ``Σ eᵢᵀ Pᵢ⁻¹ eᵢ`` has the mean n and the variance ``2 ‖C‖²`` (Frobenius), C being the covariance with every d × d
+    diagonal block whitened; a ``χ²_ν`` scaled to the same two moments has ``ν = n² / ‖C‖²`` (Satterthwaite).
+
+    Parameters
+    ----------
+    covariance : (n, n)
+        Joint covariance of all errors.
+    d : int
+        Size of one error.
+    """
+    n = len(covariance)
+    k = n // d
+    blocks = covariance.reshape(k, d, k, d)[np.arange(k), :, np.arange(k), :]
+    W = np.linalg.inv(np.linalg.cholesky(blocks))
+    C = np.einsum("kij,kjm->kim", W, covariance.reshape(k, d, n)).reshape(n, k, d)
+    C = np.einsum("nkj,kij->nki", C, W)
+    return float(n**2 / np.sum(C**2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassConsistency:
+    """χ² of one class of factors against what it should be at the optimum.
+
+    Parameters
+    ----------
+    name : str
+    factors, rows : int
+        Factors, and scalars that they measure.
+    leverage : float
+        Unknowns that this class determined: ``Σ w tr(J P Jᵀ Λ)``. Summed over the classes it is the number of
+        unknowns.
+    dof : float
+        Expectation of :attr:`chi2` if the stated noise is right: ``rows - leverage`` without kernels; with them (their
+        weights taken as given) ``Σ tr(I - 2 w H + J P M P Jᵀ Λ)``, ``M = Σ w² Jᵀ Λ J``.
+    chi2 : float
+        ``Σ rᵀ Λ r``, without kernels.
+    mean_weight, least_weight : float
+        Weights that the kernels gave; 1 where there are none.
+    confidence : float
+    """
+
+    name: str
+    factors: int
+    rows: int
+    leverage: float
+    dof: float
+    chi2: float
+    mean_weight: float
+    least_weight: float
+    confidence: float = 0.95
+
+    @property
+    def ratio(self) -> float:
+        """χ²/dof; ``nan`` for a class whose every row went into the unknowns."""
+        return self.chi2 / self.dof if self.dof > 1e-6 * self.rows else float("nan")
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of a table, with the two-sided bounds of the ratio and the verdict.
+
+        The bounds are those of ``χ²_dof``. One class of several is a part of a projection and varies less, so they are
+        wide rather than narrow.
+        """
+        low, high, verdict = float("nan"), float("nan"), "no redundancy"
+        if np.isfinite(self.ratio):
+            low, high, verdict = two_sided(self.ratio, self.dof, self.confidence)
+        return {
+            "class": self.name,
+            "factors": self.factors,
+            "rows": self.rows,
+            "leverage": self.leverage,
+            "dof": self.dof,
+            "chi2": self.chi2,
+            "chi2_per_dof": self.ratio,
+            "low": low,
+            "high": high,
+            "verdict": verdict,
+            "mean_weight": self.mean_weight,
+            "least_weight": self.least_weight,
+        }
+
+
+def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str, ClassConsistency]:
+    """χ² and effective degrees of freedom of every class of factors, at the graph's present values.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        At its optimum: elsewhere residuals are larger than the leverages say.
+
+    Returns
+    -------
+    dict
+        By class: ``submap``, ``gps``, ``match`` …
+    """
+    covariance = graph.covariance()
+    blocks = graph.flat().factor_blocks(graph.values)
+    sandwich = _sandwich(covariance, blocks) if np.any(blocks.weight != 1.0) else None
+    sums: dict[str, list[tuple[float, ...]]] = {}
+    for record, columns, H, d2, w in zip(blocks.records, blocks.columns, blocks.H, blocks.d2, blocks.weight):
+        free = columns >= 0
+        c, H_free = columns[free], H[np.ix_(free, free)]
+        h = float(np.sum(H_free * covariance.columns(c))) if len(c) else 0.0
+        again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
+        dof = record.rows - 2.0 * w * h + again
+        sums.setdefault(record.group, []).append((record.rows, w * h, dof, float(d2), float(w)))
+    out = {}
+    for name, rows in sums.items():
+        n, leverage, dof, chi2, weight = np.array(rows).T
+        out[name] = ClassConsistency(
+            name=name,
+            factors=len(rows),
+            rows=int(n.sum()),
+            leverage=float(leverage.sum()),
+            dof=float(dof.sum()),
+            chi2=float(chi2.sum()),
+            mean_weight=float(weight.mean()),
+            least_weight=float(weight.min()),
+            confidence=confidence,
+        )
+    return out
+
+
+def _sandwich(covariance: JointCovariance, blocks: Any) -> Array:
+    """``P (Σ w² Jᵀ Λ J) P``: covariance of the estimate itself where kernels weigh the factors."""
+    n = covariance.layout.size
+    M = np.zeros((n, n))
+    for columns, H, w in zip(blocks.columns, blocks.H, blocks.weight):
+        free = columns >= 0
+        c = columns[free]
+        np.add.at(M, (c[:, None], c[None, :]), w**2 * H[np.ix_(free, free)])  # a column may stand twice
+    P = covariance.full()
+    return np.asarray(P @ M @ P)
