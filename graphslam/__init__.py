@@ -20,6 +20,8 @@ _VERBS = {
     "solve": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",
     "open_run": "graphslam.app.verbs",
+    "study": "graphslam.app.verbs",
+    "open_study": "graphslam.app.verbs",
 }
 
 __all__ = ["__version__", *_VERBS]

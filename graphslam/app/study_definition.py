@@ -84,6 +84,20 @@ def fingerprint(trial: Callable[..., Any]) -> str:
     return hashlib.sha256(_described(trial).encode()).hexdigest()[:16]
 
 
+def source_digest() -> str:
+    """Short digest of the installed code of graphslam and its front ends.
+
+    Versions change with a release; between releases this tells whether two trials were run by the same code.
+    """
+    digest = hashlib.sha256()
+    for package in ("graphslam", "frontends"):
+        root = Path(str(importlib.import_module(package).__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{package}/{path.relative_to(root).as_posix()}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 def _described(value: Any) -> str:
     """A value as text that is the same in every process: no addresses, no order of sets, arrays in full."""
     if isinstance(value, partial):
@@ -98,7 +112,7 @@ def _described(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_described(v) for v in value) + "]"
     if isinstance(value, np.ndarray):
-        return f"array({value.dtype}, {value.shape}, {hashlib.sha256(np.ascontiguousarray(value)).hexdigest()})"
+        return f"array({value.dtype}, {value.shape}, {hashlib.sha256(value.tobytes()).hexdigest()})"
     if callable(value) and hasattr(value, "__qualname__"):
         return f"{value.__module__}.{value.__qualname__}"
     if isinstance(value, np.generic):

@@ -6,17 +6,16 @@ Statistics are elsewhere (:mod:`graphslam.evaluate.tables`): the table is what w
 from __future__ import annotations
 
 import logging
-import multiprocessing
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from typing import Literal
 
 import pandas as pd
 from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.random import SeedTree
+from graphslam.evaluate.executors import Executor, Job, execute
 
 logger = logging.getLogger(__name__)
 
@@ -56,13 +55,28 @@ def trial_seed(study_seed: int, trial: int) -> int:
     return int(SeedTree(study_seed).child("trial", trial).generator().integers(0, 2**63))
 
 
+def check_measurements(values: Iterable[object]) -> str | None:
+    """What is wrong with what a trial gave, or None: something else than a measurement, or a figure given twice."""
+    seen: set[tuple[str, str, int, bool]] = set()
+    for m in values:
+        if not isinstance(m, Measurement):
+            return f"the trial gave a {type(m).__name__}; wanted Measurement"
+        key = (m.algorithm, m.quantity, m.submap, m.timing)
+        if key in seen:
+            return f"{m.quantity!r} of {m.algorithm!r} at submap {m.submap} stands twice"
+        seen.add(key)
+    return None
+
+
 def run_trials(
     trial: Trial,
     trials: int | Sequence[int],
     *,
     seed: int = 0,
-    executor: Literal["serial", "processes"] = "serial",
+    executor: Executor = "serial",
     workers: int | None = None,
+    address: str | None = None,
+    timings: bool = False,
     progress: bool = True,
 ) -> pd.DataFrame:
     """Run trials and collect their figures.
@@ -70,15 +84,16 @@ def run_trials(
     Parameters
     ----------
     trial : callable int → iterable of Measurement
-        Gets the trial's seed. With ``processes`` it must be importable (a function of a module, or a partial).
+        Gets the trial's seed. Anywhere but in this process it must be importable (a function of a module, or a
+        partial).
     trials : int or sequence of int
         Number of trials, or the numbers of those to run (to go on with a study, or to repeat one).
     seed : int
         Seed of the study.
-    executor : {"serial", "processes"}
-        ``processes`` are spawned, never forked: a forked child of a threaded library hangs or dies.
-    workers : int, optional
-        Number of processes; default the number of processors.
+    executor, workers, address
+        See :func:`graphslam.evaluate.executors.execute`.
+    timings : bool
+        Give the measured times instead of the reproducible figures.
     progress : bool
         Show a progress bar.
 
@@ -91,50 +106,29 @@ def run_trials(
     Raises
     ------
     TrialError
-        A trial raised; its number and seed are in the message, its exception is the cause.
+        A trial failed; its number, its seed and the error are in the message, its traceback in a note.
+    ConfigError
+        Unknown executor, a trial listed twice, or one that cannot be sent to another process.
     """
     numbers = list(range(trials)) if isinstance(trials, int) else [int(k) for k in trials]
     if len(set(numbers)) != len(numbers):
         raise ConfigError("a trial is listed twice")
-    run = {"serial": _serial, "processes": _processes}.get(executor)
-    if run is None:
-        raise ConfigError(f"unknown executor {executor!r}; known: serial, processes")
-    seeds = {k: trial_seed(seed, k) for k in numbers}
-    rows: dict[int, list[Measurement]] = {}
-    for k, measured in tqdm(run(trial, seeds, workers), total=len(numbers), desc="trials", disable=not progress):
-        rows[k] = measured
-    flat = [(k, m.algorithm, m.submap, m.quantity, float(m.value)) for k in numbers for m in rows[k]]
+    jobs = {k: Job(f"trial {k}", trial, trial_seed(seed, k)) for k in numbers}
+    number_of = {job.name: k for k, job in jobs.items()}
+    rows: dict[int, tuple[Measurement, ...]] = {}
+    outcomes = execute(list(jobs.values()), executor=executor, workers=workers, address=address)
+    with closing(outcomes):
+        for outcome in tqdm(outcomes, total=len(numbers), desc="trials", disable=not progress):
+            error = outcome.error or check_measurements(outcome.values)
+            if error is not None:
+                failure = TrialError(f"{outcome.job.name} (seed {outcome.job.seed}) failed: {error}")
+                if outcome.details:
+                    failure.add_note(outcome.details)
+                raise failure
+            rows[number_of[outcome.job.name]] = outcome.values
+    flat = [
+        (k, m.algorithm, m.submap, m.quantity, float(m.value)) for k in numbers for m in rows[k] if m.timing == timings
+    ]
     logger.info("%d trials, %d figures", len(numbers), len(flat))
     table = pd.DataFrame(flat, columns=list(COLUMNS))
     return table.astype({"run": "int64", "submap": "int64", "value": "float64"})
-
-
-def _call(trial: Trial, seed: int) -> list[Measurement]:
-    return list(trial(seed))
-
-
-def _failed(k: int, seed: int, error: Exception) -> TrialError:
-    return TrialError(f"trial {k} (seed {seed}) failed: {type(error).__name__}: {error}")
-
-
-def _serial(trial: Trial, seeds: dict[int, int], workers: int | None) -> Iterator[tuple[int, list[Measurement]]]:
-    for k, s in seeds.items():
-        try:
-            measured = _call(trial, s)
-        except Exception as error:
-            raise _failed(k, s, error) from error
-        yield k, measured
-
-
-def _processes(trial: Trial, seeds: dict[int, int], workers: int | None) -> Iterator[tuple[int, list[Measurement]]]:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
-        futures = {pool.submit(_call, trial, s): k for k, s in seeds.items()}
-        for future in as_completed(futures):
-            k = futures[future]
-            try:
-                measured = future.result()
-            except Exception as error:
-                pool.shutdown(cancel_futures=True)
-                raise _failed(k, seeds[k], error) from error
-            yield k, measured
