@@ -5,27 +5,27 @@ the frame of the first base, which is fixed. Submap k measures ``x_{k+1}`` and i
 eq. 15) with its full joint covariance, and the objective is ``Σ rᵀ P⁻¹ r`` (no half).
 
 Why it is fast: the Jacobian of a landmark is a rotation ``Rᵀ``, so a 2×2 block ``W`` of a submap's information enters
-the normal equations as ``R W Rᵀ``. Written as ``W = p 1 + q J + deviator(u, v)``, only (u, v) change, by a rotation of
-2θ. Refreshing the matrix costs a few vector operations on the stored blocks instead of two dense products a submap.
+the normal equations as ``R W Rᵀ``. Refreshing the matrix is one pass over the information matrices in compiled code,
+instead of two dense products a submap.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 from scipy.linalg import lapack
 
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, tangent_to_vector_covariance, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.submap_model import predict_points
-from graphslam.graph.submap_pattern import BlockPattern, Entries
+from graphslam.graph import submap_kernels as kernels
+from graphslam.graph.submap_pattern import BlockPattern
 
-Index = npt.NDArray[np.intp]
+Index = npt.NDArray[np.int64]
 
 
 def landmark_map_of(submap: Submap) -> LandmarkMap:
@@ -131,6 +131,10 @@ class SubmapProblem:
         In order: submap k+1 starts where submap k ends. Landmarks carry global ids; an id may stand twice in a submap.
     scale : (m,) or float, optional
         Factor on the covariance of each submap (default 1).
+    ids : sequence of (n_k,), optional
+        Global ids of the entries of every submap, instead of those they carry.
+    information : sequence of (3 + 2 n_k, 3 + 2 n_k), optional
+        Their information matrices (before ``scale``) where they are known already.
 
     Attributes
     ----------
@@ -149,103 +153,66 @@ class SubmapProblem:
         A submap whose information is not positive definite.
     """
 
-    def __init__(self, submaps: Sequence[Submap], *, scale: ArrayLike | None = None) -> None:
-        check_identified(submaps)
+    def __init__(
+        self,
+        submaps: Sequence[Submap],
+        *,
+        scale: ArrayLike | None = None,
+        ids: Sequence[npt.NDArray[np.int64]] | None = None,
+        information: Sequence[Array] | None = None,
+    ) -> None:
+        if ids is None:
+            check_identified(submaps)
         maps = [landmark_map_of(s) for s in submaps]
         self.m = m = len(maps)
         weights = 1.0 / _check_scale(1.0 if scale is None else scale, m)
-        all_ids = np.concatenate([a.ids for a in maps])
+        all_ids = np.concatenate([a.ids for a in maps] if ids is None else list(ids))
         unique, first, inverse = np.unique(all_ids, return_index=True, return_inverse=True)
         by_sighting = np.argsort(first, kind="stable")
-        rank = np.empty(len(unique), dtype=np.intp)
+        rank = np.empty(len(unique), dtype=np.int64)
         rank[by_sighting] = np.arange(len(unique))
         self.ids = unique[by_sighting]
         self.size = 3 * m + 2 * len(self.ids)
 
-        # Pairs: for every submap its end position, then its landmarks. Nodes: pose k is node k, landmark j node m + j.
-        counts = np.array([1 + len(a) for a in maps])
-        self._owner = np.repeat(np.arange(m), counts)
-        first_pair = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        is_landmark = np.ones(len(self._owner), dtype=bool)
-        is_landmark[first_pair] = False
-        self._node = self._owner.copy()
+        # Entries: of every submap its end, then its landmarks. Nodes: pose k is node k, landmark j node m + j.
+        counts = np.array([1 + len(a) for a in maps], dtype=np.int64)
+        self._entry_ptr = _offsets(counts)
+        owner = np.repeat(np.arange(m), counts)
+        is_landmark = np.ones(len(owner), dtype=bool)
+        is_landmark[self._entry_ptr[:-1]] = False
+        self._node = owner.astype(np.int64)
         self._node[is_landmark] = m + rank[inverse.ravel()]
-        self._z = np.concatenate([np.vstack([a.exit_pose[:2], a.positions]) for a in maps])
-        self._z_heading = np.array([a.exit_pose[2] for a in maps])
-        # Rows of submap k: its heading, then its pairs.
-        first_row = np.concatenate([[0], np.cumsum(1 + 2 * counts)[:-1]])
-        self._row_heading = first_row
-        self._row_pair = (first_row[self._owner] + 1 + 2 * (np.arange(len(self._owner)) - first_pair[self._owner]))[
-            :, None
-        ] + np.arange(2)
-        self._row_owner = np.repeat(np.arange(m), 1 + 2 * counts)
-        self.measurements = len(self._row_owner)
-        self._first_sighting = np.flatnonzero(is_landmark)[first[by_sighting]]
-        self._gather_information(submaps, maps, weights, first_pair)
-
-    def _gather_information(
-        self, submaps: Sequence[Submap], maps: list[LandmarkMap], weights: Array, first_pair: Index
-    ) -> None:
-        """Flatten the information matrices and lay out the sparse pattern of the normal equations."""
-        data, indices, blocks, left, right, to_pair, to_itself = [], [], [], [], [], [], []
+        self._width = np.repeat([3, 2], [m, len(self.ids)]).astype(np.int64)
+        self._node_at = _offsets(self._width)[:-1]
+        rows = 1 + 2 * counts
+        self._row_ptr = _offsets(rows)
+        self.measurements = int(self._row_ptr[-1])
+        self._z = np.concatenate([a.mean for a in maps])
+        self._omega_ptr = _offsets(rows * rows)
+        self._omega = np.empty(self._omega_ptr[-1])
         for k, (submap, landmarks) in enumerate(zip(submaps, maps)):
-            W = weights[k] * dense_information(landmarks, what=f"submap {submap.key}")
-            n = len(landmarks) + 1
-            heading_first = np.concatenate([[2, 0, 1], np.arange(3, len(W))])
-            W = W[np.ix_(heading_first, heading_first)]
-            data.append(W.ravel())
-            to_itself.append(W[0, 0])
-            to_pair.append(W[0, 1:].reshape(-1, 2))
-            indices.append(np.tile(np.arange(len(W)) + self._row_heading[k], len(W)))
-            blocks.append(W[1:, 1:].reshape(n, 2, n, 2).swapaxes(1, 2).reshape(-1, 2, 2))
-            left.append(np.repeat(np.arange(n), n) + first_pair[k])
-            right.append(np.tile(np.arange(n), n) + first_pair[k])
-        lengths = np.diff(np.append(self._row_heading, self.measurements))
-        indptr = np.concatenate([[0], np.cumsum(np.repeat(lengths, lengths))])
-        self._omega = sp.csr_matrix(
-            (np.concatenate(data), np.concatenate(indices), indptr), shape=(self.measurements,) * 2
-        )
-        W, a, b = np.concatenate(blocks), np.concatenate(left), np.concatenate(right)
-        self._heading_pair = np.concatenate(to_pair)  # Ω between a submap's heading and its pairs, (N, 2)
-        self._heading_heading = np.array(to_itself)
-        self._column_sums = np.stack(  # Σ_a W_ab for every pair b: what the start position feels of it
-            [np.bincount(b, W[:, i, j], len(self._owner)) for i in (0, 1) for j in (0, 1)], -1
-        )
-        self._build_pattern(W, a, b)
+            W = dense_information(landmarks, what=f"submap {submap.key}") if information is None else information[k]
+            self._omega[self._omega_ptr[k] : self._omega_ptr[k + 1]] = (weights[k] * W).ravel()
+        sighting = first[by_sighting]  # among the landmark entries of all submaps
+        self._first_owner = owner[is_landmark][sighting]
+        self._first_row = self._row_ptr[self._first_owner] + 3
+        self._first_row += 2 * (np.flatnonzero(is_landmark)[sighting] - self._entry_ptr[self._first_owner] - 1)
 
-    def _build_pattern(self, W: Array, a: Index, b: Index) -> None:
-        m, node, owner = self.m, self._node, self._owner
-        moved = np.flatnonzero(owner > 0)  # pairs of submaps whose start is not the fixed first base
-        later = np.arange(1, m)
-        sizes = np.concatenate([np.full(m, 3), np.full(len(self.ids), 2)])
-        order_rows = np.concatenate([node[a], owner[moved] - 1])
-        order_columns = np.concatenate([node[b], node[moved]])
-        pattern = BlockPattern(sizes, order_rows, order_columns)
-        keep = pattern.upper(node[a], node[b])
-        self._W = np.stack(
-            [
-                0.5 * (W[keep, 0, 0] + W[keep, 1, 1]),
-                0.5 * (W[keep, 1, 0] - W[keep, 0, 1]),
-                0.5 * (W[keep, 0, 0] - W[keep, 1, 1]),
-                0.5 * (W[keep, 0, 1] + W[keep, 1, 0]),
-            ]
+    @cached_property
+    def pattern(self) -> BlockPattern:
+        """Pattern of ``JᵀΩJ`` and its factorisation; made when it is first needed."""
+        ptr, neighbours = kernels.adjacency(len(self._width), self._entry_ptr, self._node)
+        return BlockPattern(self._width, ptr, neighbours)
+
+    @cached_property
+    def _slots(self) -> tuple[Index, Index]:
+        """Where the block of every two entries of a submap goes, its start counted in."""
+        p = self.pattern
+        pair_ptr = _offsets((1 + np.diff(self._entry_ptr)) ** 2)
+        slots = kernels.entry_slots(
+            len(self._width), self._entry_ptr, self._node, pair_ptr, p.ptr, p.neighbours, p.block, p.flip
         )
-        self._W_owner = owner[a[keep]]
-        a, b = a[keep], b[keep]
-        two = [(i, j) for i in (0, 1) for j in (0, 1)]
-        every = np.arange(len(owner))
-        first_pair = np.searchsorted(owner, np.arange(m))
-        entries: list[Entries] = [(node[a], i, node[b], j) for i, j in two]
-        entries += [(owner[every], 2, node, j) for j in (0, 1)]
-        entries += [(node[first_pair], j, np.arange(m), 2) for j in (0, 1)]  # same block: the other triangle
-        entries += [(np.arange(m), 2, np.arange(m), 2)]
-        entries += [(owner[moved] - 1, i, node[moved], j) for i, j in two]
-        entries += [(owner[moved] - 1, 2, node[moved], j) for j in (0, 1)]
-        entries += [(later - 1, i, later, 2) for i in (0, 1, 2)]
-        entries += [(later - 1, i, later - 1, j) for i in (0, 1, 2) for j in (0, 1, 2)]
-        pattern.place(entries)
-        self.pattern = pattern
-        self._moved, self._first_pair = moved, first_pair
+        return pair_ptr, slots
 
     # ---------------------------------------------------------------- values
 
@@ -264,9 +231,9 @@ class SubmapProblem:
             In the order of :attr:`ids`, instead of the first sighting.
         """
         if poses is None:
-            heading = np.cumsum(self._z_heading)
+            z = self._z[self._row_ptr[:-1, None] + np.arange(3)]
+            heading = np.cumsum(z[:, 2])
             before = np.concatenate([[0.0], heading[:-1]])
-            z = self._z[self._first_pair]
             c, s = np.cos(before), np.sin(before)
             step = np.stack([c * z[:, 0] - s * z[:, 1], s * z[:, 0] + c * z[:, 1]], -1)
             P = np.column_stack([np.cumsum(step, axis=0), wrap_angle(heading)])
@@ -276,11 +243,11 @@ class SubmapProblem:
                 raise GeometryError("initial poses do not fit the submaps", got=P.shape, wanted=(self.m, 3))
         x = np.concatenate([P.ravel(), np.zeros(2 * len(self.ids))])
         if landmarks is None:
-            owner, z = self._owner[self._first_sighting], self._z[self._first_sighting]
-            s0 = self.starts(x)[owner]
+            zx, zy = self._z[self._first_row], self._z[self._first_row + 1]
+            s0 = self.starts(x)[self._first_owner]
             c, s = np.cos(s0[:, 2]), np.sin(s0[:, 2])
-            x[3 * self.m :: 2] = s0[:, 0] + c * z[:, 0] - s * z[:, 1]
-            x[3 * self.m + 1 :: 2] = s0[:, 1] + s * z[:, 0] + c * z[:, 1]
+            x[3 * self.m :: 2] = s0[:, 0] + c * zx - s * zy
+            x[3 * self.m + 1 :: 2] = s0[:, 1] + s * zx + c * zy
         else:
             l = np.asarray(landmarks, dtype=np.float64)
             if l.shape != (len(self.ids), 2) or not np.all(np.isfinite(l)):
@@ -288,77 +255,43 @@ class SubmapProblem:
             x[3 * self.m :] = l.ravel()
         return x
 
-    def _predict(self, x: Array) -> tuple[Array, Array, Array]:
-        """Start poses, predicted pairs ``(N, 2)`` and residual ``(measurements,)`` (eq. 15)."""
-        starts, ends = self.starts(x), x[: 3 * self.m].reshape(-1, 3)
-        points = np.vstack([ends[:, :2], x[3 * self.m :].reshape(-1, 2)])
-        q = predict_points(starts, points[self._node], self._owner)
-        r = np.empty(self.measurements)
-        r[self._row_heading] = wrap_angle(ends[:, 2] - starts[:, 2] - self._z_heading)
-        r[self._row_pair] = q - self._z
-        return starts, q, r
+    def _split(self, x: Array) -> tuple[Array, Array]:
+        """End poses ``(m, 3)`` and landmarks ``(L, 2)``."""
+        return x[: 3 * self.m].reshape(-1, 3), x[3 * self.m :].reshape(-1, 2)
 
     def residual(self, x: Array) -> Array:
-        """``H(X) - z``, submap by submap: heading first, then end position and landmarks ``(measurements,)``."""
-        return self._predict(x)[2]
-
-    def objective(self, x: Array) -> float:
-        """``Σ rᵀ P⁻¹ r`` at the values ``x`` ``(size,)``."""
-        r = self.residual(x)
-        return float(r @ (self._omega @ r))
+        """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15)."""
+        poses, points = self._split(np.ascontiguousarray(x, dtype=np.float64))
+        r = np.empty(self.measurements)
+        kernels.predict(poses, points, self.m, self._entry_ptr, self._node, self._z, r)
+        return r
 
     def objective_per_submap(self, x: Array) -> Array:
         """The share ``(m,)`` of every submap in the objective: which of them disagrees with the rest."""
-        r = self.residual(x)
-        return np.asarray(np.bincount(self._row_owner, r * (self._omega @ r), self.m), dtype=np.float64)
+        out = np.empty(self.m)
+        kernels.chi2(self._row_ptr, self._omega, self._omega_ptr, self.residual(x), out)
+        return out
+
+    def objective(self, x: Array) -> float:
+        """``Σ rᵀ P⁻¹ r`` at the values ``x`` ``(size,)``."""
+        return float(np.sum(self.objective_per_submap(x)))
 
     def linearise(self, x: Array) -> tuple[float, Array, Array]:
-        """Objective, ``JᵀΩr`` ``(size,)``, and the values of ``JᵀΩJ`` in :attr:`pattern` (elimination order)."""
-        m, owner, node, moved = self.m, self._owner, self._node, self._moved
-        starts, q, r = self._predict(x)
-        c, s = np.cos(starts[:, 2]), np.sin(starts[:, 2])
-        d = np.empty_like(r)  # the column of J that belongs to the start heading
-        d[self._row_heading] = -1.0
-        d[self._row_pair] = np.stack([q[:, 1], -q[:, 0]], -1)
-        omega_rd = self._omega @ np.stack([r, d], -1)
-        cp, sp_ = c[owner], s[owner]
-
-        def to_world(v: Array) -> Array:
-            return np.stack([cp * v[:, 0] - sp_ * v[:, 1], sp_ * v[:, 0] + cp * v[:, 1]])
-
-        def per_submap(v: Array) -> Array:
-            return np.stack([np.bincount(owner, row, m) for row in v])
-
-        force = to_world(omega_rd[self._row_pair, 0])
-        g_point = np.stack([np.bincount(node, row, m + len(self.ids)) for row in force])
-        total = per_submap(force)
-        g_pose = np.column_stack([g_point[:, :m].T, omega_rd[self._row_heading, 0]])
-        g_pose[:-1, :2] -= total[:, 1:].T
-        g_pose[:-1, 2] += np.bincount(self._row_owner, d * omega_rd[:, 0], m)[1:]
-        g = np.concatenate([g_pose.ravel(), g_point[:, m:].T.ravel()])
-
-        c2, s2 = c * c - s * s, 2.0 * c * s
-        blocks = _rotate_blocks(self._W, c2[self._W_owner], s2[self._W_owner])
-        p = self._column_sums
-        sums = np.stack([0.5 * (p[:, 0] + p[:, 3]), 0.5 * (p[:, 2] - p[:, 1]), 0.5 * (p[:, 0] - p[:, 3])])
-        sums = np.vstack([sums, 0.5 * (p[:, 1] + p[:, 2])[None]])
-        pull = _rotate_blocks(sums, c2[owner], s2[owner])  # R (Σ_a W_ab) Rᵀ
-        turn = to_world(omega_rd[self._row_pair, 1])
-        heading_pair = to_world(self._heading_pair)
-        ss = per_submap(pull)[:, 1:]
-        st = per_submap(turn)[:, 1:]
-        tt = np.bincount(self._row_owner, d * omega_rd[:, 1], m)[1:]
-        values = [blocks, heading_pair, heading_pair[:, self._first_pair], self._heading_heading]
-        values += [-pull[:, moved], turn[:, moved], -per_submap(heading_pair)[:, 1:]]
-        values += [omega_rd[self._row_heading, 1][1:], ss[0], ss[1], -st[0], ss[2], ss[3], -st[1], -st[0], -st[1], tt]
-        return float(r @ omega_rd[:, 0]), g, self.pattern.assemble(np.concatenate([v.ravel() for v in values]))
+        """Objective, ``JᵀΩr`` ``(size,)``, and the values of ``JᵀΩJ`` in :attr:`pattern`."""
+        x = np.ascontiguousarray(x, dtype=np.float64)
+        r, poses = self.residual(x), self._split(x)[0]
+        g, values = np.zeros(self.size), np.zeros(self.pattern.entries)
+        pair_ptr, slots = self._slots
+        f = kernels.linearise(
+            poses, self.m, self._entry_ptr, self._node, self._node_at, self._row_ptr, self._z, self._omega,
+            self._omega_ptr, r, pair_ptr, slots, g, values,
+        )  # fmt: skip
+        return float(f), g, values
 
 
-def _rotate_blocks(parts: Array, c2: Array, s2: Array) -> Array:
-    """``R W Rᵀ`` from the parts ``(p, q, u, v)`` of W, as rows w00, w01, w10, w11."""
-    p, q, u, v = parts
-    ur, vr = c2 * u - s2 * v, s2 * u + c2 * v
-    return np.stack([p + ur, vr - q, vr + q, p - ur])
+def _offsets(counts: npt.NDArray[np.int64]) -> Index:
+    """``[0, c_0, c_0 + c_1, …]``."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 def relabel(submaps: Sequence[Submap], ids: Sequence[npt.ArrayLike]) -> list[Submap]:

@@ -8,11 +8,8 @@ rotation of the position part, so ``J_tangent = J_vector · blkdiag(R(θ), 1)``.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.geometry import Array, rotation2, wrap_angle
-
-Index = npt.NDArray[np.intp]
 
 
 def predict_submap(start: Array, end: Array, landmarks: Array) -> Array:
@@ -78,25 +75,3 @@ def submap_jacobians(start: Array, end: Array, landmarks: Array, *, tangent: boo
     J_end[:2, :2] = Rt @ rotation2(end[2]) if tangent else Rt
     J_end[2, 2] = 1.0
     return J_start, J_end, Rt
-
-
-def predict_points(starts: Array, points: Array, owner: Index) -> Array:
-    """The position rows of eq. 15 for many submaps at once.
-
-    Parameters
-    ----------
-    starts : (m, 3)
-        World base pose of every submap.
-    points : (N, 2)
-        World positions of end poses and landmarks, in any order.
-    owner : (N,)
-        Which submap each point is seen from.
-
-    Returns
-    -------
-    (N, 2)
-        ``R(θ_s)ᵀ (p - p_s)`` in the base frame of its submap.
-    """
-    c, s = np.cos(starts[:, 2])[owner], np.sin(starts[:, 2])[owner]
-    dx, dy = points[:, 0] - starts[owner, 0], points[:, 1] - starts[owner, 1]
-    return np.stack([c * dx + s * dy, c * dy - s * dx], -1)

@@ -188,7 +188,7 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
     """
     x = np.array(x, dtype=np.float64)
     headings = np.arange(2, 3 * problem.m, 3)
-    permutation, pattern = problem.pattern.permutation, problem.pattern
+    pattern = problem.pattern
     damping, converged, iterations = 0.0, False, 0
     f, g, data = problem.linearise(x)
     history = [f]
@@ -196,8 +196,7 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
         raise SolverError(f"objective is {f} at the start; wanted a finite number")
     while iterations < max_iterations:
         iterations += 1
-        step = np.empty_like(x)
-        step[permutation] = -pattern.factor(data, damping).solve(g[permutation])
+        step = -pattern.factor(data, damping).solve(g)
         promised = float(-(g @ step))  # = gᵀ H⁻¹ g, the decrease of the linear model, when there is no damping
         trial = x + step
         trial[headings] = wrap_angle(trial[headings])

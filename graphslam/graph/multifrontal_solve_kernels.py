@@ -1,0 +1,202 @@
+"""Numba kernels: what a multifrontal factor is for: solutions, and entries of the inverse. Plain arrays only.
+
+Scalars are numbered in order of elimination; ``start`` and ``row`` say which of them are the rows of each panel.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@nb.njit(cache=True)
+def forward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
+    """``x ← L⁻¹ x`` for ``x`` ``(n,)``; ``own`` ``(S + 1,)`` is the first scalar of every supernode."""
+    for s in range(len(own) - 1):
+        w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
+        P = L[panel_ptr[s] : panel_ptr[s + 1]].reshape(w, r)
+        for c in range(w):
+            v = x[own[s] + c] / P[c, c]
+            x[own[s] + c] = v
+            for i in range(c + 1, r):
+                x[row[at + i]] -= P[c, i] * v
+
+
+@nb.njit(cache=True)
+def backward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
+    """``x ← L⁻ᵀ x`` for ``x`` ``(n,)``."""
+    for s in range(len(own) - 2, -1, -1):
+        w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
+        P = L[panel_ptr[s] : panel_ptr[s + 1]].reshape(w, r)
+        for c in range(w - 1, -1, -1):
+            v = x[own[s] + c]
+            for i in range(c + 1, r):
+                v -= P[c, i] * x[row[at + i]]
+            x[own[s] + c] = v / P[c, c]
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def forward_units(
+    own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
+) -> tuple[Array, Index]:
+    """``L⁻¹ E`` for unit columns ``unit`` ``(k,)``: its rows that are not zero, and which they are.
+
+    Only the supernodes between a unit's own and the root are visited.
+    """
+    S, k = len(own) - 1, len(unit)
+    visited = np.zeros(S, np.bool_)
+    count = 0
+    for u in unit:
+        s = np.searchsorted(own, u, side="right") - 1
+        while s >= 0 and not visited[s]:
+            visited[s] = True
+            count += own[s + 1] - own[s]
+            s = parent[s]
+    place = np.full(own[S], -1, np.int64)
+    which = np.empty(count, np.int64)
+    n = 0
+    for s in range(S):
+        if visited[s]:
+            for c in range(own[s], own[s + 1]):
+                place[c] = n
+                which[n] = c
+                n += 1
+    W = np.zeros((count, k))
+    for j in range(k):
+        W[place[unit[j]], j] = 1.0
+    for s in range(S):
+        if not visited[s]:
+            continue
+        w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
+        P = L[panel_ptr[s] : panel_ptr[s + 1]].reshape(w, r)
+        for c in range(w):
+            v = W[place[own[s] + c]]
+            inverse = 1.0 / P[c, c]
+            for j in range(k):
+                v[j] *= inverse
+            for i in range(c + 1, r):
+                f = P[c, i]
+                y = W[place[row[at + i]]]
+                for j in range(k):
+                    y[j] -= f * v[j]
+    return W, which
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def inverse_diagonal(
+    own: Index,
+    start: Index,
+    row: Index,
+    parent: Index,
+    panel_ptr: Index,
+    L: Array,
+    begin: Index,
+    width: int,
+    most: int,
+) -> Array:
+    """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
+
+    With a panel's own scalars S and those below R, ``Y = L_RS L_SS⁻¹``: ``Z_RS = -Z_RR Y`` and
+    ``Z_SS = L_SS⁻ᵀ L_SS⁻¹ - Yᵀ Z_RS``; ``Z_RR`` lies inside the front of the parent, which is kept as long as it has
+    children to come.
+
+    Parameters
+    ----------
+    begin : (k,)
+        First scalar of each block; a block lies inside one supernode.
+    width : int
+        Scalars of a block.
+    most : int
+        Most rows of a front.
+
+    Returns
+    -------
+    (k, width, width)
+    """
+    S = len(own) - 1
+    out = np.zeros((len(begin), width, width))
+    by_super = np.argsort(begin)
+    left = np.zeros(S, np.int64)  # children still to come
+    for s in range(S):
+        if parent[s] >= 0:
+            left[parent[s]] += 1
+    base = np.zeros(S, np.int64)  # where the front of s begins on the stack
+    stack = np.empty(4 * most * most)
+    height = 0
+    local = np.empty(own[S], np.int64)
+    q = len(begin) - 1
+    for s in range(S - 1, -1, -1):
+        w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
+        n = r - w
+        P = L[panel_ptr[s] : panel_ptr[s + 1]].reshape(w, r)
+        if height + r * r > len(stack):
+            bigger = np.empty(2 * len(stack) + r * r)
+            bigger[:height] = stack[:height]
+            stack = bigger
+        base[s] = height
+        Z = stack[height : height + r * r].reshape(r, r)
+        height += r * r
+        if parent[s] >= 0:
+            t = parent[s]
+            rt = start[t + 1] - start[t]
+            T = stack[base[t] : base[t] + rt * rt].reshape(rt, rt)
+            for i in range(rt):
+                local[row[start[t] + i]] = i
+            for i in range(n):
+                li = local[row[at + w + i]]
+                for j in range(n):
+                    Z[w + i, w + j] = T[li, local[row[at + w + j]]]
+        # Y, row by row of R, and the inverse of L_SS: both from L_SS x = e-like back substitutions
+        Y = np.empty((w, n))
+        for c in range(w - 1, -1, -1):
+            for i in range(n):
+                Y[c, i] = P[c, w + i]
+            for b in range(c + 1, w):
+                f = P[c, b]
+                for i in range(n):
+                    Y[c, i] -= f * Y[b, i]
+            inverse = 1.0 / P[c, c]
+            for i in range(n):
+                Y[c, i] *= inverse
+        M = np.zeros((w, w))  # L_SS⁻ᵀ, upper
+        for c in range(w):
+            M[c, c] = 1.0 / P[c, c]
+            for b in range(c - 1, -1, -1):
+                v = 0.0
+                for d in range(b + 1, c + 1):
+                    v -= P[b, d] * M[d, c]
+                M[b, c] = v / P[b, b]
+        for c in range(w):
+            for i in range(n):
+                v = 0.0
+                for j in range(n):
+                    v -= Z[w + i, w + j] * Y[c, j]
+                Z[c, w + i] = v
+                Z[w + i, c] = v
+        for c in range(w):
+            for b in range(c, w):
+                v = 0.0
+                for d in range(b, w):
+                    v += M[c, d] * M[b, d]
+                for i in range(n):
+                    v -= Y[c, i] * Z[b, w + i]
+                Z[c, b] = v
+                Z[b, c] = v
+        while q >= 0 and begin[by_super[q]] >= own[s]:
+            k = by_super[q]
+            for i in range(width):
+                for j in range(width):
+                    out[k, i, j] = Z[begin[k] - own[s] + i, begin[k] - own[s] + j]
+            q -= 1
+        t = s
+        while t >= 0 and left[t] == 0:
+            height = base[t]
+            t = parent[t]
+            if t >= 0:
+                left[t] -= 1
+    return out

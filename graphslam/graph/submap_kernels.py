@@ -1,0 +1,350 @@
+"""Numba kernels: the pattern of landmark submaps, their Gauss–Newton blocks, and block matrices as CSC. Plain arrays.
+
+Every submap is a list of *entries*: its end pose (3 scalars), then its landmarks (2 each), in the order of its mean
+and information matrix. Nodes: end pose of submap k is node k, landmark j node m + j. Submap k starts at node k - 1;
+the first starts at the fixed base, which is no node.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@nb.njit(cache=True)
+def adjacency(N: int, entry_ptr: Index, entry_node: Index) -> tuple[Index, Index]:
+    """Neighbours ``(N + 1,), (nb,)`` of every node, itself first: all that stands in one submap or starts it."""
+    m = len(entry_ptr) - 1
+    count = np.zeros(N + 1, np.int64)
+    for k in range(m):
+        for e in range(entry_ptr[k], entry_ptr[k + 1]):
+            count[entry_node[e] + 1] += 1
+        if k:
+            count[k] += 1
+    start = np.cumsum(count)
+    fill = start[:-1].copy()
+    inside = np.empty(start[N], np.int64)  # submaps of every node
+    for k in range(m):
+        if k:
+            inside[fill[k - 1]] = k
+            fill[k - 1] += 1
+        for e in range(entry_ptr[k], entry_ptr[k + 1]):
+            inside[fill[entry_node[e]]] = k
+            fill[entry_node[e]] += 1
+    seen = np.full(N, -1, np.int64)
+    ptr = np.zeros(N + 1, np.int64)
+    for sweep in range(2):  # count, then write
+        if sweep:
+            idx = np.empty(ptr[N], np.int64)
+            seen[:] = -1
+        else:
+            idx = np.empty(0, np.int64)
+        at = 0
+        for i in range(N):
+            seen[i] = i
+            if sweep:
+                idx[at] = i
+            at += 1
+            for q in range(start[i], start[i + 1]):
+                k = inside[q]
+                if k and seen[k - 1] != i:
+                    seen[k - 1] = i
+                    if sweep:
+                        idx[at] = k - 1
+                    at += 1
+                for e in range(entry_ptr[k], entry_ptr[k + 1]):
+                    j = entry_node[e]
+                    if seen[j] != i:
+                        seen[j] = i
+                        if sweep:
+                            idx[at] = j
+                        at += 1
+            ptr[i + 1] = at
+    return ptr, idx
+
+
+@nb.njit(cache=True)
+def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[Index, Index, int]:
+    """Room for the block of every pair, stored once, with the rows of the node that is eliminated first.
+
+    Returns
+    -------
+    block : (nb,)
+        Offset of the block of each listed pair; both directions of a pair share it.
+    flip : (nb,)
+        1 where the block is stored the other way round (rows of the neighbour).
+    size : int
+    """
+    block = np.empty(len(idx), np.int64)
+    flip = np.zeros(len(idx), np.int64)
+    at = 0
+    for i in range(len(position)):
+        for e in range(ptr[i], ptr[i + 1]):
+            if position[idx[e]] >= position[i]:
+                block[e] = at
+                at += width[i] * width[idx[e]]
+    for i in range(len(position)):
+        for e in range(ptr[i], ptr[i + 1]):
+            j = idx[e]
+            if position[j] < position[i]:
+                flip[e] = 1
+                for f in range(ptr[j], ptr[j + 1]):
+                    if idx[f] == i:
+                        block[e] = block[f]
+                        break
+    return block, flip, at
+
+
+@nb.njit(cache=True)
+def entry_slots(
+    N: int, entry_ptr: Index, entry_node: Index, pair_ptr: Index, ptr: Index, idx: Index, block: Index, flip: Index
+) -> Index:
+    """Offset ``(pair_ptr[-1],)`` of the block of every two entries of a submap, -1 where it is stored flipped.
+
+    The list of submap k is a square over ``[start, entries…]``.
+    """
+    m = len(entry_ptr) - 1
+    slot = np.full(pair_ptr[m], -1, np.int64)
+    where = np.full(N, -1, np.int64)
+    for k in range(m):
+        n = entry_ptr[k + 1] - entry_ptr[k] + 1
+        for a in range(n):
+            i = entry_node[entry_ptr[k] + a - 1] if a else k - 1
+            if i < 0:
+                continue
+            for e in range(ptr[i], ptr[i + 1]):
+                where[idx[e]] = -1 if flip[e] else block[e]
+            for b in range(n):
+                j = entry_node[entry_ptr[k] + b - 1] if b else k - 1
+                if j >= 0:
+                    slot[pair_ptr[k] + a * n + b] = where[j]
+    return slot
+
+
+@nb.njit(cache=True)
+def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array) -> None:
+    """Residual ``H(X) - z`` of all submaps, one after the other in the order of their means (eq. 15)."""
+    at = 0
+    for k in range(m):
+        sx, sy, st = 0.0, 0.0, 0.0
+        if k:
+            sx, sy, st = poses[k - 1, 0], poses[k - 1, 1], poses[k - 1, 2]
+        c, s = np.cos(st), np.sin(st)
+        for e in range(entry_ptr[k], entry_ptr[k + 1]):
+            j = entry_node[e]
+            if j < m:
+                dx, dy = poses[j, 0] - sx, poses[j, 1] - sy
+            else:
+                dx, dy = points[j - m, 0] - sx, points[j - m, 1] - sy
+            r[at] = c * dx + s * dy - z[at]
+            r[at + 1] = c * dy - s * dx - z[at + 1]
+            at += 2
+            if j < m:
+                turn = poses[j, 2] - st - z[at]
+                r[at] = turn - 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
+                at += 1
+
+
+@nb.njit(cache=True)
+def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
+    """``rᵀ Ω r`` of every submap."""
+    for k in range(len(row_ptr) - 1):
+        n, a = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
+        W = omega[omega_ptr[k] : omega_ptr[k + 1]].reshape(n, n)
+        total = 0.0
+        for i in range(n):
+            v = 0.0
+            for j in range(n):
+                v += W[i, j] * r[a + j]
+            total += v * r[a + i]
+        out[k] = total
+
+
+@nb.njit(cache=True)
+def linearise(
+    poses: Array,
+    m: int,
+    entry_ptr: Index,
+    entry_node: Index,
+    node_at: Index,
+    row_ptr: Index,
+    z: Array,
+    omega: Array,
+    omega_ptr: Index,
+    r: Array,
+    pair_ptr: Index,
+    slot: Index,
+    g: Array,
+    value: Array,
+) -> float:
+    """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
+
+    A position is measured through ``Rᵀ``, so a block ``W`` of Ω enters as ``R W Rᵀ``; a heading as it is. The start
+    moves all positions the other way: its translation columns are minus the sum of theirs.
+
+    Parameters
+    ----------
+    poses : (m, 3)
+    node_at : (N,)
+        First scalar of each node.
+    row_ptr : (m + 1,); z, r : (rows,)
+        Measurement and residual of every submap.
+    omega, omega_ptr
+        Information matrices, row-major.
+    pair_ptr, slot
+        From :func:`entry_slots`.
+    """
+    f = 0.0
+    most = 0
+    for k in range(m):
+        most = max(most, row_ptr[k + 1] - row_ptr[k])
+    d, wr, wd = np.empty(most), np.empty(most), np.empty(most)
+    turned = np.empty((most, most))
+    for k in range(m):
+        n, a0 = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
+        entries = entry_ptr[k + 1] - entry_ptr[k]
+        W = omega[omega_ptr[k] : omega_ptr[k + 1]].reshape(n, n)
+        st = poses[k - 1, 2] if k else 0.0
+        c, s = np.cos(st), np.sin(st)
+        # Rows: 0, 1 end position, 2 end heading, then landmarks. d is the column of the start heading.
+        for i in range(n):
+            if i == 2:
+                d[i] = -1.0
+            elif (i < 2 and i == 0) or (i > 2 and i % 2 == 1):
+                qx, qy = r[a0 + i] + z[a0 + i], r[a0 + i + 1] + z[a0 + i + 1]
+                d[i], d[i + 1] = qy, -qx
+        for i in range(n):
+            v, u = 0.0, 0.0
+            for j in range(n):
+                v += W[i, j] * r[a0 + j]
+                u += W[i, j] * d[j]
+            wr[i], wd[i] = v, u
+            f += v * r[a0 + i]
+        # T W Tᵀ with T = blkdiag(R, 1, R, R, …): rows first, then columns
+        for j in range(n):
+            turned[2, j] = W[2, j]
+        for e in range(entries):
+            i = 0 if e == 0 else 1 + 2 * e
+            for j in range(n):
+                turned[i, j] = c * W[i, j] - s * W[i + 1, j]
+                turned[i + 1, j] = s * W[i, j] + c * W[i + 1, j]
+        for i in range(n):
+            for e in range(entries):
+                j = 0 if e == 0 else 1 + 2 * e
+                x, y = turned[i, j], turned[i, j + 1]
+                turned[i, j], turned[i, j + 1] = c * x - s * y, s * x + c * y
+        for e in range(entries):
+            i = 0 if e == 0 else 1 + 2 * e
+            x, y = wr[i], wr[i + 1]
+            wr[i], wr[i + 1] = c * x - s * y, s * x + c * y
+            x, y = wd[i], wd[i + 1]
+            wd[i], wd[i + 1] = c * x - s * y, s * x + c * y
+        slots = slot[pair_ptr[k] : pair_ptr[k + 1]].reshape(entries + 1, entries + 1)
+        gx, gy = 0.0, 0.0
+        dd = -wd[2]  # dᵀ Ω d; d of the positions is turned like the rest
+        dr = -wr[2]
+        for e in range(entries):
+            i = 0 if e == 0 else 1 + 2 * e
+            wi = 3 if e == 0 else 2
+            at = node_at[entry_node[entry_ptr[k] + e]]
+            for p in range(wi):
+                g[at + p] += wr[i + p]
+            gx += wr[i]
+            gy += wr[i + 1]
+            dx, dy = c * d[i] - s * d[i + 1], s * d[i] + c * d[i + 1]
+            dd += dx * wd[i] + dy * wd[i + 1]
+            dr += dx * wr[i] + dy * wr[i + 1]
+            for h in range(entries):
+                v = slots[e + 1, h + 1]
+                if v >= 0:
+                    j = 0 if h == 0 else 1 + 2 * h
+                    wj = 3 if h == 0 else 2
+                    for p in range(wi):
+                        for q in range(wj):
+                            value[v + p * wj + q] += turned[i + p, j + q]
+        if k == 0:
+            continue
+        at = node_at[k - 1]
+        g[at] -= gx
+        g[at + 1] -= gy
+        g[at + 2] += dr
+        # Coupling of the start with every entry: translation, then heading
+        sxx, sxy, syy, sxt, syt = 0.0, 0.0, 0.0, 0.0, 0.0
+        for e in range(entries):
+            i = 0 if e == 0 else 1 + 2 * e
+            wi = 3 if e == 0 else 2
+            one, other = slots[0, e + 1], slots[e + 1, 0]
+            for p in range(wi):
+                tx, ty = 0.0, 0.0
+                for h in range(entries):
+                    j = 0 if h == 0 else 1 + 2 * h
+                    tx -= turned[j, i + p]
+                    ty -= turned[j + 1, i + p]
+                if p == 0:
+                    sxx -= tx
+                elif p == 1:
+                    sxy -= tx
+                    syy -= ty
+                if one >= 0:
+                    value[one + p] += tx
+                    value[one + wi + p] += ty
+                    value[one + 2 * wi + p] += wd[i + p]
+                else:
+                    value[other + 3 * p] += tx
+                    value[other + 3 * p + 1] += ty
+                    value[other + 3 * p + 2] += wd[i + p]
+            sxt -= wd[i]
+            syt -= wd[i + 1]
+        own = slots[0, 0]
+        value[own] += sxx
+        value[own + 1] += sxy
+        value[own + 2] += sxt
+        value[own + 3] += sxy
+        value[own + 4] += syy
+        value[own + 5] += syt
+        value[own + 6] += sxt
+        value[own + 7] += syt
+        value[own + 8] += dd
+    return f
+
+
+@nb.njit(cache=True)
+def to_csc(
+    nodes: Index, width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array
+) -> tuple[Index, Index, Array]:
+    """``indptr, indices, data`` of a block matrix with its nodes in the order ``nodes`` ``(N,)``; indices ascend.
+
+    Every pair is listed both ways; ``flip`` ``(nb,)`` is 1 where the block has the neighbour's rows.
+    """
+    N = len(nodes)
+    first = np.empty(N, np.int64)
+    n = 0
+    for i in nodes:
+        first[i] = n
+        n += width[i]
+    indptr = np.zeros(n + 1, np.int64)
+    for i in range(N):
+        for e in range(ptr[i], ptr[i + 1]):
+            for q in range(width[idx[e]]):
+                indptr[first[idx[e]] + q + 1] += width[i]
+    for c in range(n):
+        indptr[c + 1] += indptr[c]
+    fill = indptr[:-1].copy()
+    indices = np.empty(indptr[n], np.int64)
+    data = np.empty(indptr[n])
+    for i in nodes:  # rows ascending, so that every column is filled in order
+        wi = width[i]
+        for p in range(wi):
+            for e in range(ptr[i], ptr[i + 1]):
+                wj = width[idx[e]]
+                for q in range(wj):
+                    c = first[idx[e]] + q
+                    indices[fill[c]] = first[i] + p
+                    data[fill[c]] = value[block[e] + (q * wi + p if flip[e] else p * wj + q)]
+                    fill[c] += 1
+    return indptr, indices, data
