@@ -71,18 +71,28 @@ class ParticleSet:
             equal_tail_gate(config.outlier_gate or np.inf, 2, 1),
         )
 
-    def _make_room(self, n_obs: int) -> None:
-        """Grow the arrays before the kernel would run out of slots, observations or scans."""
-        while self.count.max() + n_obs > self.mean.shape[1]:
-            pad = self.mean.shape[1]
-            grow = ((0, 0), (0, pad))
+    def _grow_slots(self, new_slots: int) -> None:
+        """Make the arrays hold ``new_slots`` more landmarks before the kernel runs out of them."""
+        while self.count.max() + new_slots > self.mean.shape[1]:
+            grow = ((0, 0), (0, self.mean.shape[1]))
             self.mean = np.pad(self.mean, (*grow, (0, 0)))
             self.cov = np.pad(self.cov, (*grow, (0, 0)))
             self.hits, self.misses, self.born = (np.pad(a, grow) for a in (self.hits, self.misses, self.born))
+
+    def _grow_history(self, n_obs: int) -> None:
+        """Make the history hold another scan with ``n_obs`` observations."""
         while self.observations + n_obs > self.assoc.shape[1]:
             self.assoc = np.pad(self.assoc, ((0, 0), (0, self.assoc.shape[1])), constant_values=IGNORED)
         if self.scans >= self.path.shape[1]:
             self.path = np.pad(self.path, ((0, 0), (0, self.path.shape[1]), (0, 0)))
+
+    def _column(self) -> int:
+        """Column of ``assoc`` where this scan's observations begin."""
+        return self.observations
+
+    def _record(self, n_obs: int) -> None:
+        """Note what the scan that was just taken in adds to the history."""
+        self.path[:, self.scans] = self.pose
 
     def step(self, u: Array, Q: Array, observations: Array, known: Ints) -> None:
         """One scan: motion, association, weights, maps; then resampling if the effective size is low.
@@ -98,13 +108,14 @@ class ParticleSet:
         """
         n_obs = len(observations)
         highest = int(known.max()) + 1 if n_obs else 0
-        self._make_room(max(n_obs, highest - int(self.count.max())))
+        self._grow_slots(max(n_obs, highest - int(self.count.max())))
+        self._grow_history(n_obs)
         fastslam_step(
             self.pose, self.log_weight, self.mean, self.cov, self.hits, self.misses, self.born, self.count, self.assoc,
-            self.scans, self.observations, observations, known, u, Q,
+            self.scans, self._column(), observations, known, u, Q,
             self.rng.standard_normal((len(self.pose), 3)), self.sensor, self._cfg,
         )  # fmt: skip
-        self.path[:, self.scans] = self.pose
+        self._record(n_obs)
         self.scans += 1
         self.observations += n_obs
         self.log_weight -= self.log_weight.max()
@@ -125,6 +136,9 @@ class ParticleSet:
         self.log_weight[:] = 0.0
         self.weights[:] = 1.0 / len(self.weights)
         self.resamplings += 1
+
+    def _copy_waiting(self, source: Ints) -> None:
+        """Let row k of what waits to become a landmark go on from row ``source[k]``."""
 
     @property
     def best(self) -> int:

@@ -15,11 +15,15 @@ import numpy.typing as npt
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.smoothing_kernels import smooth_kernel, smoothed_covariances, smoothing_cost
 from graphslam.core.errors import CovarianceError
-from graphslam.core.gaussian import Gaussian, moment_match
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.gaussian import Gaussian
+from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 
 Ints = npt.NDArray[np.int64]
 _HUBER2 = 1.345**2
+REGULARISER = 1e-9
+"""Added to the diagonal of every covariance made of particles [m², rad²]. A single particle, or identical ones, have no
+spread: this keeps the matrix invertible and is negligible beside any measurement. Read the NEES of such a set as
+infinite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,24 +72,103 @@ def common_features(particles: ParticleSet, association: Association) -> tuple[I
     slots : (k, L)
         Their slot of each common feature.
     """
+    table = particles.assoc[:, association.observation].astype(np.int64)
+    return majority_slots(table, association.landmark, len(association.slots))
+
+
+def majority_slots(table: Ints, landmark: Ints, count: int) -> tuple[Ints, Ints]:
+    """Slot of each common feature in each particle: the one that holds the majority of the feature's observations.
+
+    Parameters
+    ----------
+    table : (n, q)
+        Slot of each observation in each particle; negative where it has none.
+    landmark : (q,)
+        Common feature of each observation, 0 … count-1.
+    count : int
+
+    Returns
+    -------
+    kept : (k,)
+        Particles that hold every feature, each in a slot of its own.
+    slots : (k, count)
+    """
+    size = np.bincount(landmark, minlength=count)
+    width = int(table.max(initial=0)) + 1
     kept, rows = [], []
-    L = len(association.slots)
-    first = np.searchsorted(np.sort(association.landmark), np.arange(L))
-    by_landmark = association.observation[np.argsort(association.landmark, kind="stable")]
-    groups = np.split(by_landmark, first[1:]) if L else []
-    for i in range(len(particles.pose)):
-        row = np.full(L, -1, dtype=np.int64)
-        for f, members in enumerate(groups):
-            held = particles.assoc[i, members]
-            held = held[held >= 0]
-            if 2 * len(held) > len(members):
-                values, counts = np.unique(held, return_counts=True)
-                if 2 * counts.max() > len(members):
-                    row[f] = values[counts.argmax()]
-        if np.all(row >= 0) and len(np.unique(row)) == L:
+    for i, held in enumerate(table):
+        there = held >= 0
+        votes = np.bincount(landmark[there] * width + held[there], minlength=count * width).reshape(count, width)
+        row = votes.argmax(axis=1)
+        if np.all(2 * votes[np.arange(count), row] > size) and len(np.unique(row)) == count:
             kept.append(i)
             rows.append(row)
-    return np.array(kept, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(len(kept), L)
+    return np.array(kept, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(len(kept), count)
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """First two moments of a particle set over ``[pose, landmark_1, …]``, kept apart (eq. 7–8).
+
+    Parameters
+    ----------
+    mean : (3 + 2 L,)
+        Heading averaged on the circle.
+    within : (L, 3)
+        Mean of the particles' own landmark covariances: xx, xy, yy.
+    weights : (k,)
+        Of the particles, normalised.
+    deviations : (k, 3 + 2 L)
+        Of the particles from the mean.
+    """
+
+    mean: Array
+    within: Array
+    weights: Array
+    deviations: Array
+
+    @classmethod
+    def of(cls, particles: ParticleSet, kept: Ints, slots: Ints) -> Moments:
+        """Of the particles ``kept`` with the common features in ``slots`` ``(k, L)``.
+
+        Raises
+        ------
+        CovarianceError
+            If none of them has weight.
+        """
+        w = particles.weights[kept]
+        if not w.sum() > 0.0:
+            raise CovarianceError("no particle holds the common features, nothing to moment-match")
+        w = w / w.sum()
+        features = particles.mean[kept[:, None], slots].reshape(len(kept), -1)
+        X = np.concatenate([particles.pose[kept], features], axis=1)
+        mean = w @ X
+        mean[2] = circular_mean(X[:, 2], w)  # eq. 7 on the circle
+        D = X - mean
+        D[:, 2] = wrap_angle(D[:, 2])
+        # eq. 6: Q^j = blkdiag(0, Σ_1, …)
+        return cls(mean, np.einsum("k,klc->lc", w, particles.cov[kept[:, None], slots]), w, D)
+
+    def pose_covariance(self) -> Array:
+        """Of the plain vector x, y, θ ``(3, 3)``, regularised."""
+        d = self.deviations[:, :3]
+        return np.asarray((self.weights[:, None] * d).T @ d + REGULARISER * np.eye(3))
+
+    def landmark_covariances(self) -> Array:
+        """Marginals ``(L, 2, 2)``, regularised."""
+        d = self.deviations[:, 3:].reshape(len(self.weights), -1, 2)
+        between = np.einsum("kla,klb->lab", self.weights[:, None, None] * d, d)
+        return np.asarray(self.within[:, [[0, 1], [1, 2]]] + between + REGULARISER * np.eye(2))
+
+    def joint(self, *, inflation: float = 1.0) -> Gaussian:
+        """The Gaussian over everything (eq. 8), with the part between the particles times ``inflation``."""
+        floor = REGULARISER * np.eye(len(self.mean))
+        between = (self.weights[:, None] * self.deviations).T @ self.deviations
+        within = np.zeros_like(floor)
+        ix = 3 + 2 * np.arange(len(self.within))
+        within[ix, ix], within[ix + 1, ix + 1] = self.within[:, 0], self.within[:, 2]
+        within[ix, ix + 1] = within[ix + 1, ix] = self.within[:, 1]
+        return Gaussian(self.mean, within + 0.5 * (between + between.T) * inflation + floor, (2,))
 
 
 def moment_matched(particles: ParticleSet, association: Association, *, inflate: bool = False) -> tuple[Gaussian, int]:
@@ -97,25 +180,8 @@ def moment_matched(particles: ParticleSet, association: Association, *, inflate:
         Multiply the between-particle part by 1 + 40/N (finite-sample repair for poor sensors).
     """
     kept, slots = common_features(particles, association)
-    n = 3 + 2 * slots.shape[1]
-    rows = np.arange(len(kept))[:, None]
-    means = np.concatenate([particles.pose[kept], particles.mean[kept[:, None], slots].reshape(len(kept), -1)], axis=1)
-    # eq. 6: Q^j = blkdiag(0, Σ_1, …)
-    cov = particles.cov[kept[:, None], slots]
-    within = np.zeros((len(kept), n, n))
-    ix = 3 + 2 * np.arange(slots.shape[1])
-    within[rows, ix, ix], within[rows, ix, ix + 1] = cov[..., 0], cov[..., 1]
-    within[rows, ix + 1, ix], within[rows, ix + 1, ix + 1] = cov[..., 1], cov[..., 2]
-    w = particles.weights[kept]
-    mean_within = np.einsum("m,mij->ij", w / w.sum(), within)
-    # a single particle, or identical ones, has no spread: the regulariser keeps the matrix invertible and is negligible
-    # beside any measurement
-    floor = 1e-9 * np.eye(n)
-    g = moment_match(w, means, floor, angular=(2,))
-    between = g.covariance - floor
-    if inflate:
-        between = between * (1.0 + 40.0 / len(particles.pose))
-    return Gaussian(g.mean, mean_within + between + floor, (2,)), len(particles.pose) - len(kept)
+    n = len(particles.pose)
+    return Moments.of(particles, kept, slots).joint(inflation=1.0 + 40.0 / n if inflate else 1.0), n - len(kept)
 
 
 @dataclass(frozen=True, slots=True)

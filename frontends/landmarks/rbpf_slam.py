@@ -1,0 +1,218 @@
+"""RBPF-SLAM with a single map over the whole log: the baseline that Combined SLAM compares submaps with.
+
+One FastSLAM filter, moment-matched (B3) wherever it is asked what it believes. Forty particles cannot hold the
+uncertainty of a long path, so this map is over-confident by orders of magnitude; it is here to be measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.landmarks.config import RbpfSlamConfig
+from frontends.landmarks.lineage import WholeMapParticles
+from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from frontends.landmarks.snapshot import Snapshot
+from frontends.landmarks.summarise import REGULARISER, Moments
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array, circular_mean, vector_to_tangent_covariance, wrap_angle
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.records import LandmarkObservations
+from graphslam.core.submap import LandmarkMap, Submap
+from graphslam.core.trajectory import Trajectory
+
+Ints = npt.NDArray[np.int64]
+Joint = Literal["none", "last", "all"]
+
+
+class WholeMapFilter:
+    """The filter of one log, scan by scan.
+
+    Parameters
+    ----------
+    data : Prepared
+    config : RbpfSlamConfig
+    rng : numpy Generator
+    """
+
+    def __init__(self, data: Prepared, config: RbpfSlamConfig, rng: np.random.Generator) -> None:
+        obs = data.observations
+        self.data, self.config = data, config
+        miss_range = 0.9 * min(config.max_range, obs.max_range)
+        self.particles = WholeMapParticles(config, obs.T_base_sensor, obs.field_of_view, miss_range, rng)
+        self._slot_of: dict[int, int] = {}
+
+    def advance(self) -> None:
+        """Take in the next scan."""
+        k, obs = self.particles.scans, self.data.observations
+        rows = obs.scan(k)
+        if self.config.association == "known":
+            known = known_slots(obs, rows, self._slot_of)
+        else:
+            known = np.full(rows.stop - rows.start, -1, dtype=np.int64)
+        odometry = self.data.odometry
+        self.particles.step(odometry.increments[k], odometry.covariances[k], self.data.rows[rows], known)
+
+    def ids(self, slots: Ints) -> Ints:
+        """Identities of the landmarks in ``slots`` of the standard particle; -1 where the filter found them itself."""
+        by_slot = {s: i for i, s in self._slot_of.items()}
+        return np.array([by_slot.get(int(s), -1) for s in slots], dtype=np.int64)
+
+    def snapshot(self, *, joint: bool) -> tuple[Snapshot, int, Ints]:
+        """What the particles believe, the number of those left out of it (B4), and the standard particle's slots."""
+        p = self.particles
+        kept, slots = p.features(self.config.min_hits)
+        m = Moments.of(p, kept, slots)
+        standard = slots[int(np.argmax(p.weights[kept]))]
+        snapshot = Snapshot(
+            scan=p.scans,
+            time=float(self.data.observations.times[p.scans - 1]),
+            pose=m.mean[:3],
+            pose_covariance=m.pose_covariance(),
+            landmark_ids=self.ids(standard),
+            landmarks=m.mean[3:].reshape(-1, 2),
+            landmark_covariances=m.landmark_covariances(),
+            gaussian=m.joint() if joint else None,
+        )
+        return snapshot, len(p.pose) - len(kept), standard
+
+
+def rbpf_snapshots(
+    log: SensorLog,
+    config: RbpfSlamConfig,
+    *,
+    seed: SeedTree,
+    cuts: Sequence[int] | Ints,
+    joint: Joint = "last",
+    drops: DropCounter | None = None,
+) -> Iterator[Snapshot]:
+    """Run one filter over the log and say what it believes at each cut.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : RbpfSlamConfig
+    seed : SeedTree
+    cuts : sequence of int
+        Numbers of scans after which a snapshot is taken, increasing; the filter stops at the last one.
+    joint : {"last", "all", "none"}
+        Which snapshots carry the joint Gaussian; the others hold the marginals of pose and landmarks.
+    drops : DropCounter, optional
+
+    Yields
+    ------
+    Snapshot
+        Moment-matched (B3) in the frame of the first base.
+
+    Raises
+    ------
+    ConfigError
+        If the cuts do not increase or lie outside the log.
+    MissingDataError
+        See :func:`frontends.landmarks.prepare.prepare`.
+    """
+    if joint not in ("last", "all", "none"):
+        raise ConfigError(f"joint = {joint!r}; known: last, all, none")
+    data = prepare(log, config, drops if drops is not None else DropCounter())
+    at = [int(c) for c in cuts]
+    if any(b <= a for a, b in zip([0, *at], at)) or (at and at[-1] > len(data)):
+        raise ConfigError(f"cuts must increase from 1 to the log's {len(data)} scans, got {at[:3]} … {at[-1:]}")
+    filter = WholeMapFilter(data, config, seed.generator())
+    for k, cut in enumerate(at):
+        while filter.particles.scans < cut:
+            filter.advance()
+        yield filter.snapshot(joint=joint == "all" or (joint == "last" and k == len(at) - 1))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class RbpfSlam:
+    """The front end ``rbpf-slam``: the whole log as one submap.
+
+    Needs a stream of controls or odometry, and one of landmark observations or, with the tree detector, of laser scans.
+    """
+
+    config: RbpfSlamConfig = field(default_factory=RbpfSlamConfig)
+    name: ClassVar[str] = "rbpf-slam"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        if after is None:
+            data = prepare(log, self.config, drops if drops is not None else DropCounter())
+            yield self._build(data, seed.child(0))
+
+    def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
+        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans).
+
+        Raises
+        ------
+        MissingDataError
+        """
+        return landmark_stream(log, self.config.detector)
+
+    def _build(self, data: Prepared, seed: SeedTree) -> Submap:
+        filter = WholeMapFilter(data, self.config, seed.generator())
+        p, times = filter.particles, data.observations.times
+        while p.scans < len(times):
+            filter.advance()
+        end, dropped, slots = filter.snapshot(joint=True)
+        assert end.gaussian is not None
+        report: dict[str, Any] = {
+            "ended": "end-of-log",
+            "scans": p.scans,
+            "observations": p.observations,
+            "resamplings": p.resamplings,
+            "min_ess": round(p.min_ess, 3),
+            "ancestors": p.ancestors,
+            "dropped_particles": dropped,
+            "regulariser": REGULARISER,
+        }
+        landmarks = LandmarkMap(
+            ids=end.landmark_ids,
+            exit_pose=end.pose,
+            positions=end.landmarks,
+            covariance=end.gaussian.covariance,
+            sightings=self._sightings(filter, slots),
+        )
+        return Submap.from_landmarks(
+            0,
+            landmarks,
+            interval=(data.t_start, float(times[-1])),
+            trajectory=_trajectory(filter),
+            uses=data.uses,
+            report=report,
+        )
+
+    def _sightings(self, filter: WholeMapFilter, slots: Ints) -> Ints | None:
+        """Observations of the landmarks handed over, as the standard particle has them; None with known identities."""
+        if self.config.association == "known":
+            return None
+        p = filter.particles
+        rank = np.full(p.hits.shape[1] + 1, -1, dtype=np.int64)  # its last entry serves slot -1
+        rank[slots] = np.arange(len(slots))
+        landmark = rank[p.associations()[:, p.best]]
+        used = np.flatnonzero(landmark >= 0)
+        return np.column_stack([filter.data.original[used], landmark[used]])
+
+
+def _trajectory(filter: WholeMapFilter) -> Trajectory:
+    """Mean path of the particles that are left, with their scatter; the base stands first, exactly known."""
+    p, times, t_start = filter.particles, filter.data.observations.times, filter.data.t_start
+    paths, w = p.paths(), p.weights
+    mean = np.einsum("k,tkc->tc", w, paths)
+    mean[:, 2] = [circular_mean(a, w) for a in paths[:, :, 2]]
+    d: Array = paths - mean[:, None]
+    d[..., 2] = wrap_angle(d[..., 2])
+    covariances = np.einsum("k,tka,tkb->tab", w, d, d) + REGULARISER * np.eye(3)
+    covariances = vector_to_tangent_covariance(mean, covariances)
+    if t_start < times[0]:
+        times = np.concatenate([[t_start], times])
+        mean = np.concatenate([np.zeros((1, 3)), mean])
+        covariances = np.concatenate([np.zeros((1, 3, 3)), covariances])
+    return Trajectory(times, mean, covariances)
