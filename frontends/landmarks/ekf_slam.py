@@ -1,0 +1,329 @@
+"""EKF-SLAM front ends: local maps (``ekf``), a single map over the whole log (``ekf-slam``), and snapshots of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
+from frontends.landmarks.ekf_filter import EkfMap
+from frontends.landmarks.prepare import Prepared, known_slots, prepare
+from frontends.landmarks.snapshot import Snapshot
+from frontends.landmarks.stopping import Stopping
+from frontends.landmarks.summarise import Smoothed, smooth
+from graphslam.core.errors import ConfigError
+from graphslam.core.gaussian import Gaussian
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import LandmarkMap, Submap
+from graphslam.core.trajectory import Trajectory
+
+Ints = npt.NDArray[np.int64]
+OnScan = Callable[[int], None]
+
+
+class _Run:
+    """One EKF map growing from scan ``first`` on, with the path it took."""
+
+    def __init__(self, data: Prepared, config: EkfSlamConfig | EkfConfig, first: int, t_start: float) -> None:
+        obs = data.observations
+        self.data, self.config, self.first, self.t_start = data, config, first, t_start
+        self.next = first
+        self.map = EkfMap(config, obs.T_base_sensor, obs.field_of_view, obs.max_range)
+        self.slots: dict[int, int] = {}
+        self.poses: list[Array] = []
+        self.covariances: list[Array] = []
+
+    def advance(self) -> None:
+        """Take in the next scan."""
+        obs, k = self.data.observations, self.next
+        rows = obs.scan(k)
+        if self.config.association == "known":
+            known = known_slots(obs, rows, self.slots)
+        else:
+            known = np.full(rows.stop - rows.start, -1, dtype=np.int64)
+        odometry = self.data.odometry
+        self.map.step(odometry.increments[k], odometry.covariances[k], self.data.rows[rows], known)
+        self.poses.append(self.map.pose)
+        self.covariances.append(self.map.pose_tangent_covariance)
+        self.next += 1
+
+    def identities(self, slots: Ints) -> Ints:
+        """The log's identity of the landmarks ``slots``; -1 where the filter found them by itself."""
+        identity = {key: i for i, key in self.slots.items()}
+        by_founding = {founding: identity[key] for key, founding in self.map.keys.items()}
+        return np.array([by_founding.get(int(f), -1) for f in self.map.founded[slots]], dtype=np.int64)
+
+    def sightings(self, slots: Ints) -> tuple[Ints, Ints]:
+        """Observations (index in the prepared log) of the landmarks ``slots``, and the position of each in them."""
+        a = self.map.association()
+        rank = np.full(self.map.foundings + 1, -1, dtype=np.int64)
+        rank[self.map.founded[slots]] = np.arange(len(slots))
+        landmark = rank[a]  # a = -1 reads the last entry, which is -1
+        used = np.flatnonzero(landmark >= 0)
+        return used + int(self.data.observations.offsets[self.first]), landmark[used]
+
+    def trajectory(self, poses: Array, covariances: Array) -> Trajectory:
+        """Path in the base frame; the base itself stands first, exactly known, unless the first scan is the base."""
+        times = self.data.observations.times[self.first : self.next]
+        if self.t_start < times[0]:
+            times = np.concatenate([[self.t_start], times])
+            poses = np.concatenate([np.zeros((1, 3)), poses])
+            covariances = np.concatenate([np.zeros((1, 3, 3)), covariances])
+        return Trajectory(times, poses, covariances)
+
+    def report(self, used: int) -> dict[str, Any]:
+        """Counts and the filter's own figures of honesty."""
+        m, c = self.map, self.config
+        out: dict[str, Any] = {
+            "scans": m.scans,
+            "observations": m.observations,
+            "used": used,
+            "not_associated": int(np.count_nonzero(m.association() < 0)),
+            "founded": m.foundings,
+            "dropped": m.foundings - int(np.count_nonzero(m.hits > 0)),
+            "range_only_without_landmark": m.unfounded,
+            "outliers": m.outliers,
+            "nis": float(m.nis),
+            "nis_dof": m.nis_dof,
+        }
+        if c.association == "jcbb":
+            out |= {"jcbb_nodes": m.nodes, "jcbb_capped_scans": m.capped}
+        return out
+
+    def submap(self, key: int, report: dict[str, Any]) -> Submap:
+        """The filter's own Gaussian as a submap."""
+        slots = self.map.landmarks(self.config.min_hits)
+        mean, P = self.map.joint(slots)
+        rows, landmark = self.sightings(slots)
+        return self._hand_over(
+            key,
+            Gaussian(mean, P, (2,)),
+            self.identities(slots),
+            np.column_stack([self.data.original[rows], landmark]),
+            self.trajectory(np.array(self.poses), np.array(self.covariances)),
+            report | {"handover": "filter"} | self.report(len(rows)),
+        )
+
+    def smoothed_submap(self, key: int, report: dict[str, Any], trim: float) -> Submap:
+        """Gauss-Newton over the submap's poses and landmarks under the filter's association."""
+        data, obs, c = self.data, self.data.observations, self.config
+        slots = self.map.landmarks(c.min_hits)
+        mean, _ = self.map.joint(slots)
+        rows, landmark = self.sightings(slots)
+        span = slice(self.first, self.next)
+        s: Smoothed = smooth(
+            np.array(self.poses),
+            mean[3:].reshape(-1, 2),
+            data.odometry.increments[span],
+            data.odometry.covariances[span],
+            np.searchsorted(obs.offsets, rows, side="right") - 1 - self.first,
+            landmark,
+            np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]]),
+            obs.T_base_sensor,
+            trim=trim,
+            min_hits=c.min_hits,
+        )
+        index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
+        used = int(s.kept.sum())
+        counts = self.report(used)
+        counts["not_associated"] = counts["observations"] - len(rows)
+        return self._hand_over(
+            key,
+            s.gaussian,
+            self.identities(slots)[s.landmark_kept],
+            np.column_stack([data.original[rows[s.kept]], index]),
+            self.trajectory(s.poses, s.pose_covariances),
+            report
+            | {"handover": "smoothed", "trimmed": len(s.kept) - used}
+            | counts
+            | {
+                "chi2": s.chi2,
+                "dof": s.dof,
+                "chi2_odometry": float(s.parts[0]),
+                "chi2_range": float(s.parts[1]),
+                "chi2_bearing": float(s.parts[2]),
+                "converged": s.converged,
+            },
+        )
+
+    def _hand_over(
+        self, key: int, g: Gaussian, ids: Ints, sightings: Ints, path: Trajectory, report: dict[str, Any]
+    ) -> Submap:
+        landmarks = LandmarkMap(
+            ids=ids,
+            exit_pose=g.mean[:3],
+            positions=g.mean[3:].reshape(-1, 2),
+            covariance=g.covariance,
+            sightings=sightings,
+        )
+        return Submap.from_landmarks(
+            key,
+            landmarks,
+            interval=(self.t_start, float(self.data.observations.times[self.next - 1])),
+            trajectory=path,
+            uses=self.data.uses,
+            report=report,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ekf:
+    """The front end ``ekf``: EKF local maps, each a Gaussian in the frame of its base.
+
+    Needs a stream of motion and one of landmark observations or, with the tree detector, of laser scans. Draws no
+    random numbers.
+
+    Parameters
+    ----------
+    config : EkfConfig
+    """
+
+    config: EkfConfig = field(default_factory=EkfConfig)
+    name: ClassVar[str] = "ekf"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`."""
+        data = prepare(log, self.config, drops if drops is not None else DropCounter())
+        times = data.observations.times
+        key, scan, t_start = 0, 0, data.t_start
+        if after is not None:
+            t_start = after.interval[1]
+            key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
+        while scan < len(times):
+            submap, scan = self._build(data, key, scan, t_start)
+            yield submap
+            key, t_start = key + 1, submap.interval[1]
+
+    def _build(self, data: Prepared, key: int, first: int, t_start: float) -> tuple[Submap, int]:
+        """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
+        obs, run = data.observations, _Run(data, self.config, first, t_start)
+        stopping = Stopping(self.config.stopping, _measurement_sigma(data))
+        ended, previous = None, t_start
+        while ended is None and run.next < len(data):
+            k = run.next
+            run.advance()
+            now = float(obs.times[k])
+            ended = stopping.reason(
+                run.map, now - previous, data.odometry.increments[k], int(obs.offsets[k + 1] - obs.offsets[k])
+            )
+            previous = now
+        report: dict[str, Any] = {"ended": ended or "end-of-log"}
+        if self.config.handover == "filter":
+            return run.submap(key, report), run.next
+        return run.smoothed_submap(key, report, self.config.trim), run.next
+
+
+@dataclass(frozen=True, slots=True)
+class EkfSlam:
+    """The front end ``ekf-slam``: one EKF map over the whole log, handed over as a single submap.
+
+    Parameters
+    ----------
+    config : EkfSlamConfig
+    on_scan : callable, optional
+        Called with the number of scans taken in, after each: to watch progress or to take the time. It has no part in
+        the result.
+    """
+
+    config: EkfSlamConfig = field(default_factory=EkfSlamConfig)
+    on_scan: OnScan | None = None
+    name: ClassVar[str] = "ekf-slam"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`; there is nothing after the one submap."""
+        if after is not None:
+            return
+        data = prepare(log, self.config, drops if drops is not None else DropCounter())
+        run = _Run(data, self.config, 0, data.t_start)
+        while run.next < len(data):
+            run.advance()
+            if self.on_scan is not None:
+                self.on_scan(run.next)
+        yield run.submap(0, {"ended": "end-of-log"})
+
+
+def ekf_snapshots(
+    log: SensorLog,
+    config: EkfSlamConfig | EkfConfig,
+    *,
+    seed: SeedTree | None = None,
+    cuts: Sequence[int],
+    joint: Literal["last", "all", "never"] = "last",
+    drops: DropCounter | None = None,
+    on_scan: OnScan | None = None,
+) -> Iterator[Snapshot]:
+    """Run EKF-SLAM with a single map and tell what it believes after given numbers of scans.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : EkfSlamConfig or EkfConfig
+        Of the latter, what concerns local maps alone is not read.
+    seed : SeedTree, optional
+        Not used: the filter draws nothing. Here so that every filter is called alike.
+    cuts : sequence of int
+        Numbers of scans, strictly increasing, from 1 to the number of scans that can be used. The filter stops after
+        the last of them.
+    joint : {"last", "all", "never"}
+        Which snapshots carry the joint Gaussian.
+    drops : DropCounter, optional
+        Where records that are not used are counted.
+    on_scan : callable, optional
+        As in :class:`EkfSlam`.
+
+    Raises
+    ------
+    ConfigError
+        If ``cuts`` are not as above, or ``joint`` is another word.
+    """
+    if joint not in ("last", "all", "never"):
+        raise ConfigError(f"joint = {joint!r}; known: last, all, never")
+    wanted = [int(k) for k in cuts]
+    data = prepare(log, config, drops if drops is not None else DropCounter())
+    if not wanted or wanted[0] < 1 or any(b <= a for a, b in pairwise(wanted)) or wanted[-1] > len(data):
+        raise ConfigError(f"cuts must increase strictly within 1 … {len(data)}, got {wanted[:3]} … {wanted[-1:]}")
+    return _snapshots(_Run(data, config, 0, data.t_start), wanted, joint, on_scan)
+
+
+def _snapshots(run: _Run, cuts: list[int], joint: str, on_scan: OnScan | None) -> Iterator[Snapshot]:
+    for cut in cuts:
+        while run.next < cut:
+            run.advance()
+            if on_scan is not None:
+                on_scan(run.next)
+        slots = run.map.landmarks(run.config.min_hits)
+        gaussian = None
+        if joint == "all" or (joint == "last" and cut == cuts[-1]):
+            gaussian = Gaussian(*run.map.joint(slots), (2,))
+        positions, covariances = run.map.marginals(slots)
+        yield Snapshot(
+            scan=cut,
+            time=float(run.data.observations.times[cut - 1]),
+            pose=run.map.pose,
+            pose_covariance=run.map.pose_covariance,
+            landmark_ids=run.identities(slots),
+            landmarks=positions,
+            landmark_covariances=covariances,
+            gaussian=gaussian,
+        )
+
+
+def _measurement_sigma(data: Prepared) -> Array:
+    """ε of the stopping rule: mean measurement noise as x, y [m] and heading [rad]."""
+    variances = data.rows[:, 2:]
+    if not len(variances):
+        return np.ones(3)
+    along = float(np.sqrt(variances[:, 0].mean()))
+    bearing = variances[np.isfinite(variances[:, 1]), 1]
+    return np.array([along, along, float(np.sqrt(bearing.mean())) if len(bearing) else np.inf])
