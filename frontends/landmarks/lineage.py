@@ -74,8 +74,11 @@ class WholeMapParticles(ParticleSet):
         source[copies == 0] = np.repeat(source, np.maximum(copies - 1, 0))
         dead = np.flatnonzero(copies == 0)
         parent, m = source[dead], int(self.count.max())
-        for a in (self.pose, self.ancestor, self.count):
-            a[dead] = a[parent]
+        self.pose[dead], self.ancestor[dead], self.count[dead] = (
+            self.pose[parent],
+            self.ancestor[parent],
+            self.count[parent],
+        )
         for a in (self.mean, self.cov, self.hits, self.misses, self.born):
             a[dead, :m] = a[parent, :m]
         self._copy_waiting(source)

@@ -152,7 +152,5 @@ def test_sightings_of_an_unknown_association_name_the_observations(log):
 def test_known_association_needs_identities(log):
     observations = replace(log["landmarks"], ids=None)
     bare = SensorLog(name="bare", streams={"controls": log["controls"], "landmarks": observations})
-        name="bare", streams={"controls": log["controls"], "landmarks": _without_ids(log["landmarks"])}
-    )
     with pytest.raises(MissingDataError, match="identities"):
         next(rbpf_snapshots(bare, RbpfSlamConfig(association="known"), seed=SeedTree(0), cuts=[5]))
