@@ -48,6 +48,10 @@ class MotionNoise:
     """σ of the yaw rate [rad/s]."""
     yaw_rate_fraction: float = 0.0
     """Part of σ proportional to the yaw rate: σ² = yaw_rate² + (yaw_rate_fraction · ω)²."""
+    speed_walk: float = 0.0
+    """σ of the distance after one second of driving, growing with the root of time [m/√s]; speed and yaw rate only."""
+    yaw_walk: float = 0.0
+    """σ of the heading after one second of driving, growing with the root of time [rad/√s]; speed and yaw rate only."""
     per_increment: bool = False
     """True: errors of the controls are constant over an increment; False: independent per control step."""
     lateral: float = 0.0
@@ -60,7 +64,8 @@ class MotionNoise:
     """σ added to the heading of every increment [rad]."""
 
     def __post_init__(self) -> None:
-        for name in ("speed", "speed_fraction", "steering", "yaw_rate", "yaw_rate_fraction", "lateral", "heading"):
+        rates = ("speed", "speed_fraction", "speed_walk", "steering", "yaw_rate", "yaw_rate_fraction", "yaw_walk")
+        for name in (*rates, "lateral", "heading"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"motion noise {name} = {getattr(self, name)}; wanted ≥ 0")
         if not (self.floor_position > 0 and self.floor_heading > 0):
@@ -80,6 +85,8 @@ class MotionNoise:
                 self.floor_heading,
                 self.yaw_rate,
                 self.yaw_rate_fraction,
+                self.speed_walk,
+                self.yaw_walk,
             ]
         )
 
@@ -187,7 +194,8 @@ def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoi
         Stamps of the poses, strictly increasing, none before the first control.
     noise : MotionNoise
         σ² = speed² + (speed_fraction · v)² and yaw_rate² + (yaw_rate_fraction · ω)²: drawn per control, or with
-        ``per_increment`` once per increment (constant error and scale error each).
+        ``per_increment`` once per increment (constant error and scale error each). Random walks of distance and
+        heading come on top, whatever the rate of the controls.
 
     Returns
     -------

@@ -102,10 +102,11 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
     """Compose the fine steps ``first[k]:first[k + 1]`` of a base that drives arcs into increment k with its covariance.
 
     dt, speed, rate : (s,) fine steps with constant speed along x and constant yaw rate.
-    noise : (10,) as :meth:`frontends.motion.MotionNoise.as_array`.
+    noise : (12,) as :meth:`frontends.motion.MotionNoise.as_array`.
     increments : (n, 3) out; covs : (n, 3, 3) out, right tangent at the end of the increment.
     """
     sv0, sv1, sw0, sw1, correlated = noise[0], noise[1], noise[8], noise[9], noise[3] > 0.5
+    walk_v, walk_w = noise[10] ** 2, noise[11] ** 2
     P = np.zeros((3, 3))
     S = np.zeros((3, 4))  # sensitivity to constant errors: of speed, speed scale, rate, rate scale
     A = np.zeros((3, 3))
@@ -119,7 +120,10 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
             h, v, w = dt[i], speed[i], rate[i]
             if v == 0.0 and w == 0.0:
                 continue  # the base stands
-            qv, qw = sv0 * sv0 + (sv1 * v) ** 2, sw0 * sw0 + (sw1 * w) ** 2
+            qv, qw = walk_v / h, walk_w / h  # a walk of variance q · t is a rate of variance q / h over a step of h
+            if not correlated:
+                qv += sv0 * sv0 + (sv1 * v) ** 2
+                qw += sw0 * sw0 + (sw1 * w) ** 2
             d = w * h
             # exact arc: sinc = sin d / d, cosc = (1 - cos d) / d and their derivatives; series where d is small
             if abs(d) < 1e-3:
@@ -143,16 +147,15 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
             A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, 1.0
             P = A @ P @ A.T
             S = A @ S + J
-            if not correlated:
-                for r in range(3):
-                    for q in range(3):
-                        P[r, q] += J[r, 0] * qv * J[q, 0] + J[r, 2] * qw * J[q, 2]
-                # A heading error n of variance q shortens what is integrated, E cos(θ + n) = cos θ exp(-q/2). Undone
-                # here, so that noisy rates do not make paths short on average. Over a step its mean variance is that
-                # before plus a third of what the step adds (∫ u² du). Beyond 0.5 rad² nothing of first order is true.
-                unbias = math.exp(0.5 * min(spread + qw * h * h / 3.0, 0.5))
-                dx, dy = dx * unbias, dy * unbias
-                spread += qw * h * h
+            for r in range(3):
+                for q in range(3):
+                    P[r, q] += J[r, 0] * qv * J[q, 0] + J[r, 2] * qw * J[q, 2]
+            # A heading error n of variance q shortens what is integrated, E cos(θ + n) = cos θ exp(-q/2). Undone here,
+            # so that noisy rates do not make paths short on average. Over a step its mean variance is that before plus
+            # a third of what the step adds (∫ u² du). Beyond 0.5 rad² nothing of first order is true.
+            unbias = math.exp(0.5 * min(spread + qw * h * h / 3.0, 0.5))
+            dx, dy = dx * unbias, dy * unbias
+            spread += qw * h * h
             dist += abs(v) * h
             cx, sx = math.cos(th), math.sin(th)
             x, y, th = x + cx * dx - sx * dy, y + sx * dx + cx * dy, th + d

@@ -48,7 +48,7 @@ def test_arcs_equal_a_fine_integrator():
 def test_covariance_equals_the_slow_twin(per_increment):
     noise = MotionNoise(
         speed=0.02, speed_fraction=0.05, yaw_rate=0.01, yaw_rate_fraction=0.08, per_increment=per_increment,
-        lateral=0.02, heading=0.01,
+        lateral=0.02, heading=0.01, speed_walk=0.01, yaw_walk=0.015,
     )  # fmt: skip
     o = velocity_odometry(controls(), STAMPS, noise)
     for k in range(1, len(STAMPS)):
@@ -93,6 +93,18 @@ def test_noisy_rates_do_not_shorten_the_path():
     # truth 5 m; the mean of 3,000 is known to 6 mm; uncorrected it is short by 6 %
     assert np.mean(driven[True]) == pytest.approx(5.0, abs=0.03)
     assert np.mean(driven[False]) < 4.8
+
+
+def test_a_walk_does_not_depend_on_the_rate_of_the_controls():
+    noise = MotionNoise(speed=0.0, yaw_rate=0.0, speed_walk=0.02, yaw_walk=0.04)
+    found = []
+    for n in (20, 200, 2000):
+        t = np.linspace(0.0, 4.0, n, endpoint=False)
+        c = VelocityControls(times=t, speed=np.full(n, 0.5), yaw_rate=np.zeros(n))
+        found.append(velocity_odometry(c, np.array([0.0, 4.0]), noise).covariances[1])
+    np.testing.assert_allclose(found[0], found[2], rtol=2e-2, atol=1e-9)
+    # heading 0.04² · 4 s; along 0.02² · 4 s; across ∫ (v (T - t))² q dt = q v² T³ / 3 (tangent at the end)
+    np.testing.assert_allclose(np.diag(found[2]), [0.0016, 0.0016 * 0.25 * 64 / 3, 0.0064], rtol=2e-3)
 
 
 def test_a_standing_base_gains_no_more_than_the_floors():

@@ -56,9 +56,11 @@ def drive_arcs_covariance(speed, rate, dt, noise) -> np.ndarray:
     if noise.per_increment:
         constant = [(noise.speed * moving, 0 * rate), (0 * speed, noise.yaw_rate * moving)]
         errors = [*constant, (noise.speed_fraction * speed, 0 * rate), (0 * speed, noise.yaw_rate_fraction * rate)]
-    else:
-        for k in np.flatnonzero(moving):
-            one = np.eye(len(speed))[k]
+    for k in np.flatnonzero(moving):
+        one = np.eye(len(speed))[k]
+        errors.append((one * noise.speed_walk / math.sqrt(dt[k]), 0 * rate))
+        errors.append((0 * speed, one * noise.yaw_walk / math.sqrt(dt[k])))
+        if not noise.per_increment:
             errors.append((one * math.hypot(noise.speed, noise.speed_fraction * speed[k]), 0 * rate))
             errors.append((0 * speed, one * math.hypot(noise.yaw_rate, noise.yaw_rate_fraction * rate[k])))
     P = np.zeros((3, 3))
