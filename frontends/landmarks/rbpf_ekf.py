@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.filter import ParticleSet
+from frontends.landmarks.honesty import distance, flag, particle_gaussians
 from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
 from frontends.landmarks.stopping import Stopping
-from frontends.landmarks.summarise import Association, Smoothed, moment_matched, smooth, winning_association
+from frontends.landmarks.summarise import Smoothed, smooth, winning_association
 from graphslam.core.errors import CovarianceError
-from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -65,7 +65,11 @@ class RbpfEkf:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
         c, obs = self.config, data.observations
         miss_range = 0.9 * min(c.max_range, obs.max_range)
-        particles = ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, seed.generator())
+        branches = [seed, *(seed.child("pooled", k) for k in range(1, c.pooled))]
+        filters = [
+            ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, branch.generator()) for branch in branches
+        ]
+        particles = filters[0]  # it decides alone; the others only watch
         mean_var = data.rows[:, 2:].mean(axis=0) if len(data.rows) else np.ones(2)
         epsilon = np.sqrt([mean_var[0], mean_var[0], mean_var[1]])
         stopping = Stopping(c.stopping, epsilon)
@@ -76,12 +80,13 @@ class RbpfEkf:
             rows = obs.scan(scan)
             known = self._known(obs, rows, slots)
             u, Q = data.odometry.increments[scan], data.odometry.covariances[scan]
-            particles.step(u, Q, data.rows[rows], known)
+            for filter in filters:
+                filter.step(u, Q, data.rows[rows], known)
             ended = stopping.reason(particles, float(obs.times[scan]) - previous, u, rows.stop - rows.start)
             previous = float(obs.times[scan])
             scan += 1
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        return self._summarise(data, particles, key, first, scan, t_start, slots, report), scan
+        return self._summarise(data, filters, key, first, scan, t_start, slots, report), scan
 
     def _known(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
         """Slot of every observation in known-association mode, else -1."""
@@ -92,7 +97,7 @@ class RbpfEkf:
     def _summarise(
         self,
         data: Prepared,
-        particles: ParticleSet,
+        filters: list[ParticleSet],
         key: int,
         first: int,
         last: int,
@@ -100,7 +105,7 @@ class RbpfEkf:
         slots: dict[int, int],
         report: dict[str, Any],
     ) -> Submap:
-        c, obs = self.config, data.observations
+        c, obs, particles = self.config, data.observations, filters[0]
         association = winning_association(particles, c.min_hits)
         offset = int(obs.offsets[first])
         rows = offset + association.observation
@@ -121,8 +126,10 @@ class RbpfEkf:
             min_hits=c.min_hits,
         )
         slot_of = association.slots[smoothed.landmark_kept]
-        paper, dropped = _paper_gaussian(particles, association, smoothed, c.moment_inflation)
-        report |= _honesty(smoothed, paper)
+        made = particle_gaussians(filters, association, smoothed, inflate=c.moment_inflation)
+        report |= distance("moment", made.moments, smoothed.gaussian)
+        if c.pooled:
+            report |= distance("pooled", made.pooled, smoothed.gaussian) | {"dropped_filters": made.dropped_filters}
         report |= {
             "handover": c.handover,
             "scans": last - first,
@@ -133,7 +140,7 @@ class RbpfEkf:
             "resamplings": particles.resamplings,
             "min_ess": round(particles.min_ess, 3),
             "ancestors": particles.ancestors,
-            "dropped_particles": dropped,
+            "dropped_particles": made.dropped_particles,
             "chi2": smoothed.chi2,
             "dof": smoothed.dof,
             "chi2_odometry": float(smoothed.parts[0]),
@@ -141,27 +148,26 @@ class RbpfEkf:
             "chi2_bearing": float(smoothed.parts[2]),
             "converged": smoothed.converged,
         }
-        gaussian = smoothed.gaussian
-        if c.handover == "moments":
-            if paper is None:
-                raise CovarianceError(f"submap {key}: no particle holds the common features, nothing to moment-match")
-            gaussian = paper
+        report["flag"] = flag(report, c.particles)
+        handed = {"smoothed": smoothed.gaussian, "moments": made.moments, "pooled": made.pooled}[c.handover]
+        if handed is None:
+            raise CovarianceError(f"submap {key}: too few particles hold the common features, nothing to moment-match")
         by_slot = {s: i for i, s in slots.items()}
         ids = np.array([by_slot.get(int(s), -1) for s in slot_of], dtype=np.int64)
         lm_index = (np.cumsum(smoothed.landmark_kept) - 1)[association.landmark[smoothed.kept]]
         landmarks = LandmarkMap(
             ids=ids,
-            exit_pose=gaussian.mean[:3],
-            positions=gaussian.mean[3:].reshape(-1, 2),
-            covariance=gaussian.covariance,
+            exit_pose=handed.mean[:3],
+            positions=handed.mean[3:].reshape(-1, 2),
+            covariance=handed.covariance,
             sightings=np.column_stack([data.original[rows[smoothed.kept]], lm_index]),
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
-        if c.handover == "moments":  # the path's end is the Gaussian's
+        if c.handover != "smoothed":  # the path's end is the Gaussian's
             cov = trajectory.covariances
             assert cov is not None
-            cov[-1] = vector_to_tangent_covariance(gaussian.mean[:3], gaussian.covariance[:3, :3])
-            trajectory.poses[-1] = gaussian.mean[:3]
+            cov[-1] = vector_to_tangent_covariance(handed.mean[:3], handed.covariance[:3, :3])
+            trajectory.poses[-1] = handed.mean[:3]
         return Submap.from_landmarks(
             key,
             landmarks,
@@ -170,33 +176,6 @@ class RbpfEkf:
             uses=data.uses,
             report=report,
         )
-
-
-def _paper_gaussian(
-    particles: ParticleSet, association: Association, smoothed: Smoothed, inflate: bool
-) -> tuple[Gaussian | None, int]:
-    """Moment-matched Gaussian over the landmarks that the smoothed map holds, and particles dropped on the way."""
-    keep = smoothed.landmark_kept
-    used = keep[association.landmark]
-    rank = np.cumsum(keep) - 1
-    same = Association(association.slots[keep], association.observation[used], rank[association.landmark[used]])
-    try:
-        return moment_matched(particles, same, inflate=inflate)
-    except (CovarianceError, ZeroDivisionError):  # every particle was dropped
-        return None, len(particles.pose)
-
-
-def _honesty(smoothed: Smoothed, paper: Gaussian | None) -> dict[str, Any]:
-    """How far the particle Gaussian (B3) is from the smoothed one: Mahalanobis distance²/n, KL, pose variance ratio."""
-    if paper is None:
-        return {"moment_d2_per_dof": None, "moment_kl": None, "moment_pose_variance_ratio": None}
-    s = smoothed.gaussian
-    ratio = np.diag(paper.covariance)[:3] / np.diag(s.covariance)[:3]
-    return {
-        "moment_d2_per_dof": paper.mahalanobis2(s.mean) / len(s.mean),
-        "moment_kl": s.kl_from(paper),
-        "moment_pose_variance_ratio": [float(r) for r in ratio],
-    }
 
 
 def _trajectory(t_start: float, times: Array, smoothed: Smoothed) -> Trajectory:

@@ -52,7 +52,17 @@ def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
         out.add("submap_chi2_range", sum(r["chi2_range"] for r in reports) / max(used, 1), "per observation")
         out.add("submap_chi2_bearing", sum(r["chi2_bearing"] for r in reports) / max(used, 1), "per observation")
         out.add("submap_chi2_odometry", sum(r["chi2_odometry"] for r in reports) / (3 * scans), "per component")
+    if all("min_ess" in r for r in reports):
         out.add("min_ess_median", float(np.median([r["min_ess"] for r in reports])), "particles", "higher")
+    if any("flag" in r for r in reports):
+        out.add("flagged_submaps", flag_counts(submaps)["any"], "", "lower")
+
+
+def flag_counts(submaps: Sequence[Submap]) -> dict[str, int]:
+    """Submaps flagged by the front end for each reason, and for ``any``."""
+    flags = [s.report.get("flag", []) for s in submaps]
+    reasons = sorted({reason for f in flags for reason in f})
+    return {"any": sum(bool(f) for f in flags)} | {r: sum(r in f for f in flags) for r in reasons}
 
 
 def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:

@@ -23,6 +23,7 @@ from graphslam.app.gps_use import split, used_fixes
 from graphslam.app.metrics import (
     Metrics,
     dead_reckoning_metrics,
+    flag_counts,
     front_end_metrics,
     gps_metrics,
     map_truth,
@@ -259,6 +260,7 @@ def _judge(
         "versions": versions(),
         "seconds": seconds,
         "resumed_submaps": work.resumed,
+        "flagged_submaps": flag_counts(submaps),
         "records_read": dict(log.read) or {k: len(s.times) for k, s in log.streams.items()},
         "records_dropped": {**log.dropped, **drops.counts},
         "source_meta": dict(log.meta),
