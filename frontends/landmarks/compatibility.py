@@ -110,7 +110,7 @@ def pair(
     if alive is None:
         alive = np.ones((len(x) - 3) // 2, dtype=np.bool_)
     nl = len(alive)
-    gates = gates_by_dof(gate, 2 * q)
+    gates = gates_by_dof(gate, max(2 * q, 2))
     polar, nearest = np.full((nl, 2), np.nan), np.full(q, np.inf)
     pair_o, pair_k = np.empty(q * nl, dtype=np.int64), np.empty(q * nl, dtype=np.int64)
     d2 = np.empty(q * nl)

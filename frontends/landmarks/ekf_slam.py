@@ -85,7 +85,7 @@ class _Run:
             "scans": m.scans,
             "observations": m.observations,
             "used": used,
-            "not_associated": int(np.count_nonzero(m.association() < 0)),
+            "not_associated": m.observations - used,
             "founded": m.foundings,
             "dropped": m.foundings - int(np.count_nonzero(m.hits > 0)),
             "range_only_without_landmark": m.unfounded,
@@ -132,8 +132,7 @@ class _Run:
         )
         index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
         used = int(s.kept.sum())
-        counts = self.report(used)
-        counts["not_associated"] = counts["observations"] - len(rows)
+        counts = self.report(used) | {"not_associated": self.map.observations - len(rows)}
         return self._hand_over(
             key,
             s.gaussian,
