@@ -29,6 +29,10 @@ def dies_once(seed: int, *, bad: int) -> list[Measurement]:
     return steady(seed)
 
 
+def gives_a_lambda(seed: int) -> list[object]:
+    return [lambda: seed]
+
+
 def notes_its_process(seed: int, *, folder: str, seconds: float = 0.0) -> list[Measurement]:
     (Path(folder) / f"{os.getpid()}-{seed}").touch()
     time.sleep(seconds)
