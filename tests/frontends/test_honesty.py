@@ -49,7 +49,7 @@ def maps():
                 motion=MotionNoise(speed=0.3, steering=np.deg2rad(3.0)),
                 stopping=StoppingConfig(scans=59),
                 handover=handover,
-                pooled=5,
+                pooled=0 if handover == "moments" else 5,
             )
             submaps = [s for s in RbpfEkf(config).submaps(log, seed=SeedTree(seed)) if s.report["scans"] == 59]
             out.setdefault(handover, []).append((log, submaps))
