@@ -15,6 +15,7 @@ from graphslam.plots.map import plot_map
 from graphslam.plots.save import save
 from graphslam.plots.submaps import plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
+from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
 
 # A dead-reckoned path this many times larger than the map would shrink the map to a dot.
 _MAX_STRETCH = 2.5
@@ -67,10 +68,14 @@ def _fitting(path: Trajectory | None, beside: Trajectory) -> Trajectory | None:
 
 
 def save_figures(run: Run, folder: Path) -> list[Path]:
-    """Map, submap chain, and GPS residuals where there are any, as PNG files."""
+    """Map, submap chain, and GPS residuals, innovations and loops where there are any, as PNG files."""
     made = [save(draw_map(run), folder / "map.png")]
     chain = plot_submap_chain(None, run.submaps, run.map.node_poses, title=f"{run.name}: submaps at their solved poses")
     made.append(save(chain, folder / "submaps.png"))
     if run.gps:
         made.append(save(plot_gps_residuals(None, dict(run.gps)), folder / "gps_residuals.png"))
+    if run.checks is not None and run.checks.gps is not None:
+        made.append(save(plot_innovations(None, run.checks.gps), folder / "gps_innovations.png"))
+    if run.checks is not None and run.checks.loops is not None:
+        made.append(save(plot_loop_matrix(None, run.checks.loops), folder / "loops.png"))
     return made

@@ -36,6 +36,7 @@ from graphslam.app.outputs import write_outputs
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.threads import one_blas_thread
+from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import DropCounter, SensorLog
@@ -249,6 +250,7 @@ def _judge(
         dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
+    checks = check_without_truth(out, back.graph, identified, solution.poses, gps, settings)
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         truth_metrics(out, solution, truth, identities=known)
@@ -284,6 +286,7 @@ def _judge(
         dead_reckoning=reckoned,
         solution=solution,
         graph=back.graph,
+        checks=checks,
     )
 
 

@@ -19,6 +19,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 
 if TYPE_CHECKING:
+    from graphslam.app.without_truth import WithoutTruth
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.solution import Solution
 
@@ -81,6 +82,8 @@ class Run:
         In the frame of the first base.
     solution, graph : Solution, PoseGraph or None
         The solver's own view; None for a run read back from disk.
+    checks : WithoutTruth or None
+        What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     """
 
     name: str
@@ -98,6 +101,7 @@ class Run:
     dead_reckoning: Trajectory | None = None
     solution: Solution | None = None
     graph: PoseGraph | None = None
+    checks: WithoutTruth | None = None
 
     def metric(self, key: str) -> float:
         """Value of one metric.

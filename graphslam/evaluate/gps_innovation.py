@@ -15,7 +15,7 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_inverse
+from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_transform
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_floor import fix_segments
@@ -148,7 +148,10 @@ def gps_innovations(
     n = len(times)
     bias = _biases(graph, times, bias_sigma, segment_gap)
     own = bias < len(values.biases)
-    r, J = gps_jacobians(values, node, arm, z, np.where(own, bias, -1))
+    with_bias = np.where(own, bias, -1)
+    predicted = se2_transform(se2_compose(np.broadcast_to(values.datum, (n, 3)), values.poses[node]), arm)
+    predicted[with_bias >= 0] += values.biases[with_bias[with_bias >= 0]]
+    _, J = gps_jacobians(values, node, arm, predicted, with_bias)  # where the fix should be, not where it is
     R = rotation2(values.datum[2]) @ rotation2(values.poses[node, 2])  # base frame → GPS frame
     if bias_sigma is not None or len(values.biases):
         J[:, :, 6:8] = np.where((bias >= 0)[:, None, None], np.swapaxes(R, 1, 2), 0.0)
@@ -181,7 +184,7 @@ def gps_innovations(
     S = np.einsum("mkj,kij->mki", turned, R).reshape(2 * n, 2 * n)
     return GpsInnovations(
         times=times,
-        innovations=-np.einsum("kij,kj->ki", R, r),
+        innovations=z - predicted,
         covariance=0.5 * (S + S.T),
         unpredicted=int(np.sum(~found)),
         confidence=confidence,

@@ -39,7 +39,12 @@ def submap_bytes(folder: Path) -> dict[str, bytes]:
 
 def test_run_folder_is_complete(result):
     assert {p.name for p in result.folder.iterdir()} == FILES
-    assert {p.name for p in (result.folder / "figures").iterdir()} == {"map.png", "submaps.png", "gps_residuals.png"}
+    assert {p.name for p in (result.folder / "figures").iterdir()} == {
+        "map.png",
+        "submaps.png",
+        "gps_residuals.png",
+        "loops.png",
+    }
     report = json.loads((result.folder / "run.json").read_text())
     assert report["seed"] == 5
     assert report["records_read"]["landmarks"] > 0
