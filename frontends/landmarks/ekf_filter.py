@@ -25,7 +25,7 @@ from frontends.landmarks.ekf_kernels import (
     update_kernel,
 )
 from graphslam.core.errors import CovarianceError
-from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
 IGNORED = -1
@@ -348,11 +348,6 @@ class EkfMap:
     def pose_covariance(self) -> Array:
         """Covariance ``(3, 3)`` of the plain vector x, y, θ."""
         return self._aP[:3, :3].copy()
-
-    @property
-    def pose_tangent_covariance(self) -> Array:
-        """Covariance ``(3, 3)`` of the right tangent at the pose."""
-        return vector_to_tangent_covariance(self._ax[:3], self._aP[:3, :3])
 
     def pose_std(self) -> Array:
         """Standard deviation of x, y [m] and heading [rad], ``(3,)``."""

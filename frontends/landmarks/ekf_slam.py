@@ -16,9 +16,9 @@ from frontends.landmarks.prepare import Prepared, known_slots, prepare
 from frontends.landmarks.snapshot import Snapshot
 from frontends.landmarks.stopping import Stopping
 from frontends.landmarks.summarise import Smoothed, smooth
-from graphslam.core.errors import ConfigError
+from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.gaussian import Gaussian
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
@@ -26,6 +26,15 @@ from graphslam.core.trajectory import Trajectory
 
 Ints = npt.NDArray[np.int64]
 OnScan = Callable[[int], None]
+
+
+def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> Prepared:
+    data = prepare(log, config, drops if drops is not None else DropCounter())
+    if len(data.rows) and not np.any(np.isfinite(data.rows[:, 3])):
+        raise MissingDataError(
+            "an EKF cannot start a landmark from ranges alone", where=log.name, wanted="bearings in some observations"
+        )
+    return data
 
 
 class _Run:
@@ -38,7 +47,7 @@ class _Run:
         self.map = EkfMap(config, obs.T_base_sensor, obs.field_of_view, obs.max_range)
         self.slots: dict[int, int] = {}
         self.poses: list[Array] = []
-        self.covariances: list[Array] = []
+        self.covariances: list[Array] = []  # of the plain vectors
 
     def advance(self) -> None:
         """Take in the next scan."""
@@ -51,7 +60,7 @@ class _Run:
         odometry = self.data.odometry
         self.map.step(odometry.increments[k], odometry.covariances[k], self.data.rows[rows], known)
         self.poses.append(self.map.pose)
-        self.covariances.append(self.map.pose_tangent_covariance)
+        self.covariances.append(self.map.pose_covariance)
         self.next += 1
 
     def identities(self, slots: Ints) -> Ints:
@@ -102,12 +111,13 @@ class _Run:
         slots = self.map.landmarks(self.config.min_hits)
         mean, P = self.map.joint(slots)
         rows, landmark = self.sightings(slots)
+        path = np.array(self.poses)
         return self._hand_over(
             key,
             Gaussian(mean, P, (2,)),
             self.identities(slots),
             np.column_stack([self.data.original[rows], landmark]),
-            self.trajectory(np.array(self.poses), np.array(self.covariances)),
+            self.trajectory(path, vector_to_tangent_covariance(path, np.array(self.covariances))),
             report | {"handover": "filter"} | self.report(len(rows)),
         )
 
@@ -191,21 +201,21 @@ class Ekf:
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`."""
-        data = prepare(log, self.config, drops if drops is not None else DropCounter())
-        times = data.observations.times
+        data = _prepare(log, self.config, drops)
+        times, epsilon = data.observations.times, _measurement_sigma(data)
         key, scan, t_start = 0, 0, data.t_start
         if after is not None:
             t_start = after.interval[1]
             key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
         while scan < len(times):
-            submap, scan = self._build(data, key, scan, t_start)
+            submap, scan = self._build(data, key, scan, t_start, epsilon)
             yield submap
             key, t_start = key + 1, submap.interval[1]
 
-    def _build(self, data: Prepared, key: int, first: int, t_start: float) -> tuple[Submap, int]:
+    def _build(self, data: Prepared, key: int, first: int, t_start: float, epsilon: Array) -> tuple[Submap, int]:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
         obs, run = data.observations, _Run(data, self.config, first, t_start)
-        stopping = Stopping(self.config.stopping, _measurement_sigma(data))
+        stopping = Stopping(self.config.stopping, epsilon)
         ended, previous = None, t_start
         while ended is None and run.next < len(data):
             k = run.next
@@ -243,7 +253,7 @@ class EkfSlam:
         """See :class:`frontends.base.FrontEnd`; there is nothing after the one submap."""
         if after is not None:
             return
-        data = prepare(log, self.config, drops if drops is not None else DropCounter())
+        data = _prepare(log, self.config, drops)
         run = _Run(data, self.config, 0, data.t_start)
         while run.next < len(data):
             run.advance()
@@ -285,11 +295,13 @@ def ekf_snapshots(
     ------
     ConfigError
         If ``cuts`` are not as above, or ``joint`` is another word.
+    MissingDataError
+        If a stream is missing, or no observation has a bearing.
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")
     wanted = [int(k) for k in cuts]
-    data = prepare(log, config, drops if drops is not None else DropCounter())
+    data = _prepare(log, config, drops)
     if not wanted or wanted[0] < 1 or any(b <= a for a, b in pairwise(wanted)) or wanted[-1] > len(data):
         raise ConfigError(f"cuts must increase strictly within 1 … {len(data)}, got {wanted[:3]} … {wanted[-1:]}")
     return _snapshots(_Run(data, config, 0, data.t_start), wanted, joint, on_scan)
