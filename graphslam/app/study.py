@@ -108,8 +108,8 @@ class Study:
         return plot_error_panels(self._of(self.table, world), algorithm, **options)
 
     def plot_time(self, *, world: str | None = None, ax: Axes | None = None, **options: Any) -> Axes:
-        """Cumulative time along the run; see :func:`graphslam.plots.study.plot_cumulative_time`."""
-        from graphslam.plots.study import plot_cumulative_time
+        """Cumulative time along the run; see :func:`graphslam.plots.study_time.plot_cumulative_time`."""
+        from graphslam.plots.study_time import plot_cumulative_time
 
         return plot_cumulative_time(ax, self._of(self.timings, world), **options)
 

@@ -5,6 +5,7 @@ Colour says whose local maps they are, the line how they were joined.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from graphslam.plots import style
@@ -23,7 +24,7 @@ _ALGORITHMS: dict[str, tuple[str, str, str, str]] = {
     "default-eif": ("default-EIF", style.GREEN, "-", "o"),
     "default-eif-tree": ("default-EIF, tree", style.GREEN, "--", "D"),
     "default-ekf": ("default-EKF", style.GREEN, "-.", "v"),
-    "default+polish": ("default, polished", style.PURPLE, ":", "o"),
+    "default+polish": ("default, polished", style.PURPLE, ":", "s"),
     "default-eif+polish": ("default-EIF, polished", style.PURPLE, ":", "o"),
     "default-ekf+polish": ("default-EKF, polished", style.PURPLE, ":", "v"),
     "default-isam2": ("default, iSAM2", style.PURPLE, "--", "P"),
@@ -37,6 +38,12 @@ _ALGORITHMS: dict[str, tuple[str, str, str, str]] = {
     "local-paper-inflated": ("RBPF, moments inflated", style.PURPLE, "-.", "D"),
     "local-default": ("RBPF, smoothed (default)", style.GREEN, "-", "o"),
 }
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names in the order in which they are drawn: ours as listed, then others by name."""
+    rank = {name: k for k, name in enumerate(_ALGORITHMS)}
+    return sorted(set(names), key=lambda name: (rank.get(name, len(rank)), name))
 
 
 def algorithm_label(name: str) -> str:

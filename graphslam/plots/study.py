@@ -1,12 +1,12 @@
-"""Figures of a Monte-Carlo study from its tidy table: consistency, errors with their bands, RMS, times, local maps.
+"""Figures of a Monte-Carlo study from its tidy table: consistency, errors with their bands, RMS.
 
 Every function takes the rows of *one* world. The run is the unit of all bounds: errors of one run hang together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -20,7 +20,7 @@ from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line
+from graphslam.plots.algorithms import algorithm_label, algorithm_line, in_order
 
 DOF = {"pose_nees": 3, "feature_nees": 2, "local_pose_nees": 3}
 _NAMES = {"pose_nees": "end pose", "feature_nees": "features"}
@@ -30,7 +30,7 @@ _RMS = (("pose_rms", "position", 1.0, "m"), ("heading_rms", "heading", np.degree
 
 
 def algorithms_with(table: pd.DataFrame, quantity: str, *, online: bool) -> list[str]:
-    """Algorithms that have a quantity, along the run (``online``) or of the whole run, in order of name.
+    """Algorithms that have a quantity, along the run (``online``) or of the whole run, in the order of drawing.
 
     Raises
     ------
@@ -40,13 +40,13 @@ def algorithms_with(table: pd.DataFrame, quantity: str, *, online: bool) -> list
     if "world" in table and table["world"].nunique() > 1:
         raise DataError("a figure is of one world", got=", ".join(sorted(set(table["world"]))), wanted="rows of one")
     of = (table["quantity"] == quantity) & ((table["submap"] >= 0) == online)
-    found = sorted(set(table.loc[of, "algorithm"]))
+    found = in_order(table.loc[of, "algorithm"])
     if not found:
         raise DataError(f"table has no {quantity!r}", wanted=", ".join(sorted(set(table["quantity"]))) or "figures")
     return found
 
 
-def _curve(table: pd.DataFrame, algorithm: str, quantity: str) -> tuple[Array, Array]:
+def curve_of(table: pd.DataFrame, algorithm: str, quantity: str) -> tuple[Array, Array]:
     """Submaps ``(k,)`` and values ``(runs, k)`` along the run."""
     return values_of(table[table["submap"] >= 0], algorithm, quantity)
 
@@ -91,6 +91,8 @@ def plot_ci(
         Means are ruled by the worst run; the median says what most runs do.
     log : bool, optional
         Logarithmic axis; default where a curve leaves the decade above the bounds.
+
+    A run without a finite value at a submap is left out there, and the legend says how many such runs there are.
     """
     names = list(algorithms or algorithms_with(table, quantity, online=True))
     n = float(DOF[quantity] if dof is None else dof)
@@ -99,7 +101,7 @@ def plot_ci(
     bounds_of = median_bounds if statistic == "median" else chi2_mean_bounds
     fewest, last, top, least = 10**9, 1.0, 0.0, np.inf
     for k, name in enumerate(names):
-        submaps, d2 = _curve(table, name, quantity)
+        submaps, d2 = curve_of(table, name, quantity)
         known = np.isfinite(d2)
         some = known.any(axis=0)
         short = int(np.sum(~known[:, some].all(axis=1)))
@@ -209,7 +211,7 @@ def plot_error_panels(
         if not np.array_equal(submaps, at):
             raise DataError(f"errors and standard deviations of {name!r} are of different submaps", where=component)
         style.new_axes(ax)
-        plot_error_band(ax, submaps + 1, factor * error[0], factor * sigma[0], label=component, unit=unit)
+        plot_error_band(ax, submaps + 1, factor * error[0], factor * sigma[0], label=f"error of {component}", unit=unit)
         if ax is not axes[-1]:
             ax.set_xlabel("")
     axes[0].set_title(title or f"{algorithm_label(name)}, run {chosen}", fontsize="medium")
@@ -243,7 +245,7 @@ def plot_rms(
     names = list(algorithms or algorithms_with(table, quantity, online=False))
     ax = style.new_axes(ax, (7.0, 0.9 + 0.4 * len(names)))
     whole = table[table["submap"] == -1]
-    every = []
+    every: list[Array] = []
     for k, name in enumerate(names):
         rows = whole[(whole["algorithm"] == name) & (whole["quantity"] == quantity)]
         v = factor * rows["value"].to_numpy(dtype=np.float64)
@@ -281,7 +283,7 @@ def plot_rms(
 
 def _spread(n: int) -> Array:
     """Offsets that keep points of a row apart; the same every time."""
-    return 0.22 * ((np.arange(n) * 0.618034) % 1.0 - 0.5) * 2.0
+    return np.asarray(0.44 * ((np.arange(n) * 0.618034) % 1.0 - 0.5), dtype=np.float64)
 
 
 def plot_rms_panels(
@@ -298,119 +300,3 @@ def plot_rms_panels(
         if ax is not axes[-1] and (legend := ax.get_legend()) is not None:
             legend.remove()
     return list(axes)
-
-
-def plot_cumulative_time(
-    ax: Axes | None,
-    timings: pd.DataFrame,
-    *,
-    algorithms: Sequence[str] | None = None,
-    log: bool | None = None,
-    title: str | None = None,
-) -> Axes:
-    """Seconds spent up to each submap, median over the runs with its 10-90 % range (Fig. 8 and 9).
-
-    A method that joins all submaps at once, as the tree does, has its total only: a level line.
-
-    Parameters
-    ----------
-    ax : Axes or None
-    timings : DataFrame
-        Of one world: ``seconds_cumulative`` along the run, or ``seconds_total``.
-    """
-    online = set(timings.loc[(timings["quantity"] == "seconds_cumulative") & (timings["submap"] >= 0), "algorithm"])
-    names = list(algorithms or algorithms_with(timings, "seconds_cumulative", online=True))
-    ax = style.new_axes(ax, (8.0, 4.0))
-    last, ends, levels = 2.0, [], []
-    for k, name in enumerate(names):
-        look: Mapping[str, Any] = algorithm_line(name, k)
-        if name not in online:
-            levels.append((name, look))
-            continue
-        submaps, seconds = _curve(timings, name, "seconds_cumulative")
-        x = submaps + 1
-        middle = np.nanmedian(seconds, axis=0)
-        low, high = np.nanquantile(seconds, [0.1, 0.9], axis=0)
-        every = max(1, len(x) // 10)
-        ax.fill_between(x, low, high, color=look["color"], alpha=0.15, lw=0)
-        ax.plot(x, middle, lw=1.5, ms=4.5, markevery=(k * every // len(names), every),
-                label=f"{algorithm_label(name)}: {middle[-1]:.3g} s", **look)  # fmt: skip
-        last = max(last, float(x[-1]))
-        ends += [float(middle[-1])]
-    for name, look in levels:
-        _, seconds = values_of(timings[timings["submap"] == -1], name, "seconds_total")
-        total = float(np.nanmedian(seconds))
-        ax.axhline(total, color=look["color"], ls=look["linestyle"], lw=1.3)
-        ax.plot([last], [total], ms=6, clip_on=False, label=f"{algorithm_label(name)}, all at once: {total:.3g} s",
-                **{**look, "linestyle": "none"})  # fmt: skip
-        ends += [total]
-    if log or (log is None and max(ends) > 30.0 * min(e for e in ends if e > 0)):
-        ax.set_yscale("log")
-    else:
-        ax.set_ylim(bottom=0.0)
-    ax.set_xlim(1.0, last)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("submap")
-    ax.set_ylabel("cumulative time [s]")
-    ax.set_title("median and 10–90 % of the runs" if title is None else title, fontsize="medium")
-    style.legend(ax)
-    return ax
-
-
-def plot_local_honesty(
-    ax: Axes | None,
-    table: pd.DataFrame,
-    *,
-    algorithms: Sequence[str] | None = None,
-    confidence: float = 0.95,
-    title: str | None = None,
-) -> Axes:
-    """Histogram of the joint NEES/n of local maps against what honest maps of the same sizes would show.
-
-    Densities are over ln(NEES/n), so every area is one. The expected curve is the mean of the χ²_n/n densities of the
-    maps' own dimensions n. Maps of one run use different data: each is a unit.
-
-    Parameters
-    ----------
-    ax : Axes or None
-    table : DataFrame
-        Of one world, with ``local_joint_nees`` and ``local_joint_dof``.
-    """
-    names = list(algorithms or algorithms_with(table, "local_joint_nees", online=True))
-    ax = style.new_axes(ax, (8.0, 4.0))
-    found = {}
-    for name in names:
-        at, d2 = _curve(table, name, "local_joint_nees")
-        same, dof = _curve(table, name, "local_joint_dof")
-        if d2.shape != dof.shape or not np.array_equal(at, same):
-            raise DataError(f"local maps of {name!r} lack a NEES or its degrees of freedom", got=(d2.shape, dof.shape))
-        known = np.isfinite(d2) & np.isfinite(dof) & (d2 > 0)
-        found[name] = d2[known], dof[known]
-    ratios = np.concatenate([d2 / dof for d2, dof in found.values()])
-    left = min(0.3, float(ratios.min(initial=0.3)))
-    right = max(3.0, float(np.quantile(ratios, 0.995)))
-    edges = np.geomspace(left, right, 60)
-    for k, (name, (d2, dof)) in enumerate(found.items()):
-        r, look = d2 / dof, algorithm_line(name, k)
-        beyond = int(np.sum(r > right))
-        density = np.histogram(r, edges)[0] / (len(r) * np.diff(np.log(edges)))
-        inside = np.mean(d2 < stats.chi2.ppf(confidence, dof))
-        label = f"{algorithm_label(name)}: mean {d2.sum() / dof.sum():.3g}, {inside:.0%} inside {confidence:.0%}"
-        label += f", {beyond} beyond" if beyond else ""
-        ax.stairs(density, edges, color=look["color"], lw=1.6, ls=look["linestyle"], label=label, zorder=3)
-        if k == 0:
-            x = np.geomspace(left, right, 400)
-            sizes, counts = np.unique(dof, return_counts=True)
-            f = stats.chi2.pdf(x[:, None] * sizes, sizes) * sizes * x[:, None]
-            ax.fill_between(x, f @ counts / counts.sum(), color=style.BOUNDS, alpha=0.8, lw=0, label="honest (χ²)")
-    ax.axvline(1.0, color=style.BLACK, lw=0.8, ls="--", zorder=1)
-    ax.set_xscale("log")
-    ax.set_xlim(left, right)
-    ax.set_ylim(bottom=0.0)
-    ax.set_xlabel("joint NEES / n of a local map")
-    ax.set_ylabel("density over ln(NEES / n)")
-    count = max(len(d2) for d2, _ in found.values())
-    ax.set_title(f"{count} local maps, each in the frame of its first pose" if title is None else title,
-                 fontsize="medium")  # fmt: skip
-    style.legend(ax)
-    return ax
