@@ -164,6 +164,7 @@ class SubmapProblem:
         if ids is None:
             check_identified(submaps)
         maps = [landmark_map_of(s) for s in submaps]
+        self._submaps = tuple(submaps)
         self.m = m = len(maps)
         weights = 1.0 / _check_scale(1.0 if scale is None else scale, m)
         all_ids = np.concatenate([a.ids for a in maps] if ids is None else list(ids))
@@ -197,6 +198,10 @@ class SubmapProblem:
         self._first_owner = owner[is_landmark][sighting]
         self._first_row = self._row_ptr[self._first_owner] + 3
         self._first_row += 2 * (np.flatnonzero(is_landmark)[sighting] - self._entry_ptr[self._first_owner] - 1)
+
+    def is_of(self, submaps: Sequence[Submap]) -> bool:
+        """Whether it was made of these very submaps."""
+        return len(submaps) == self.m and all(a is b for a, b in zip(submaps, self._submaps))
 
     @cached_property
     def pattern(self) -> BlockPattern:

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
-from graphslam.core.geometry import Array, wrap_angle
+from graphslam.graph.symmetric_factor import elimination_order
+from graphslam.join import kernels
 from graphslam.join.joined_map import JoinedMap, JoinTimes
 
 Index = npt.NDArray[np.intp]
 
-# A kept order is given up when the factors have this much more fill-in than under the last fresh one.
+# A kept order is given up when the factor has this much more fill-in than under the last fresh one.
 _STALE = 1.3
 # Below this a difference between B and its own prediction is arithmetic, not news.
 _ROUNDING = 1e-12
@@ -56,82 +56,56 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
     times = times or JoinTimes()
     with times.measure("update"):
         joined, gradient = _assemble(a, b, match)
-    if not np.any(gradient):  # nothing in B was known before: the mean stays, and no factorisation is needed
+    if gradient is None:  # nothing in B was known before: the mean stays, and no factorisation is needed
         return joined
     with times.measure("recovery"):
-        factor = joined.factor()
-        joined.x = joined.x + factor.solve(gradient)  # eq. 13
-        if joined.ordered and factor.nnz / joined.information.nnz > _STALE * joined.fill:
-            joined = joined.reordered()
+        _keep_order_sparse(joined)
+        joined.x += joined.factor().solve(gradient)  # eq. 13
     return joined
 
 
-def _assemble(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[JoinedMap, Array]:
-    """The joined map at its values before the update, and ``∇Hᵀ I_B (x_B - H(X))`` there."""
-    n_a, m_b = len(a.x), len(b.pose_at)
+def _assemble(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[JoinedMap, npt.NDArray[np.float64] | None]:
+    """The joined map at its values before the update, and ``∇Hᵀ I_B (x_B - H(X))`` there (None: zero)."""
+    N, m_b = len(a.width), len(b.pose_node)
     new = np.flatnonzero(match < 0)
-    pose_at = n_a + 3 * np.arange(m_b, dtype=np.intp)
-    landmark_at = np.empty(len(match), dtype=np.intp)
-    landmark_at[match >= 0] = a.landmark_at[match[match >= 0]]
-    landmark_at[new] = n_a + 3 * m_b + 2 * np.arange(len(new))
-    size = n_a + 3 * m_b + 2 * len(new)
-
-    # First values of what is new come from B alone.
-    start_at = a.pose_at[-1]
-    px, py, heading = a.x[start_at : start_at + 3]
-    c, s = np.cos(heading), np.sin(heading)
-    x = np.concatenate([a.x, np.zeros(size - n_a)])
-    rows = np.concatenate([b.pose_at, b.landmark_at])  # where positions begin in B
-    columns = np.concatenate([pose_at, landmark_at])  # and in the joined map
-    fresh = np.concatenate([np.ones(m_b, dtype=bool), match < 0])
-    zx, zy = b.x[rows], b.x[rows + 1]
-    x[columns[fresh]] = (px + c * zx - s * zy)[fresh]
-    x[columns[fresh] + 1] = (py + s * zx + c * zy)[fresh]
-    x[pose_at + 2] = heading + b.x[b.pose_at + 2]
-
-    # H of eq. 15 and its Jacobian, everything seen from A's last pose.
-    dx, dy = x[columns] - px, x[columns + 1] - py
-    qx, qy = c * dx + s * dy, c * dy - s * dx
-    difference = np.zeros(len(b.x))
-    difference[rows], difference[rows + 1] = zx - qx, zy - qy
-    difference[b.pose_at + 2] = wrap_angle(b.x[b.pose_at + 2] - (x[pose_at + 2] - heading))
-    ones = np.ones(len(rows))
-    turn = b.pose_at + 2
-    entries = [
-        (rows, columns, c * ones),
-        (rows, columns + 1, s * ones),
-        (rows + 1, columns, -s * ones),
-        (rows + 1, columns + 1, c * ones),
-        (rows, start_at * np.ones_like(rows), -c * ones),
-        (rows, (start_at + 1) * np.ones_like(rows), -s * ones),
-        (rows + 1, start_at * np.ones_like(rows), s * ones),
-        (rows + 1, (start_at + 1) * np.ones_like(rows), -c * ones),
-        (rows, (start_at + 2) * np.ones_like(rows), qy),
-        (rows + 1, (start_at + 2) * np.ones_like(rows), -qx),
-        (turn, pose_at + 2, np.ones(m_b)),
-        (turn, (start_at + 2) * np.ones_like(turn), -np.ones(m_b)),
-    ]
-    i, j, v = (np.concatenate(part) for part in zip(*entries))
-    J = sp.csc_matrix((v, (i, j)), shape=(len(b.x), size))
-    difference[np.abs(difference) < _ROUNDING * (1.0 + np.abs(b.x))] = 0.0
-    JtI = sp.csc_matrix(J.T @ b.information)
-    grown = sp.csc_matrix(
-        (
-            a.information.data,
-            a.information.indices,
-            np.append(a.information.indptr, [a.information.nnz] * (size - n_a)),
-        ),
-        shape=(size, size),
-    )
-    place = np.where(match >= 0, match, len(a.landmark_at) + np.cumsum(match < 0) - 1).astype(np.intp)
+    image = np.empty(len(b.width), dtype=np.int64)
+    pose_node = N + np.arange(m_b)
+    image[b.pose_node] = pose_node
+    landmark_node = np.empty(len(match), dtype=np.int64)
+    landmark_node[match >= 0] = a.landmark_node[match[match >= 0]]
+    landmark_node[new] = N + m_b + np.arange(len(new))
+    image[b.landmark_node] = landmark_node
+    x, width, ptr, neighbours, block, values, gradient, news = kernels.join_blocks(
+        a.x, a.width, a.ptr, a.neighbours, a.block, a.values,
+        b.x, b.width, b.ptr, b.neighbours, b.block, b.values,
+        image, int(a.pose_node[-1]), _ROUNDING,
+    )  # fmt: skip
+    place = np.where(match >= 0, match, len(a.landmark_node) + np.cumsum(match < 0) - 1).astype(np.intp)
+    came = image[b.order]
+    rank = None
+    if a.rank is not None and b.rank is not None:
+        rank = np.append(a.rank, np.zeros(len(width) - N, dtype=np.int64))
+        rank[image] = b.rank
     joined = JoinedMap(
         x=x,
-        information=sp.csc_matrix(grown + JtI @ J),  # eq. 16
-        pose_at=np.concatenate([a.pose_at, pose_at]),
-        landmark_at=np.concatenate([a.landmark_at, landmark_at[new]]),
+        width=width,
+        ptr=ptr,
+        neighbours=neighbours,
+        block=block,
+        values=values,
+        pose_node=np.concatenate([a.pose_node, pose_node]),
+        landmark_node=np.concatenate([a.landmark_node, landmark_node[new]]),
         ids=np.concatenate([a.ids, b.ids[new]]),
         entries=a.entries + tuple(place[e] for e in b.entries),
-        ordered=a.ordered,
-        fill=a.fill,
+        order=np.append(a.order, came[came >= N]) if rank is None else np.argsort(rank),
+        fill=max(a.fill, b.fill),
+        rank=rank,
     )
-    return joined, np.asarray(JtI @ difference)
+    return joined, gradient if news else None
+
+
+def _keep_order_sparse(joined: JoinedMap) -> None:
+    """Keep the elimination order as long as it does not cost much more fill-in than the last fresh one did."""
+    if joined.rank is None and joined.symbolic().nnz / len(joined.values) > _STALE * joined.fill:
+        owner = np.repeat(np.arange(len(joined.width)), np.diff(joined.ptr))
+        joined.reorder(elimination_order(owner, joined.neighbours, len(joined.width)).astype(np.int64))

@@ -33,7 +33,6 @@ from graphslam.join.joined_map import (
     check_chain,
     distinct_landmarks,
     finish,
-    landmark_labels,
     landmark_scalars,
     last_pose,
 )
@@ -236,8 +235,7 @@ def join_ekf(
         if on_join is not None:
             on_join(k, dense)
     assert dense is not None
-    labels = landmark_labels(dense, dense.ids, identified=identified)
-    return finish(submaps, dense, labels, method="ekf", times=times, covariance=dense.covariance)
+    return finish(submaps, dense, identified=identified, method="ekf", times=times)
 
 
 def _scalars(submaps: Sequence[Submap]) -> int:

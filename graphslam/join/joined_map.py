@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,40 +15,39 @@ import scipy.sparse as sp
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
+from graphslam.graph.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.graph.submap_blocks import (
     SubmapProblem,
     check_identified,
     dense_information,
     fuse_repeated,
     landmark_map_of,
-    relabel,
 )
+from graphslam.graph.submap_pattern import csc_of_blocks
 from graphslam.graph.submap_solver import SubmapEstimate
-from graphslam.graph.symmetric_factor import SymmetricFactor
+from graphslam.join import kernels
 
 Index = npt.NDArray[np.intp]
 Ids = npt.NDArray[np.int64]
+Nodes = npt.NDArray[np.int64]
 
 
 @dataclass
 class JoinTimes:
-    """Seconds of wall time, split as in Table 1 of the paper; ``recovery`` is factorisation and mean."""
+    """CPU seconds of this process, split as in Table 1 of the paper; ``recovery`` is factorisation and mean."""
 
     parts: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("association", "update", "recovery"), 0.0))
+    wall: float = 0.0
 
     @contextmanager
     def measure(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to ``part``."""
-        start = time.perf_counter()
+        """Add the time spent inside to ``part``, and to the wall time."""
+        cpu, start = time.process_time(), time.perf_counter()
         try:
             yield
         finally:
-            self.parts[part] = self.parts.get(part, 0.0) + time.perf_counter() - start
-
-    @property
-    def total(self) -> float:
-        """Sum of the parts [s]."""
-        return sum(self.parts.values())
+            self.parts[part] = self.parts.get(part, 0.0) + time.process_time() - cpu
+            self.wall += time.perf_counter() - start
 
 
 class MapView(Protocol):
@@ -80,6 +79,15 @@ class MapView(Protocol):
 
     def landmark_marginals(self) -> Array:
         """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        ...
+
+
+class DenseView(MapView, Protocol):
+    """A map that carries its whole covariance ``(n, n)``."""
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of ``x``."""
         ...
 
 
@@ -134,39 +142,77 @@ def distinct_landmarks(submap: Submap, *, identified: bool) -> tuple[LandmarkMap
 class JoinedMap:
     """A map in sparse information form, in the frame of its first base, which is not part of the state.
 
+    The information matrix is made of node blocks: poses of 3 scalars, landmarks of 2.
+
     Parameters
     ----------
     x : (n,)
-        Mean. The order of its parts is free: it doubles as the elimination order.
-    information : csc_matrix (n, n)
-    pose_at : (m,)
-        Where end pose k begins in ``x``.
-    landmark_at : (L,)
-        Where landmark j begins, landmarks in the order of first sighting.
+        Mean: the nodes' scalars, one node after the other.
+    width : (N,)
+        Scalars of each node.
+    ptr : (N + 1,)
+    neighbours : (nb,)
+        Neighbours of every node, itself included; every pair stands in both lists.
+    block : (nb,)
+        Where the block of each pair begins in ``values``: rows of the node whose list it is in, row-major.
+    values : (k,)
+    pose_node : (m,)
+        Node of end pose k.
+    landmark_node : (L,)
+        Node of landmark j, landmarks in the order of first sighting.
     ids : (L,) int64
     entries : tuple of (n_k,)
         For every submap inside, the landmark each of its entries became.
-    ordered : bool
-        Unknowns are eliminated in the order of ``x``; otherwise every factorisation looks for its own order.
+    order : (N,)
+        Elimination order of the nodes.
     fill : float
-        Fill-in of the last fresh order: entries of the factors per entry of the matrix.
+        Entries of the factor per entry of the matrix under the last fresh order.
+    rank : (N,), optional
+        When each node is eliminated under an order of all that will ever be joined; then no other is looked for.
     """
 
     x: Array
-    information: sp.csc_matrix
-    pose_at: Index
-    landmark_at: Index
+    width: Nodes
+    ptr: Nodes
+    neighbours: Nodes
+    block: Nodes
+    values: Array
+    pose_node: Nodes
+    landmark_node: Nodes
     ids: Ids
     entries: tuple[Index, ...]
-    ordered: bool = True
-    fill: float = 1.0
-    _factor: SymmetricFactor | None = field(default=None, init=False, repr=False)
+    order: Nodes
+    fill: float
+    rank: Nodes | None = None
+    _symbolic: BlockSymbolic | None = field(default=None, init=False, repr=False)
+    _factor: BlockFactor | None = field(default=None, init=False, repr=False)
 
-    def factor(self) -> SymmetricFactor:
+    def __post_init__(self) -> None:
+        at = np.cumsum(self.width) - self.width
+        self.pose_at: Index = at[self.pose_node]
+        self.landmark_at: Index = at[self.landmark_node]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Factors are cheap to make again and dear to send.
+        return {**self.__dict__, "_symbolic": None, "_factor": None}
+
+    def symbolic(self) -> BlockSymbolic:
+        """Symbolic factorisation under the present order, made once."""
+        if self._symbolic is None:
+            self._symbolic = BlockSymbolic(self.order, self.width, self.ptr, self.neighbours)
+        return self._symbolic
+
+    def factor(self) -> BlockFactor:
         """Factorisation of the information matrix, made once."""
         if self._factor is None:
-            self._factor = SymmetricFactor(self.information, ordered=self.ordered)
+            self._factor = self.symbolic().factor(self.block, self.values)
         return self._factor
+
+    def reorder(self, order: Nodes) -> None:
+        """Take a fresh elimination order ``(N,)``."""
+        self.order = order
+        self._symbolic = self._factor = None
+        self.fill = self.symbolic().nnz / len(self.values)
 
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` by sparse solves (Algorithm 1)."""
@@ -184,30 +230,15 @@ class JoinedMap:
         """Covariance ``(L, 2, 2)`` of every landmark by itself."""
         return self.factor().inverse_diagonal_blocks(self.landmark_at, 2)
 
-    def reordered(self) -> JoinedMap:
-        """The same map in a fresh elimination order; the scalars of a pose or landmark stay together."""
-        fresh = SymmetricFactor(self.information)
-        rank = np.argsort(fresh.order)  # when each scalar would be eliminated
-        begin = np.concatenate([self.pose_at, self.landmark_at])
-        width = np.repeat([3, 2], [len(self.pose_at), len(self.landmark_at)])
-        parts = np.argsort(rank[begin])
-        begin, width = begin[parts], width[parts]
-        order = np.repeat(begin - (np.cumsum(width) - width), width) + np.arange(len(self.x))
-        where = np.empty_like(order)
-        where[order] = np.arange(len(order))
-        return JoinedMap(
-            x=self.x[order],
-            information=sp.csc_matrix(self.information[order][:, order]),
-            pose_at=where[self.pose_at],
-            landmark_at=where[self.landmark_at],
-            ids=self.ids,
-            entries=self.entries,
-            ordered=self.ordered,
-            fill=fresh.nnz / self.information.nnz,
+    def information(self, nodes: Nodes | None = None) -> sp.csc_matrix:
+        """Information matrix ``(n, n)``, both triangles, its nodes in the order ``nodes`` (default: that of ``x``)."""
+        nodes = np.arange(len(self.width)) if nodes is None else nodes
+        return csc_of_blocks(
+            nodes, self.width, self.ptr, self.neighbours, self.block, np.zeros_like(self.block), self.values
         )
 
     @classmethod
-    def leaf(cls, submap: Submap, *, identified: bool, ordered: bool = True) -> JoinedMap:
+    def leaf(cls, submap: Submap, *, identified: bool) -> JoinedMap:
         """A single submap as a joined map.
 
         Parameters
@@ -215,18 +246,49 @@ class JoinedMap:
         submap : Submap
         identified : bool
             Entries of one id are fused. Otherwise ids are ignored and every entry is a landmark of its own.
-        ordered : bool
-            See :class:`JoinedMap`.
         """
-        fused, entries = distinct_landmarks(submap, identified=identified)
+        return cls.leaves([submap], identified=identified)[0][0]
+
+    @classmethod
+    def leaves(cls, submaps: Sequence[Submap], *, identified: bool) -> tuple[list[JoinedMap], list[Array] | None]:
+        """Every submap as a joined map, and the information matrices of all of them as they stand in the submaps.
+
+        The latter is None where entries of one id had to be fused.
+        """
+        maps: list[JoinedMap] = []
+        matrices: list[Array] | None = []
+        for submap in submaps:
+            fused, entries = distinct_landmarks(submap, identified=identified)
+            matrix = dense_information(fused, what=f"submap {submap.key}")
+            maps.append(cls.of_landmarks(fused, entries, matrix, identified=identified))
+            if len(fused) < len(entries):
+                matrices = None
+            elif matrices is not None:
+                matrices.append(matrix)
+        return maps, matrices
+
+    @classmethod
+    def of_landmarks(cls, landmarks: LandmarkMap, entries: Index, information: Array, *, identified: bool) -> JoinedMap:
+        """A landmark map, each landmark once, with its information matrix; ``entries`` as in :class:`JoinedMap`."""
+        n = len(landmarks)
+        width = np.full(n + 1, 2, dtype=np.int64)
+        width[0] = 3
+        nodes = np.arange(n + 1)
+        # All blocks of one row of nodes stand one after the other, so the matrix is cut by rows, then by columns.
+        size = np.outer(width, width).ravel()
         return cls(
-            x=fused.mean,
-            information=sp.csc_matrix(dense_information(fused, what=f"submap {submap.key}")),
-            pose_at=np.zeros(1, dtype=np.intp),
-            landmark_at=3 + 2 * np.arange(len(fused), dtype=np.intp),
-            ids=fused.ids if identified else np.full(len(fused), -1, dtype=np.int64),
+            x=landmarks.mean,
+            width=width,
+            ptr=(n + 1) * np.arange(n + 2),
+            neighbours=np.tile(nodes, n + 1),
+            block=np.cumsum(size) - size,
+            values=kernels.cut_into_blocks(np.ascontiguousarray(information), width),
+            pose_node=np.zeros(1, dtype=np.int64),
+            landmark_node=nodes[1:],
+            ids=landmarks.ids if identified else np.full(n, -1, dtype=np.int64),
             entries=(entries,),
-            ordered=ordered,
+            order=nodes,
+            fill=0.5,
         )
 
 
@@ -241,15 +303,21 @@ class JoinResult(SubmapEstimate):
     ----------
     method : str
     times : mapping of str to float
-        Seconds: association, update, recovery, and polish where there was one. ``seconds`` is their sum; evaluating
-        the objective of the unpolished map is not in it.
+        CPU seconds: association, update, recovery, and polish where there was one. (``seconds`` is wall time.)
+        Evaluating the objective of the unpolished map is in neither.
     submap_ids : tuple of (n_k,) int64
         The landmark ids of every submap as joined: those given, or those association found.
+    problem : SubmapProblem or None
+        The least-squares problem of the same submaps, which a polish goes on with; not pickled.
     """
 
     method: str = ""
     times: Mapping[str, float] = field(default_factory=dict)
     submap_ids: tuple[Ids, ...] = ()
+    problem: SubmapProblem | None = field(default=None, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "problem": None}
 
 
 def landmark_labels(view: MapView, ids: Ids, *, identified: bool) -> Ids:
@@ -259,35 +327,46 @@ def landmark_labels(view: MapView, ids: Ids, *, identified: bool) -> Ids:
 
 def finish(
     submaps: Sequence[Submap],
-    view: MapView,
-    labels: Ids,
+    view: JoinedMap | DenseView,
     *,
+    identified: bool,
     method: str,
     times: JoinTimes,
-    information: sp.csc_matrix | None = None,
-    covariance: Array | None = None,
+    information: Sequence[Array] | None = None,
 ) -> JoinResult:
-    """Bring a joined map into the common layout ``[poses, landmarks by first sighting]`` and evaluate its objective."""
+    """Bring a joined map into the common layout ``[poses, landmarks by first sighting]`` and evaluate its objective.
+
+    ``information`` are the information matrices of the submaps, where the joiner has made them and no submap has an id
+    twice.
+    """
+    labels = landmark_labels(view, view.ids, identified=identified)
     submap_ids = tuple(labels[e] for e in view.entries)
-    problem = SubmapProblem(relabel(submaps, submap_ids))
-    place = {int(j): i for i, j in enumerate(labels)}
-    at = view.landmark_at[[place[int(j)] for j in problem.ids]] if len(problem.ids) else view.landmark_at[:0]
-    order = np.concatenate([pose_scalars(view.pose_at).ravel(), landmark_scalars(at).ravel()])
-    x = view.x[order].copy()
+    problem = SubmapProblem(submaps, ids=submap_ids, information=information)
+    by_id = np.argsort(labels)
+    rank = by_id[np.searchsorted(labels[by_id], problem.ids)]
     m = len(view.pose_at)
+    order = np.concatenate([pose_scalars(view.pose_at).ravel(), landmark_scalars(view.landmark_at[rank]).ravel()])
+    x = view.x[order].copy()
     x[2 : 3 * m : 3] = wrap_angle(x[2 : 3 * m : 3])
+    matrix: sp.csc_matrix | None = None
+    covariance: Array | None = None
+    if isinstance(view, JoinedMap):
+        matrix = view.information(np.concatenate([view.pose_node, view.landmark_node[rank]]))
+    else:
+        covariance = view.covariance[np.ix_(order, order)]
     return JoinResult(
         poses=np.vstack([np.zeros((1, 3)), x[: 3 * m].reshape(-1, 3)]),
         landmark_ids=problem.ids,
         landmarks=x[3 * m :].reshape(-1, 2),
-        information=None if information is None else sp.csc_matrix(information[order][:, order]),
-        covariance=None if covariance is None else covariance[np.ix_(order, order)],
+        information=matrix,
+        covariance=covariance,
         objective=problem.objective(x),
         objective_polished=None,
         iterations=0,
         converged=False,
-        seconds=times.total,
+        seconds=times.wall,
         method=method,
         times=dict(times.parts),
         submap_ids=submap_ids,
+        problem=problem,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from tqdm.auto import tqdm
 
 from graphslam.core.submap import Submap
@@ -16,8 +17,8 @@ from graphslam.join.joined_map import (
     OnJoin,
     check_chain,
     finish,
-    landmark_labels,
 )
+from graphslam.join.tree_order import tree_ranks
 
 
 def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
@@ -54,17 +55,15 @@ def join_sequential(
     check_chain(submaps, identified=identified)
     times = JoinTimes()
     with times.measure("update"):
-        joined = JoinedMap.leaf(submaps[0], identified=identified)
+        leaves, matrices = JoinedMap.leaves(submaps, identified=identified)
+    joined = leaves[0]
     if on_join is not None:
         on_join(0, joined)
-    for k, submap in enumerate(tqdm(submaps[1:], desc="join", unit="submap", disable=not progress), start=1):
-        with times.measure("update"):
-            leaf = JoinedMap.leaf(submap, identified=identified)
+    for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
         joined = _join(joined, leaf, association, times)
         if on_join is not None:
             on_join(k, joined)
-    labels = landmark_labels(joined, joined.ids, identified=identified)
-    return finish(submaps, joined, labels, method="eif-sequential", times=times, information=joined.information)
+    return finish(submaps, joined, identified=identified, method="eif-sequential", times=times, information=matrices)
 
 
 def join_tree(
@@ -78,11 +77,13 @@ def join_tree(
     check_chain(submaps, identified=identified)
     times = JoinTimes()
     with times.measure("update"):
-        level = [JoinedMap.leaf(s, identified=identified, ordered=False) for s in submaps]
+        level, matrices = JoinedMap.leaves(submaps, identified=identified)
+        if identified:
+            for leaf, rank in zip(level, tree_ranks([leaf.ids for leaf in level])):
+                leaf.rank, leaf.order = rank, np.argsort(rank)
     with tqdm(total=len(level) - 1, desc="join", unit="join", disable=not progress) as bar:
         while len(level) > 1:
             above = [_join(a, b, association, times) for a, b in zip(level[::2], level[1::2])]
             bar.update(len(above))
             level = above + level[len(level) - len(level) % 2 :]
-    labels = landmark_labels(level[0], level[0].ids, identified=identified)
-    return finish(submaps, level[0], labels, method="eif-tree", times=times, information=level[0].information)
+    return finish(submaps, level[0], identified=identified, method="eif-tree", times=times, information=matrices)

@@ -84,3 +84,67 @@ def dense_information_join(submaps: Sequence[Submap]) -> tuple[np.ndarray, np.nd
         on = np.flatnonzero(active)
         X[on] = np.linalg.solve(I[np.ix_(on, on)], i[on])  # eq. 13
     return X, I, ids
+
+
+Names = list[tuple[str, int]]
+
+
+def dense_join_two(
+    a: tuple[Names, np.ndarray, np.ndarray], b: tuple[Names, np.ndarray, np.ndarray]
+) -> tuple[Names, np.ndarray, np.ndarray]:
+    """Join map B, which starts at the last pose of map A, to A: eq. 13–16 with numerical Jacobians of H.
+
+    A map is the names of its parts, ``("pose", k)`` or ``("landmark", id)``, its mean and its information matrix.
+    """
+    (names_a, x_a, I_a), (names_b, x_b, I_b) = a, b
+    width = {"pose": 3, "landmark": 2}
+    names = names_a + [n for n in names_b if n not in names_a]
+    begin = dict(zip(names, np.cumsum([0] + [width[kind] for kind, _ in names])))
+    size = sum(width[kind] for kind, _ in names)
+    start = begin[max(n for n in names_a if n[0] == "pose")]
+
+    def predicted(X: np.ndarray) -> np.ndarray:
+        s, out = X[start : start + 3], []
+        c, n = np.cos(s[2]), np.sin(s[2])
+        for name in names_b:
+            v = X[begin[name] : begin[name] + width[name[0]]]
+            d = v[:2] - s[:2]
+            out += [c * d[0] + n * d[1], c * d[1] - n * d[0]]
+            if name[0] == "pose":
+                out.append(v[2] - s[2])
+        return np.array(out)
+
+    X, I = np.zeros(size), np.zeros((size, size))
+    X[: len(x_a)], I[: len(x_a), : len(x_a)] = x_a, I_a
+    s, at = X[start : start + 3].copy(), 0
+    for name in names_b:
+        z = x_b[at : at + width[name[0]]]
+        if name not in names_a:
+            X[begin[name] : begin[name] + 2] = se2_transform(s, z[:2])
+            if name[0] == "pose":
+                X[begin[name] + 2] = s[2] + z[2]
+        at += width[name[0]]
+    J = np.zeros((len(x_b), size))
+    for i in range(size):
+        e = np.zeros(size)
+        e[i] = 1e-6
+        J[:, i] = (predicted(X + e) - predicted(X - e)) / 2e-6
+    I = I + J.T @ I_b @ J
+    X = X + np.linalg.solve(I, J.T @ I_b @ (x_b - predicted(X)))
+    return names, X, I
+
+
+def dense_tree_join(submaps: Sequence[Submap]) -> tuple[Names, np.ndarray, np.ndarray]:
+    """Pairwise joins up a binary tree, dense; an odd one out goes up a level by itself."""
+    level: list[tuple[Names, np.ndarray, np.ndarray]] = [
+        (
+            [("pose", k), *(("landmark", int(j)) for j in s.landmarks.ids)],
+            s.landmarks.mean,
+            np.linalg.inv(s.landmarks.dense_covariance()),
+        )
+        for k, s in enumerate(submaps)
+    ]
+    while len(level) > 1:
+        above = [dense_join_two(a, b) for a, b in zip(level[::2], level[1::2])]
+        level = above + level[len(level) - len(level) % 2 :]
+    return level[0]
