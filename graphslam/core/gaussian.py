@@ -8,6 +8,7 @@ accept ``angular``, the indices of those components.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -190,6 +191,7 @@ def moment_match(
     return Gaussian(mean, 0.5 * (Q + Q.T), angular)
 
 
+@cache
 def chi2_quantile(probability: float, dof: float) -> float:
     """Quantile of the chi-square distribution."""
     return float(stats.chi2.ppf(probability, dof))

@@ -7,19 +7,24 @@ is ``P ← P - Wᵀ W``. (``P - K (P Hᵀ)ᵀ`` loses definiteness after a loop 
 Known landmarks are an ordinary measurement ``z_o`` with noise ``Q_oo``. The end pose and the new landmarks ``z_n`` have
 noise that is correlated with it; given the known part, ``v_n = G v_o + w`` with ``G = Q_no Q_oo⁻¹`` and
 ``w ~ N(0, Q_nn - G Q_on)``, so they are appended with their exact covariance.
+
+The square-root form costs O(n²) a join. The textbook form ``P ← (I - K H) P``, a product of two dense ``n × n``
+matrices, costs O(n³); it is here (``form="naive"``) because published times of the Kalman filter can only be understood
+with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 from tqdm.auto import tqdm
 
-from graphslam.core.errors import CovarianceError, DataError
+from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.graph.submap_blocks import landmark_map_of
@@ -38,6 +43,7 @@ from graphslam.join.joined_map import (
 )
 
 Index = npt.NDArray[np.intp]
+Form = Literal["square", "naive"]
 
 
 class DenseMap:
@@ -51,9 +57,15 @@ class DenseMap:
         Which landmark each entry of the submap became.
     capacity : int
         Scalars to make room for.
+    form : "square" or "naive"
+        How the covariance is updated: ``P - Wᵀ W``, or ``(I - K H) P``. The latter is for timing only: it does not keep
+        the covariance symmetric, and loses definiteness after a long loop.
     """
 
-    def __init__(self, first: LandmarkMap, entries: Index, capacity: int) -> None:
+    def __init__(self, first: LandmarkMap, entries: Index, capacity: int, form: Form = "square") -> None:
+        if form not in ("square", "naive"):
+            raise ConfigError(f"unknown form {form!r} of the covariance update; wanted 'square' or 'naive'")
+        self._form = form
         n = 3 + 2 * len(first)
         self._x = np.zeros(capacity)
         self._P = np.zeros((capacity, capacity))
@@ -152,9 +164,16 @@ class DenseMap:
             F += B.T @ G @ H
             shift = HP[:, columns].T @ la.cho_solve((L, True), innovation)  # of the columns, by the update
             x_new = x_new + F @ shift - B.T @ (G @ innovation)
-            W = la.solve_triangular(L, HP, lower=True)
-            self._x[:n] += W.T @ la.solve_triangular(L, innovation, lower=True)
-            P -= W.T @ W  # a symmetric rank update: numpy calls BLAS syrk
+            if self._form == "square":
+                W = la.solve_triangular(L, HP, lower=True)
+                self._x[:n] += W.T @ la.solve_triangular(L, innovation, lower=True)
+                P -= W.T @ W  # a symmetric rank update: numpy calls BLAS syrk
+            else:
+                K = la.cho_solve((L, True), HP).T  # P Hᵀ S⁻¹
+                H_all = np.zeros((len(H), n))
+                H_all[:, columns] = H
+                self._x[:n] += K @ innovation
+                P[:] = (np.eye(n) - K @ H_all) @ P
         self._append(x_new, F @ P[columns], F, columns, B.T @ Q_w @ B, len(new))
         place = np.where(match >= 0, match, len(self.landmark_at) - len(new) + np.cumsum(match < 0) - 1)
         self.entries = self.entries + (place[entries].astype(np.intp),)
@@ -186,6 +205,7 @@ def join_ekf(
     submaps: Sequence[Submap],
     *,
     association: Association | None = None,
+    form: Form = "square",
     on_join: OnJoin | None = None,
     progress: bool = False,
 ) -> JoinResult:
@@ -196,6 +216,8 @@ def join_ekf(
     submaps : sequence of Submap
     association : Association, optional
         Recognise landmarks; default: by the ids they bear.
+    form : "square" or "naive"
+        Covariance update ``P - Wᵀ W``, O(n²) a join; or ``(I - K H) P`` with dense products, O(n³), for timing only.
     on_join : callable, optional
         See :func:`~graphslam.join.order.join_sequential`.
     progress : bool
@@ -203,7 +225,7 @@ def join_ekf(
 
     Raises
     ------
-    DataError, CovarianceError
+    DataError, CovarianceError, ConfigError
     """
     identified = association is None
     check_chain(submaps, identified=identified)
@@ -229,7 +251,7 @@ def join_ekf(
                     known.setdefault(int(j), len(known))
         with times.measure("update"):
             if dense is None:
-                dense = DenseMap(fused, entries, capacity)
+                dense = DenseMap(fused, entries, capacity, form)
             else:
                 dense.join(fused, entries, match)
         if on_join is not None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.core.errors import DataError, SolverError, UnknownNameError
+from graphslam.core.errors import ConfigError, DataError, SolverError, UnknownNameError
 from graphslam.core.submap import Submap
 from graphslam.graph.submap_blocks import SubmapProblem, scale_covariances
 from graphslam.graph.submap_solver import solve_submaps
@@ -65,6 +65,16 @@ def test_kalman_filter_is_the_information_filter(chain: list[Submap]) -> None:
     some = np.array([0, 5, 40])
     np.testing.assert_allclose(a.covariance_block(some), b.covariance_block(some), rtol=1e-6)
     assert b.nnz == b.states**2 > a.nnz
+
+
+def test_textbook_update_is_the_same_filter(chain: list[Submap]) -> None:
+    a, b = join_ekf(chain), join_ekf(chain, form="naive")
+    np.testing.assert_allclose(b.vector, a.vector, atol=1e-6)
+    P = a.joint_covariance()
+    np.testing.assert_allclose(b.joint_covariance(), P, rtol=0, atol=1e-6 * np.abs(P).max())
+    assert np.any(b.joint_covariance() != P)  # another arithmetic
+    with pytest.raises(ConfigError, match="unknown form 'cubic'"):
+        join_ekf(chain, form="cubic")
 
 
 def test_kalman_filter_stays_symmetric_and_positive_over_a_closure(chain: list[Submap]) -> None:
