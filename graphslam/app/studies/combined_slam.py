@@ -1,0 +1,70 @@
+"""The study ``combined-slam``: every algorithm of the second paper, and the honest defaults, on the same data.
+
+Algorithms
+----------
+``ekf``, ``rbpf``: single-map filters. ``ekf-eif``, ``ekf-eif-tree``: EKF local maps joined by the information filter in
+sequence or by binary tree. ``rbpf-ekf``, ``rbpf-eif``, ``rbpf-eif-tree``: moment-matched particle maps (the paper's),
+joined by EKF, EIF in sequence (SS), EIF by tree (BS). ``default-…``: the same with the default, smoothed maps.
+``…+polish``: the least-squares optimum of those maps. ``default-isam2``; ``default-online``: sequence with
+relinearisation at loop closures; ``default-optimum``: relinearised at every submap. ``full-batch``: no submaps at all.
+``local-…``: the local maps by themselves.
+
+Quantities
+----------
+After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom), ``error_*``, ``sigma_*``, and, after every ninth,
+``feature_nees`` (mean over features, 2 degrees of freedom each) and ``feature_rms``. At the end (submap -1):
+``pose_nees``, ``feature_nees``, ``feature_inside``, ``feature_joint_nees`` with ``feature_joint_dof``, ``feature_rms``,
+``feature_median_error``, ``pose_rms``, ``heading_rms`` [rad], ``objective`` and ``objective_optimum``, ``diverged``.
+Of local map k: ``local_joint_nees`` with ``local_joint_dof``, ``local_pose_nees``, ``local_inside``, …
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+
+from graphslam.app.studies.combined_figures import figures
+from graphslam.app.studies.combined_report import report
+from graphslam.app.studies.combined_trial import TrialConfig, run_trial
+from graphslam.core.errors import UnknownNameError
+from graphslam.evaluate.montecarlo import Measurement
+
+# Scans a submap, so that the route makes 126 submaps as in the paper: 35.4 m in A and C, 44.4 m in B.
+_WORLDS = {"A": TrialConfig("A", 59), "B": TrialConfig("B", 74), "C": TrialConfig("C", 59)}
+_QUICK = {"quick": TrialConfig("quick", 20)}
+
+
+class CombinedSlam:
+    """See the module."""
+
+    name = "combined-slam"
+    description = "EKF, RBPF, EKF-EIF, RBPF-EKF, RBPF-EIF (sequence, tree) beside iSAM2 and batch: NEES, CI, RMSE, time"
+
+    def worlds(self, quick: bool) -> tuple[str, ...]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return tuple(_QUICK if quick else _WORLDS)
+
+    def default_trials(self, quick: bool) -> int:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return 3 if quick else 20
+
+    def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        known = {**_WORLDS, **_QUICK}
+        if world not in known:
+            raise UnknownNameError("world of combined-slam", world, known)
+        return partial(run_trial, known[world])
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return report(table, timings)
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return figures(table, timings, folder)
+
+
+STUDY = CombinedSlam()
