@@ -45,8 +45,11 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
 
 
 def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
-    """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise."""
-    values = cfg.preset(f"{log.name}.{frontend}")
+    """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
+
+    Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set.
+    """
+    values = cfg.preset(f"{log.name.partition('/')[0]}.{frontend}")
     noise = log.meta.get("noise", {})
     simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
     if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):

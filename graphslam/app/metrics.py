@@ -18,9 +18,14 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import joint_nees, vector_pose_error
+from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
-from graphslam.evaluate.map_error import match_ids
+from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.trajectory_error import ate
 from graphslam.solve.solution import Solution
+
+TRUTH_GAP = 0.5
+"""Between records of truth farther apart than this the true pose is unknown [s]."""
 
 
 @dataclass
@@ -121,50 +126,103 @@ def dead_reckoning_metrics(out: Metrics, path: Trajectory | None, gps: Gps) -> N
 
 
 def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
-    """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth."""
+    """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth there.
+
+    Submaps that end where the truth has a gap (:data:`TRUTH_GAP`) or beyond its last record have none.
+    """
     if log.truth is None or not submaps:
         return None
-    base = log.truth.trajectory.interpolate([submaps[0].interval[0]])[0]
-    ends = log.truth.trajectory.interpolate(np.array([s.interval[1] for s in submaps]))
+    path = log.truth.trajectory
+    start = np.array([submaps[0].interval[0]])
+    if not _covered(path, start)[0]:
+        return None
+    base = path.interpolate(start)[0]
+    times = np.array([s.interval[1] for s in submaps])
+    known = _covered(path, times)
+    ends = path.interpolate(times[known])
     return MapTruth(
-        keys=np.array([s.key for s in submaps], dtype=np.int64),
+        keys=np.array([s.key for s in submaps], dtype=np.int64)[known],
         exit_poses=se2_between(np.broadcast_to(base, ends.shape), ends),
         landmark_ids=log.truth.landmark_ids,
         landmarks=se2_transform(se2_inverse(base), log.truth.landmarks),
     )
 
 
+def _covered(path: Trajectory, times: Array) -> np.ndarray:
+    """Which of ``times`` lie inside the path and in no gap of it."""
+    inside = (times >= path.times[0]) & (times <= path.times[-1])
+    j = np.clip(np.searchsorted(path.times, times), 1, len(path) - 1)
+    return np.asarray(inside & (path.times[j] - path.times[j - 1] <= TRUTH_GAP))
+
+
 def truth_path(log: SensorLog, times: Array) -> Trajectory | None:
-    """True path at ``times``, in the frame of the base at the first of them."""
+    """True path at ``times`` where it is known, in the frame of the base at the first of them."""
     if log.truth is None:
         return None
     path = log.truth.trajectory
-    inside = times[(times >= path.times[0]) & (times <= path.times[-1])]
+    inside = times[_covered(path, times)]
+    if len(inside) == 0:
+        return None
     poses = path.interpolate(inside)
     return Trajectory(inside, se2_between(np.broadcast_to(poses[0], poses.shape), poses))
 
 
-def truth_metrics(out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool) -> None:
-    """RMSE and NEES with the first base fixed; landmarks only where their identities are the truth's."""
-    e_pose = vector_pose_error(solution.poses[1:], truth.exit_poses)
+def truth_metrics(
+    out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool, path: Trajectory | None = None
+) -> None:
+    """RMSE and NEES with the first base fixed, and after a rigid alignment; landmarks only with the truth's identities.
+
+    The first gauge trusts the true pose of the first base, heading included: over metres a degree of it is centimetres.
+    In the second the map is moved onto the truth as a whole (three scalars less in the NEES): landmarks by themselves,
+    the path by itself, and the NEES by generalised least squares over all that is judged.
+
+    Parameters
+    ----------
+    path : Trajectory, optional
+        True path at full rate, for the error of the whole path.
+    """
+    i, j = match_ids(solution.submap_keys, truth.keys)
+    node = solution.exit_nodes[i]
+    true_poses = truth.exit_poses[j]
+    e_pose = vector_pose_error(solution.poses[node], true_poses)
     out.add("pose_rmse", float(np.sqrt(np.mean(np.sum(e_pose[:, :2] ** 2, axis=1)))), "m", "lower")
     out.add("heading_rmse", float(np.rad2deg(np.sqrt(np.mean(e_pose[:, 2] ** 2)))), "deg", "lower")
     P = solution.joint_covariance()
-    n_pose = e_pose.size
-    error = e_pose.ravel()
-    ix = np.arange(n_pose)
+    first_landmark = 3 * (len(solution.poses) - 1)
+    error, points = e_pose.ravel(), np.zeros((0, 2))
+    ix = (3 * (node - 1)[:, None] + np.arange(3)).ravel()
+    n_pose = len(error)
     if identities:
         ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
-        e_lm = truth.landmarks[theirs] - solution.landmarks[ours]
+        points = solution.landmarks[ours]
+        e_lm = truth.landmarks[theirs] - points
         out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
         error = np.concatenate([error, e_lm.ravel()])
-        ix = np.concatenate([ix, (n_pose + 2 * ours[:, None] + np.arange(2)).ravel()])
-    dof = len(error)
-    nees = joint_nees(error, covariance=P[np.ix_(ix, ix)])
-    out.add("nees", nees)
-    out.add("nees_dof", dof)
-    out.add("nees_per_dof", nees / dof, "", "one")
-    out.add("ci", nees / chi2_quantile(0.95, dof), "", "lower")
+        ix = np.concatenate([ix, (first_landmark + 2 * ours[:, None] + np.arange(2)).ravel()])
+        if len(ours) >= 2:
+            rigid = landmark_error(
+                truth.landmark_ids[theirs], points, truth.landmark_ids, truth.landmarks, gauge="rigid"
+            )
+            out.add("landmark_rmse_aligned", rigid.statistics.rmse, "m", "lower")
+    if path is not None and len(path) >= 3:
+        whole = ate(solution.trajectory(covariances=False), path, alignment="se")
+        out.add("path_rmse_aligned", whole.statistics.rmse, "m", "lower")
+        out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
+    P = P[np.ix_(ix, ix)]
+    _add_nees(out, "nees", joint_nees(error, covariance=P), len(error))
+    gauge = gauge_directions(solution.poses[node], points)
+    parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
+    for name, part in parts.items():
+        dof = len(error[part]) - 3
+        if dof > 0:
+            _add_nees(out, f"nees_aligned{name}", aligned_nees(error[part], P[part, part], gauge[part]), dof)
+
+
+def _add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
+    out.add(key, nees)
+    out.add(f"{key}_dof", dof)
+    out.add(f"{key}_per_dof", nees / dof, "", "one")
+    out.add("ci" if key == "nees" else key.replace("nees", "ci"), nees / chi2_quantile(0.95, dof), "", "lower")
 
 
 def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, cost: Array) -> None:

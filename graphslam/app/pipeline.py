@@ -249,11 +249,12 @@ def _judge(
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
         dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"
+    true_path = truth_path(log, global_map.trajectory.times)
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
     checks = check_without_truth(out, back.graph, identified, solution.poses, gps, settings)
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
-        truth_metrics(out, solution, truth, identities=known)
+        truth_metrics(out, solution, truth, identities=known, path=true_path)
         identities = "truth" if known else "run"
     audit_association(out, log, front, *back.observation_labels(submaps))
     report = {
@@ -282,7 +283,7 @@ def _judge(
         gps=residuals,
         log=log,
         truth=truth,
-        truth_path=truth_path(log, global_map.trajectory.times),
+        truth_path=true_path,
         dead_reckoning=reckoned,
         solution=solution,
         graph=back.graph,

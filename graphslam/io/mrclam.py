@@ -3,7 +3,7 @@
 Five robots among fifteen landmarks, each an upright tube with a barcode that a camera reads at a range and a bearing.
 One log a robot. The clock of odometry, measurements and Vicon is common to all of them: Unix seconds.
 
-* ``controls``: commanded forward speed and turn rate, held from stamp to stamp.
+* ``controls``: commanded forward speed and turn rate, held from stamp to stamp, and driven a little later.
 * ``landmarks``: range and bearing (positive left) of landmarks; the identity is the *subject* of the barcode, 6 to 20.
   The second column of a measurement is the barcode, whatever the header says. Measurements of one stamp are one scan.
 * truth: the robot's centre by Vicon, and the surveyed landmarks, both in the Vicon frame.
@@ -31,8 +31,14 @@ from graphslam.io.clock import usable_records
 from graphslam.io.text_records import find_text_file, read_table
 
 ROBOTS = 5
-RANGE_SIGMA, BEARING_SIGMA = 0.15, 0.02
-"""Stated σ of a range [m] and a bearing [rad]; the recording states none. See :func:`read_mrclam`."""
+CONTROL_DELAY = 0.2
+"""A commanded velocity is driven this much later [s]: what the bearings of landmarks in turns say, of every robot."""
+RANGE_SIGMA, BEARING_SIGMA = 0.3, 0.015
+"""Stated σ of a range [m] and a bearing [rad]; the recording states none. Range errors last while a barcode is looked
+at from one side: their scatter is 0.15 m, and twice that covers what does not average out."""
+IDLE = 0.5
+"""The camera looks several times a second, but a frame in which nothing was read left no record: where that lasts
+longer than this, empty scans are put in at this spacing [s], so that maps and paths can be told to have been blind."""
 FIELD_OF_VIEW = (-0.6, 0.6)
 """Bearings of all measurements of the set lie inside [rad]."""
 _MAX_RANGE = 9.0  # nothing in the 15 m x 8 m hall was read from farther away
@@ -45,9 +51,11 @@ def read_mrclam(
     *,
     robot: int | None = None,
     robots: bool = False,
+    control_delay: float = CONTROL_DELAY,
     range_sigma: float = RANGE_SIGMA,
     bearing_sigma: float = BEARING_SIGMA,
     range_bias: float = 0.0,
+    idle: float = IDLE,
     name: str = "mrclam-dataset7",
     drops: DropCounter | None = None,
 ) -> SensorLog:
@@ -62,10 +70,15 @@ def read_mrclam(
         1 to 5.
     robots : bool
         Keep sightings of other robots, as a stream ``robots`` of its own with ids 1 to 5.
+    control_delay : float
+        Added to the stamps of the controls [s].
     range_sigma, bearing_sigma : float
         σ put on every measurement [m], [rad].
     range_bias : float
         Subtracted from every range [m].
+    idle : float
+        Spacing of empty scans where nothing was read for longer [s]; ``inf`` for none. Sightings of other robots are
+        scans, too, with nothing in them for the stream ``landmarks``.
     name : str
         The log is called ``<name>/robot<k>``.
     drops : DropCounter, optional
@@ -80,21 +93,25 @@ def read_mrclam(
         raise MissingDataError("no such folder", where=str(root), wanted="the folder of an MRCLAM data set")
     if robot is None or robot not in range(1, ROBOTS + 1):
         raise ConfigError(f"{name} holds one log a robot: name one, {name}/robot1 … robot{ROBOTS}, got robot={robot}")
-    if not (range_sigma > 0 and bearing_sigma > 0 and np.isfinite(range_bias)):
-        raise ConfigError(f"σ of range {range_sigma}, bearing {bearing_sigma}, bias {range_bias}; wanted σ > 0")
+    if not (range_sigma > 0 and bearing_sigma > 0 and idle > 0 and np.isfinite(range_bias + control_delay)):
+        raise ConfigError(
+            f"σ of range {range_sigma} and bearing {bearing_sigma}, idle {idle}, bias {range_bias}, "
+            f"delay {control_delay}; wanted the first three > 0, and finite numbers"
+        )
     counter = DropCounter()
-    controls, n_controls = _controls(root, robot, counter)
+    controls, n_controls = _controls(root, robot, control_delay, counter)
     table, n_measured = _measurements(root, robot, counter)
     subject = table[:, 1].astype(np.int64)
     sigma = (range_sigma, bearing_sigma)
     table[:, 2] -= range_bias
+    stamps = _scan_stamps(np.unique(table[:, 0]), float(controls.times[-1]), idle)
     streams: dict[str, Stream] = {
         "controls": controls,
-        "landmarks": _observations(table[subject > ROBOTS], sigma),
+        "landmarks": _observations(table[subject > ROBOTS], stamps, sigma),
     }
     others = table[(subject >= 1) & (subject <= ROBOTS)]
     if robots:
-        streams["robots"] = _observations(others, sigma)
+        streams["robots"] = _observations(others, stamps, sigma)
     else:
         counter.drop("landmarks", "sightings of other robots", len(others))
     if drops is not None:
@@ -108,6 +125,7 @@ def read_mrclam(
         meta={
             "source": root.name,
             "robot": robot,
+            "control_delay": control_delay,
             "range_sigma": range_sigma,
             "bearing_sigma": bearing_sigma,
             "range_bias": range_bias,
@@ -115,12 +133,12 @@ def read_mrclam(
     )
 
 
-def _controls(root: Path, robot: int, counter: DropCounter) -> tuple[VelocityControls, int]:
+def _controls(root: Path, robot: int, delay: float, counter: DropCounter) -> tuple[VelocityControls, int]:
     path = find_text_file(root, f"Robot{robot}_Odometry.dat")
     times, speed, rate = read_table(path, 3)[0].T
     bad = {"speed or turn rate is not finite": ~(np.isfinite(speed) & np.isfinite(rate))}
     keep = usable_records(times, bad, stream="controls", where=str(path), drops=counter)
-    return VelocityControls(times=times[keep], speed=speed[keep], yaw_rate=rate[keep]), len(times)
+    return VelocityControls(times=times[keep] + delay, speed=speed[keep], yaw_rate=rate[keep]), len(times)
 
 
 def _measurements(root: Path, robot: int, counter: DropCounter) -> tuple[Array, int]:
@@ -169,12 +187,19 @@ def _barcodes(root: Path) -> dict[int, int]:
     return dict(zip(codes, table[:, 0].astype(np.int64).tolist()))
 
 
-def _observations(table: Array, sigma: tuple[float, float]) -> LandmarkObservations:
-    """Rows stamp, subject, range, bearing as scans of equal stamps."""
-    times, first = np.unique(table[:, 0], return_index=True)
+def _scan_stamps(read: Array, end: float, idle: float) -> Array:
+    """Stamps of frames in which something was read, and of empty ones at spacing ``idle`` where nothing was."""
+    edges = np.append(read, max(end, read[-1])) if len(read) else read
+    gaps = np.diff(edges)
+    extra = [a + idle * np.arange(1, np.ceil(g / idle)) for a, g in zip(edges[:-1], gaps) if g > idle]
+    return np.unique(np.concatenate([read, *extra]))
+
+
+def _observations(table: Array, stamps: Array, sigma: tuple[float, float]) -> LandmarkObservations:
+    """Rows stamp, subject, range, bearing, in order of time, as scans at ``stamps``."""
     return LandmarkObservations(
-        times=times,
-        offsets=np.append(first, len(table)).astype(np.int64),
+        times=stamps,
+        offsets=np.append(np.searchsorted(table[:, 0], stamps), len(table)).astype(np.int64),
         ranges=table[:, 2],
         bearings=table[:, 3],
         sigmas=np.tile(sigma, (len(table), 1)),

@@ -65,6 +65,16 @@ class Solution:
         return self.values.poses
 
     @property
+    def submap_keys(self) -> npt.NDArray[np.int64]:
+        """Keys of the submaps ``(m,)`` in the order in which they were joined."""
+        return np.array([s.key for s in self._submaps], dtype=np.int64)
+
+    @property
+    def exit_nodes(self) -> npt.NDArray[np.intp]:
+        """Row of :attr:`poses` at the end of every submap ``(m,)``."""
+        return np.array([s.node + 1 for s in self._submaps], dtype=np.intp)
+
+    @property
     def landmark_ids(self) -> npt.NDArray[np.int64]:
         """``(n,)``."""
         return self.values.landmark_ids

@@ -1,0 +1,64 @@
+"""NEES up to a rigid motion: against explicit minimisation, blind to the frame, and χ² with three scalars less."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from graphslam.core.errors import CovarianceError, DataError
+from graphslam.core.geometry import se2_compose, se2_transform
+from graphslam.evaluate.consistency import joint_nees, vector_pose_error
+from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+
+POSES = np.array([[1.0, 2.0, 0.3], [4.0, -1.0, 2.0], [0.5, 5.0, -3.0]])
+POINTS = np.array([[3.0, 3.0], [-2.0, 1.0], [0.0, -4.0], [6.0, 1.0]])
+
+
+def covariance(rng, n=17):
+    A = rng.normal(size=(n, n)) * 0.03
+    return A @ A.T + 1e-4 * np.eye(n)
+
+
+def error(poses, points):
+    return np.concatenate([vector_pose_error(POSES, poses).ravel(), (points - POINTS).ravel()])
+
+
+def test_directions_are_derivatives_of_a_rigid_motion():
+    G = gauge_directions(POSES, POINTS)
+    for k in range(3):
+        T = 1e-6 * np.eye(3)[k]
+        moved = error(se2_compose(T, POSES), se2_transform(T, POINTS)) / 1e-6
+        np.testing.assert_allclose(moved, G[:, k], atol=1e-5)
+
+
+def test_equals_the_minimum_over_explicit_motions(rng):
+    P = covariance(rng)
+    e = rng.multivariate_normal(np.zeros(17), P)
+    G = gauge_directions(POSES, POINTS)
+    found = minimize(lambda d: joint_nees(e + G @ d, covariance=P), np.zeros(3), method="Powell", tol=1e-12).fun
+    assert aligned_nees(e, P, G) == pytest.approx(found, rel=1e-5)
+    assert aligned_nees(e, P, G) < joint_nees(e, covariance=P)
+
+
+def test_the_frame_of_the_truth_does_not_matter(rng):
+    P, G = covariance(rng), gauge_directions(POSES, POINTS)
+    e = rng.multivariate_normal(np.zeros(17), P)
+    moved = e + G @ np.array([0.4, -0.2, 0.03])
+    assert aligned_nees(moved, P, G) == pytest.approx(aligned_nees(e, P, G), rel=1e-9)
+    assert joint_nees(moved, covariance=P) > 2 * joint_nees(e, covariance=P)
+
+
+def test_mean_is_three_scalars_less(rng):
+    P, G = covariance(rng), gauge_directions(POSES, POINTS)
+    draws = rng.multivariate_normal(np.zeros(17), P, size=4000)
+    mean = np.mean([aligned_nees(e, P, G) for e in draws])
+    assert mean == pytest.approx(14.0, abs=4 * np.sqrt(2 * 14 / 4000))
+
+
+def test_what_cannot_be_judged_is_refused(rng):
+    with pytest.raises(DataError, match="do not fit"):
+        aligned_nees(np.zeros(3), np.eye(3), np.zeros((3, 3)))
+    twice = np.array([[1.0, 1.0], [1.0, 1.0]])
+    with pytest.raises(CovarianceError, match="not determined"):
+        aligned_nees(np.zeros(4), np.eye(4), gauge_directions(np.zeros((0, 3)), twice))
