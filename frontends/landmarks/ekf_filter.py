@@ -185,7 +185,7 @@ class EkfMap:
         if self._n0 and len(observations):
             share = self._passive_distance(observations)
             if np.any(share < 1.0):
-                self._choose(self._passive[share < _GENEROUS])
+                self._choose(np.concatenate([self._active, self._passive[share < _GENEROUS]]))
         alive = self.hits[self._active] > 0
         p = pair(
             self._ax,
@@ -304,7 +304,8 @@ class EkfMap:
         self._fold()
         slots = np.flatnonzero(self.hits[: self._slots] > 0)
         x, y, th = self._x[:3]
-        self._anchor = self._x[:2].copy()
+        if needed is None:  # else it only grows, until the vehicle has moved on
+            self._anchor = self._x[:2].copy()
         active = np.ones(len(slots), dtype=np.bool_)
         if len(slots) > _SMALL:
             m = self.config.active_margin

@@ -152,3 +152,49 @@ class DenseEkf:
         self.update(old, observations)
         for o in fresh:
             self.add(observations[o], names[o])
+
+
+class DenseEkfByDistance(DenseEkf):
+    """The same filter with nearest neighbour and provisional landmarks, which go if they are not confirmed."""
+
+    def __init__(self, sensor, *, gate, gate_new, confirm_hits, drop_misses, drop_scans, reach, view):
+        super().__init__(sensor)
+        self.gate, self.gate_new = gate, gate_new
+        self.confirm, self.drop_misses, self.drop_scans = confirm_hits, drop_misses, drop_scans
+        self.reach, self.view = reach, view
+        self.facts = {}  # name -> hits, misses, scan of birth
+        self.scan = self.founded = 0
+        self.association = []
+
+    def step(self, u, Q, observations):
+        self.predict(u, Q)
+        predicted = {n: measurement(self.x, j, self.sensor)[0] for j, n in enumerate(self.names)}
+        match = nearest_neighbour(self.x, self.P, observations, self.sensor, self.gate)
+        fresh = []
+        for o, row in enumerate(observations):
+            gate = gate_of(self.gate_new, _dof((o, 0), observations))
+            d2 = [distance2(self.x, self.P, [(o, j)], observations, self.sensor)[0] for j in range(len(self.names))]
+            if match[o] < 0 and np.isfinite(row[3]) and all(d > gate for d in d2):
+                fresh.append(o)
+        names = [self.names[j] if j >= 0 else None for j in match]
+        self.update([(o, j) for o, j in enumerate(match) if j >= 0], observations)
+        for o in fresh:
+            self.add(observations[o], self.founded)
+            self.facts[self.founded] = [0, 0, self.scan]
+            names[o] = self.founded
+            self.founded += 1
+        for n in names:
+            if n is not None:
+                self.facts[n][0] += 1
+                self.facts[n][1] = 0
+        self.association += names
+        for n, (r, b) in predicted.items():
+            hits, _, born = self.facts[n]
+            if hits >= self.confirm:
+                continue
+            if n not in names and r < self.reach and self.view[0] < b < self.view[1]:
+                self.facts[n][1] += 1
+            if self.facts[n][1] >= self.drop_misses or self.scan - born >= self.drop_scans:
+                self.remove(n)
+                self.association = [None if a == n else a for a in self.association]
+        self.scan += 1
