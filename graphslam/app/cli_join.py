@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 def join(
     source: str = typer.Argument(..., help="Submap store, run folder, or a card of submaps."),
-    method: str = typer.Option("eif-tree", help="eif-tree, eif-sequential, ekf, isam2 or batch."),
+    method: str = typer.Option("eif-tree", help="eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."),
     polish: bool = typer.Option(False, "--polish", help="Gauss-Newton from the joined map to the optimum."),
     associate: str = typer.Option("given", help="given ids, or recognise landmarks: nearest or joint."),
     scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),
@@ -51,7 +51,7 @@ def join(
 
 def compare(
     source: str = typer.Argument(..., help="Submap store, run folder, or a card of submaps."),
-    methods: str | None = typer.Option(None, help="Comma-separated; default: all five."),
+    methods: str | None = typer.Option(None, help="Comma-separated; default: all but eif-online."),
     polish: bool = typer.Option(True, help="Take every method on to the least-squares optimum."),
     associate: str = typer.Option("given", help="given ids, or recognise landmarks: nearest or joint."),
     scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),

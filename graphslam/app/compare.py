@@ -22,6 +22,7 @@ from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.join.association import Association
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.online import join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish as polish_join
 from graphslam.solve.submap_batch import solve_submaps
@@ -48,6 +49,7 @@ def _batch(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> Submap
 JOINERS: dict[str, Callable[..., JoinResult]] = {
     "eif-tree": join_tree,
     "eif-sequential": join_sequential,
+    "eif-online": join_online,
     "ekf": join_ekf,
 }
 SOLVERS: dict[str, Callable[..., SubmapEstimate]] = {"isam2": _isam2, "batch": _batch}
@@ -79,7 +81,8 @@ def join(
     submaps : sequence of Submap
         In order; submap k+1 starts where submap k ends.
     method : str
-        ``eif-tree``, ``eif-sequential`` or ``ekf``: once linearised. ``batch``, ``isam2``: least squares.
+        ``eif-tree``, ``eif-sequential`` or ``ekf``: once linearised. ``eif-online``: in sequence, linearised afresh
+        when a loop closes or a heading moves. ``batch``, ``isam2``: least squares.
     polish : bool
         Go on to the least-squares optimum from there.
     associate : "given", "nearest", "joint" or Association

@@ -39,6 +39,8 @@ class BlockPattern:
         Length of the values.
     nnz : int
         Stored entries of the matrix, both triangles.
+    order : (N,)
+        Elimination order of the nodes.
     size : int
         Scalars.
     """
@@ -47,9 +49,9 @@ class BlockPattern:
         self.width, self.ptr, self.neighbours = width, ptr, neighbours
         N = len(width)
         owner = np.repeat(np.arange(N), np.diff(ptr))
-        self._order = elimination_order(owner, neighbours, N).astype(np.int64)
+        self.order = elimination_order(owner, neighbours, N).astype(np.int64)
         position = np.empty(N, dtype=np.int64)
-        position[self._order] = np.arange(N)
+        position[self.order] = np.arange(N)
         self.block, self.flip, entries = kernels.half_blocks(position, width, ptr, neighbours)
         self.entries = int(entries)
         self.nnz = int(np.sum(width[owner] * width[neighbours]))
@@ -58,7 +60,7 @@ class BlockPattern:
     @cached_property
     def symbolic(self) -> BlockSymbolic:
         """Symbolic factorisation."""
-        return BlockSymbolic(self._order, self.width, self.ptr, self.neighbours)
+        return BlockSymbolic(self.order, self.width, self.ptr, self.neighbours)
 
     def factor(self, values: Array, damping: float = 0.0) -> BlockFactor:
         """Factor ``A + damping · diag(A)``."""
