@@ -248,7 +248,7 @@ def _dask(jobs: Sequence[Job], address: str, prepare: Callable[[], object] | Non
     try:
         futures = {client.submit(attempt, j.trial, j.seed, prepare, pure=False): j for j in jobs}
         try:
-            for future in distributed.as_completed(futures):
+            for future in distributed.as_completed(futures, loop=client.loop):
                 job = futures[future]
                 try:
                     outcome = Outcome(job, *future.result())

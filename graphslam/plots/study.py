@@ -1,6 +1,7 @@
 """Figures of a Monte-Carlo study from its tidy table: consistency, errors with their bands, RMS.
 
 Every function takes the rows of *one* world. The run is the unit of all bounds: errors of one run hang together.
+Times and local maps are drawn by neighbours, and can be had from here too.
 """
 
 from __future__ import annotations
@@ -20,35 +21,16 @@ from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line, in_order
+from graphslam.plots.algorithms import algorithm_label, algorithm_line
+from graphslam.plots.study_local import plot_local_honesty as plot_local_honesty
+from graphslam.plots.study_table import algorithms_with, curve_of
+from graphslam.plots.study_time import plot_cumulative_time as plot_cumulative_time
 
 DOF = {"pose_nees": 3, "feature_nees": 2, "local_pose_nees": 3}
 _NAMES = {"pose_nees": "end pose", "feature_nees": "features"}
 _COMPONENTS = (("x", 1.0, "m"), ("y", 1.0, "m"), ("heading", np.degrees(1.0), "°"))
 _RMS = (("pose_rms", "position", 1.0, "m"), ("heading_rms", "heading", np.degrees(1.0), "°"),
         ("feature_rms", "features", 1.0, "m"))  # fmt: skip
-
-
-def algorithms_with(table: pd.DataFrame, quantity: str, *, online: bool) -> list[str]:
-    """Algorithms that have a quantity, along the run (``online``) or of the whole run, in the order of drawing.
-
-    Raises
-    ------
-    DataError
-        None has it, or the table holds several worlds.
-    """
-    if "world" in table and table["world"].nunique() > 1:
-        raise DataError("a figure is of one world", got=", ".join(sorted(set(table["world"]))), wanted="rows of one")
-    of = (table["quantity"] == quantity) & ((table["submap"] >= 0) == online)
-    found = in_order(table.loc[of, "algorithm"])
-    if not found:
-        raise DataError(f"table has no {quantity!r}", wanted=", ".join(sorted(set(table["quantity"]))) or "figures")
-    return found
-
-
-def curve_of(table: pd.DataFrame, algorithm: str, quantity: str) -> tuple[Array, Array]:
-    """Submaps ``(k,)`` and values ``(runs, k)`` along the run."""
-    return values_of(table[table["submap"] >= 0], algorithm, quantity)
 
 
 def median_bounds(dof: float, runs: int, confidence: float = 0.95) -> tuple[float, float]:

@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 
 from graphslam.plots.algorithms import algorithm_label
 from graphslam.plots.save import save
-from graphslam.plots.study import algorithms_with, plot_ci, plot_error_panels, plot_rms_panels
+from graphslam.plots.study import plot_ci, plot_error_panels, plot_rms_panels
 from graphslam.plots.study_local import plot_local_honesty
+from graphslam.plots.study_table import algorithms_with
 from graphslam.plots.study_time import plot_cumulative_time
 
 ERRORS_OF = ("rbpf-eif", "default-online")

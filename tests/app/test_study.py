@@ -46,6 +46,18 @@ def trial_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("trials/*/*.npz"))
 
 
+def gone(group: int) -> bool:
+    """Does the process group end, the helper of multiprocessing too, which follows its parent a moment later?"""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory) -> Study:
     """Four runs of two worlds, in this process."""
@@ -98,8 +110,8 @@ def test_another_seed_gives_other_bytes(serial: Study, tmp_path: Path) -> None:
 @pytest.mark.parametrize("workers", [None, 2])
 def test_kills_and_a_resume_give_the_bytes_of_an_uninterrupted_study(tmp_path: Path, workers: int | None) -> None:
     """SIGKILL with trials under way, three times, at moments that no code chose."""
-    options = ["--trials", 30, "--worlds", "near", "--seed", 5, *([] if workers is None else ["--workers", workers])]
-    whole = study(SMALL, 30, out=tmp_path / "whole", worlds=["near"], seed=5, progress=False)
+    options = ["--trials", 20, "--worlds", "near", "--seed", 5, *([] if workers is None else ["--workers", workers])]
+    whole = study(SMALL, 20, out=tmp_path / "whole", worlds=["near"], seed=5, progress=False)
     out, counts = tmp_path / "killed", []
     rng = np.random.default_rng(3)
     for _ in range(3):
@@ -112,17 +124,17 @@ def test_kills_and_a_resume_give_the_bytes_of_an_uninterrupted_study(tmp_path: P
         )
         while process.poll() is None and len(trial_files(out)) <= before and time.monotonic() < deadline:
             time.sleep(0.002)
-        time.sleep(float(rng.uniform(0.0, 0.3)))
+        time.sleep(float(rng.uniform(0.0, 0.2)))
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         assert process.returncode == -signal.SIGKILL, "the study had ended before the kill"
         counts.append(len(trial_files(out)))
-    assert 0 < counts[0] < counts[1] < counts[2] < 30
+    assert 0 < counts[0] < counts[1] < counts[2] < 20
     done = subprocess.run(
         command(SMALL, *options, "--out", out, "--json"), env=environment(), capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["runs"] == {"near": 30}
+    assert json.loads(done.stdout)["runs"] == {"near": 20}
     assert table_bytes(out) == table_bytes(whole.folder.path)
     assert not list(out.rglob("*.part"))
 
@@ -140,15 +152,14 @@ def test_ctrl_c_writes_what_is_done_and_leaves_no_worker(tmp_path: Path) -> None
     deadline = time.monotonic() + 120
     while process.poll() is None and len(trial_files(out)) < 3 and time.monotonic() < deadline:
         time.sleep(0.01)
-    group = os.getpgid(process.pid)
+    group = process.pid  # it leads a session of its own
     os.killpg(group, signal.SIGINT)  # as a terminal does: to the workers too
     _, said = process.communicate(timeout=60)
     assert process.returncode in (1, 130), said  # the command-line library's habit, or ours
     assert "stopped; writing what is done" in said
     assert "Traceback" not in said
     assert "leaked" not in said
-    with pytest.raises(ProcessLookupError):
-        os.killpg(group, 0)
+    assert gone(group)
     done = pd.read_csv(out / "table.csv")
     assert 3 <= len(done.groupby(["world", "run"])) == len(trial_files(out)) < 800
     assert "| near |" in (out / "report.md").read_text()

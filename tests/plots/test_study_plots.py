@@ -16,7 +16,6 @@ from graphslam.core.errors import DataError
 from graphslam.plots import style
 from graphslam.plots.algorithms import _ALGORITHMS, algorithm_label, algorithm_line, in_order
 from graphslam.plots.study import (
-    algorithms_with,
     median_bounds,
     plot_ci,
     plot_error_band,
@@ -26,6 +25,7 @@ from graphslam.plots.study import (
 )
 from graphslam.plots.study_figures import save_paper_figures
 from graphslam.plots.study_local import plot_local_honesty
+from graphslam.plots.study_table import algorithms_with
 from graphslam.plots.study_time import plot_cumulative_time
 from tests.reference.study_rows import COLUMNS, study_rows
 
