@@ -1,4 +1,4 @@
-"""Panels along the run of a Monte-Carlo study: growth of errors, consistency of pose and features (Fig. 6 and 7)."""
+"""How errors grow along the run in a Monte-Carlo study (Fig. 7 of Combined SLAM, left)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphslam.core.geometry import Array
 from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
 from graphslam.plots.algorithms import algorithm_label, algorithm_line
-from graphslam.plots.study import algorithms_with, plot_ci
+from graphslam.plots.study_table import algorithms_with
 
 Component = Literal["position", "heading", "features"]
 _LABELS = {"position": "RMS position error [m]", "heading": "RMS heading error [°]", "features": "RMS of features [m]"}
@@ -83,21 +83,4 @@ def plot_growth_panels(table: pd.DataFrame, *, algorithms: Sequence[str] | None 
             ax.set_xlabel("")
         if ax is not axes[0] and (legend := ax.get_legend()) is not None:
             legend.remove()
-    return axes
-
-
-def plot_ci_panels(
-    table: pd.DataFrame,
-    *,
-    algorithms: Sequence[str],
-    statistic: Literal["mean", "median"] = "mean",
-    title: str | None = None,
-) -> list[Axes]:
-    """Consistency index of the end pose above, of the features below (Fig. 6 of Combined SLAM)."""
-    _, made = plt.subplots(2, 1, figsize=(8.0, 7.0), dpi=style.DPI, layout="constrained")
-    axes = list(made)
-    for ax, quantity in zip(axes, ("pose_nees", "feature_nees"), strict=True):
-        there = set(table.loc[(table["quantity"] == quantity) & (table["submap"] >= 0), "algorithm"])
-        own = [a for a in algorithms if a in there]
-        plot_ci(ax, table, quantity, algorithms=own, statistic=statistic, title=title if ax is axes[0] else "")
     return axes

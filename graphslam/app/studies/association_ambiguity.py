@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies.association_trial import TrialConfig, run_trial
+from graphslam.app.studies.association_trial import LOCAL, SINGLE, TrialConfig, run_trial
 from graphslam.core.errors import UnknownNameError
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.tables import consistency_of
@@ -114,6 +114,8 @@ class AssociationAmbiguity:
         for quantity, label in DRAWN.items():
             some = runs[runs["quantity"] == quantity]
             if not some.empty:
+                rank = some["algorithm"].map({name: k for k, name in enumerate((*LOCAL, *SINGLE))})
+                some = some.iloc[np.argsort(rank.to_numpy(), kind="stable")]
                 made.append(save(plot_runs(some, label=label), folder / f"{quantity}.png"))
         return made
 

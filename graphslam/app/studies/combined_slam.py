@@ -26,15 +26,19 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies.combined_figures import figures
 from graphslam.app.studies.combined_report import report
 from graphslam.app.studies.combined_trial import TrialConfig, run_trial
 from graphslam.core.errors import UnknownNameError
 from graphslam.evaluate.montecarlo import Measurement
+from graphslam.plots.save import save
+from graphslam.plots.study_figures import save_paper_figures
+from graphslam.plots.study_growth import plot_growth_panels
 
 # Scans a submap, so that the route makes 126 submaps as in the paper: 35.4 m in A and C, 44.4 m in B.
 _WORLDS = {"A": TrialConfig("A", 59), "B": TrialConfig("B", 74), "C": TrialConfig("C", 59)}
 _QUICK = {"quick": TrialConfig("quick", 20)}
+
+_GROWTH = ("ekf", "rbpf", "ekf-eif", "rbpf-eif", "default-eif", "default-online")
 
 
 class CombinedSlam:
@@ -64,7 +68,13 @@ class CombinedSlam:
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        return figures(table, timings, folder)
+        made = save_paper_figures(table, timings, folder)
+        for world in dict.fromkeys(table["world"]):
+            t = table[table["world"] == world]
+            there = set(t.loc[t["quantity"] == "error_x", "algorithm"])
+            axes = plot_growth_panels(t, algorithms=[a for a in _GROWTH if a in there])
+            made.append(save(axes[0], folder / f"fig7-growth-{world}.png"))
+        return made
 
 
 STUDY = CombinedSlam()

@@ -179,7 +179,7 @@ class _Trial:
         best = solve_submaps(submaps)
         yield Measurement("default-batch", "objective_optimum", best.objective)
         yield Measurement("default-batch", "objective_dof", float(_degrees_of_freedom(submaps, best)))
-        for kind, join in (("eif", join_sequential), ("ekf", join_ekf)):
+        for kind, join in (("sequence", join_sequential), ("ekf", join_ekf)):
             polished = polish(submaps, join(submaps))
             yield Measurement(f"default-{kind}+polish", "objective_optimum", _optimum(polished))
             yield Measurement(f"default-{kind}+polish", "polish_iterations", float(polished.iterations))
