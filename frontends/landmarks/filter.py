@@ -7,9 +7,10 @@ import numpy.typing as npt
 
 from frontends.landmarks.config import FilterConfig
 from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
+from frontends.landmarks.range_only import Start, WaitingRanges
 from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam.core.gaussian import equal_tail_gate
-from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.geometry import Array, se2_transform, wrap_angle
 
 Ints = npt.NDArray[np.int64]
 
@@ -53,6 +54,8 @@ class ParticleSet:
         self.observations = 0
         self.resamplings = 0
         self.min_ess = float(n)
+        outlier = config.outlier_gate or np.inf
+        self.waiting = WaitingRanges(n, config.delayed, equal_tail_gate(outlier, 2, 1))
         margin = np.deg2rad(1.0)  # at the edge of the scan a trunk is cut off and not reported
         self._cfg = np.zeros(CFG_LENGTH)
         self._cfg[:] = (
@@ -67,8 +70,8 @@ class ParticleSet:
             field_of_view[1] - margin,
             equal_tail_gate(config.gate, 2, 1),
             equal_tail_gate(config.gate_new, 2, 1),
-            config.outlier_gate or np.inf,
-            equal_tail_gate(config.outlier_gate or np.inf, 2, 1),
+            outlier,
+            equal_tail_gate(outlier, 2, 1),
         )
 
     def _grow_slots(self, new_slots: int) -> None:
@@ -115,6 +118,8 @@ class ParticleSet:
             self.scans, self._column(), observations, known, u, Q,
             self.rng.standard_normal((len(self.pose), 3)), self.sensor, self._cfg,
         )  # fmt: skip
+        if np.isinf(observations[:, 3]).any():
+            self._wait_or_start(observations, known)
         self._record(n_obs)
         self.scans += 1
         self.observations += n_obs
@@ -133,12 +138,35 @@ class ParticleSet:
             a[:, :m] = a[survivors, :m]
         self.assoc[:, :q] = self.assoc[survivors, :q]
         self.path[:, :t] = self.path[survivors, :t]
+        self._copy_waiting(survivors)
         self.log_weight[:] = 0.0
         self.weights[:] = 1.0 / len(self.weights)
         self.resamplings += 1
 
+    def _wait_or_start(self, observations: Array, known: Ints) -> None:
+        """Keep the ranges of this scan to beacons that are no landmarks yet, and start those that now can be."""
+        started = (self.hits[:, np.maximum(known, 0)] > 0).any(axis=0)
+        new = np.flatnonzero(np.isinf(observations[:, 3]) & (known >= 0) & ~started)
+        here = se2_transform(self.pose, self.sensor[:2])
+        self.waiting.add(known[new], self.observations + new, observations[new, 0], observations[new, 2], here)
+        for slot in np.unique(known[(known >= 0) & started]):
+            self.waiting.forget(int(slot))  # founded with a bearing: earlier ranges stay unspent
+        for start in self.waiting.ready(np.unique(known[new]), normalise_log_weights(self.log_weight)):
+            j, ok = start.slot, start.solved
+            self.mean[ok, j], self.cov[ok, j] = start.mean[ok], start.covariance[ok]
+            self.hits[ok, j], self.misses[ok, j], self.born[ok, j] = start.used[ok].sum(axis=1), 0, self.scans
+            self.count[ok] = np.maximum(self.count[ok], j + 1)
+            # the ranges that made the landmark also weigh the paths: their likelihood with the landmark integrated out
+            self.log_weight += np.where(ok, start.log_likelihood, -np.inf)
+            self._note_past(start)
+
+    def _note_past(self, start: Start) -> None:
+        """Note in the history which observations have become sightings of a landmark."""
+        self.assoc[:, start.observations] = np.where(start.used & start.solved[:, None], start.slot, IGNORED)
+
     def _copy_waiting(self, source: Ints) -> None:
         """Let row k of what waits to become a landmark go on from row ``source[k]``."""
+        self.waiting.resample(source)
 
     @property
     def best(self) -> int:

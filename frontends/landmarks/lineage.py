@@ -14,6 +14,7 @@ import numpy.typing as npt
 from frontends.landmarks.config import FilterConfig
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.kernels import IGNORED
+from frontends.landmarks.range_only import Start
 from frontends.landmarks.summarise import majority_slots
 from graphslam.core.geometry import Array
 
@@ -67,6 +68,9 @@ class WholeMapParticles(ParticleSet):
             rows = slice(self.observations, self.observations + n_obs)
             self._slots[rows] = self.assoc[:, :n_obs].T
             self._scan_of[rows] = self.scans
+
+    def _note_past(self, start: Start) -> None:
+        pass  # with known identities no history of associations is kept, and without them no range waits
 
     def _resample(self, survivors: Ints) -> None:
         copies = np.bincount(survivors, minlength=len(self.pose))

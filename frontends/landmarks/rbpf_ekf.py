@@ -13,8 +13,9 @@ from frontends.landmarks.config import RbpfEkfConfig
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.honesty import distance, flag, particle_gaussians
 from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from frontends.landmarks.stopping import Stopping
-from frontends.landmarks.summarise import Smoothed, smooth, winning_association
+from frontends.landmarks.summarise import Smoothed, winning_association
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
@@ -113,18 +114,27 @@ class RbpfEkf:
         best = particles.best
         z = np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]])
         span = slice(first, last)
-        smoothed = smooth(
-            particles.path[best, : last - first],
-            particles.mean[best, association.slots],
-            data.odometry.increments[span],
-            data.odometry.covariances[span],
-            scan_of,
-            association.landmark,
-            z,
-            obs.T_base_sensor,
+        problem = SubmapProblem(
+            increments=data.odometry.increments[span],
+            covariances=data.odometry.covariances[span],
+            ob_pose=scan_of,
+            ob_landmark=association.landmark,
+            observations=z,
+            sensor=obs.T_base_sensor,
             trim=c.trim,
             min_hits=c.min_hits,
         )
+        smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
+        if not obs.has_bearing.all():
+            settled = settle_rivals(problem, smoothed, c.delayed)
+            smoothed = settled.smoothed
+            report |= {
+                "beacons_without_landmark": len(particles.waiting.slots),
+                "ranges_unspent": len(particles.waiting) + particles.waiting.unspent,
+                "mirrors_swapped": settled.swapped,
+                "ambiguous_landmarks": settled.ambiguous,
+                "vague_landmarks": settled.vague,
+            }
         slot_of = association.slots[smoothed.landmark_kept]
         made = particle_gaussians(filters, association, smoothed, inflate=c.moment_inflation)
         report |= distance("moment", made.moments, smoothed.gaussian)

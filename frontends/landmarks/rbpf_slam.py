@@ -173,6 +173,11 @@ class RbpfSlam:
             "dropped_particles": dropped,
             "regulariser": REGULARISER,
         }
+        if not data.observations.has_bearing.all():
+            report |= {
+                "beacons_without_landmark": len(p.waiting.slots),
+                "ranges_unspent": len(p.waiting) + p.waiting.unspent,
+            }
         landmarks = LandmarkMap(
             ids=end.landmark_ids,
             exit_pose=end.pose,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.smoothing_kernels import smooth_kernel, smoothed_covariances, smoothing_cost
 from graphslam.core.errors import CovarianceError
-from graphslam.core.gaussian import Gaussian
+from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 
 Ints = npt.NDArray[np.int64]
@@ -241,11 +241,12 @@ def smooth(
     ob_pose, ob_landmark : (q,)
         Pose and landmark of each observation.
     observations : (q, 4)
-        Range, bearing, variances.
+        Range, bearing, variances; an infinite variance of the bearing says that there is none.
     sensor : (3,)
         ``T_base_sensor``.
     trim : float
-        If positive: one Huber pass, then observations with d² above ``trim`` are dropped, then plain least squares.
+        If positive: one Huber pass, then observations with d² above ``trim`` (2 dof; the same tail where there is one
+        channel) are dropped, then plain least squares.
     min_hits : int
         A landmark left with fewer observations after the trimming goes, with them.
 
@@ -266,7 +267,8 @@ def smooth(
             weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
             smooth_kernel(p, l, *args, weight, sensor, 3, 1e-3)
         smoothing_cost(p, l, *args, weight, sensor, d2, parts)
-        weight = (d2 <= trim).astype(np.float64)
+        gates = np.where(np.isinf(observations[:, 3]), equal_tail_gate(trim, 2, 1), trim)
+        weight = (d2 <= gates).astype(np.float64)
     left = np.bincount(ob_landmark, weights=weight, minlength=len(l)) >= min_hits
     kept = (weight > 0.0) & left[ob_landmark]
     l = l[left]
@@ -283,5 +285,6 @@ def smooth(
     G = np.eye(3 + 2 * len(l))
     G[:2, :2] = rotation2(p[-1, 2])  # right tangent → plain vector of eq. 15
     gaussian = Gaussian(np.concatenate([p[-1], l.ravel()]), G @ joint @ G.T, (2,))
-    dof = 2 * len(weight) - 2 * len(l)
+    channels = int(kept.sum() + np.isfinite(observations[kept, 3]).sum())
+    dof = channels - 2 * len(l)
     return Smoothed(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged))
