@@ -209,7 +209,7 @@ def agreement(table: pd.DataFrame) -> pd.DataFrame:
                 "methods": ", ".join(every),
                 "greatest relative difference": spread.max(),
                 "EKF join - sequential EIF, default maps [m, rad]": final(t, "default-ekf", "difference_to_eif").max(),
-                "the same, paper maps": np.max(final(t, "rbpf-ekf", "difference_to_eif"), initial=np.nan),
+                "the same, paper maps": final(t, "rbpf-ekf", "difference_to_eif").max(initial=0.0),
                 "join χ²/dof": every["default-batch"].sum() / dof.sum(),
                 "full batch χ²/dof": whole.sum() / whole_dof.sum(),
                 "polish steps from tree": final(t, "default-eif+polish", "polish_iterations").max(),
