@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from graphslam.core.submap import Submap
-from graphslam.join.association import Association, associate
-from graphslam.join.eif import join_maps, match_by_id
-from graphslam.join.joined_map import (
-    JoinedMap,
-    JoinResult,
-    JoinTimes,
-    OnJoin,
-    check_chain,
-    finish,
-)
+from graphslam.join.association import Association
+from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish
+from graphslam.join.parallel import join_leaves, join_two
 from graphslam.join.tree_order import tree_ranks
 
-
-def _join(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
-    with times.measure("association"):
-        match = match_by_id(a, b) if association is None else associate(a, b, association)
-    return join_maps(a, b, match, times)
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 def join_sequential(
@@ -60,30 +52,57 @@ def join_sequential(
     if on_join is not None:
         on_join(0, joined)
     for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
-        joined = _join(joined, leaf, association, times)
+        joined = join_two(joined, leaf, association, times)
         if on_join is not None:
             on_join(k, joined)
     return finish(submaps, joined, identified=identified, method="eif-sequential", times=times, information=matrices)
 
 
 def join_tree(
-    submaps: Sequence[Submap], *, association: Association | None = None, progress: bool = False
+    submaps: Sequence[Submap],
+    *,
+    association: Association | None = None,
+    executor: str | Executor | Client | None = None,
+    workers: int | None = None,
+    progress: bool = False,
 ) -> JoinResult:
     """Join submaps pairwise, then the pairs, and so on: the joined map of B9 is a submap for the next level.
 
-    An odd one out goes up a level by itself. Parameters as in :func:`join_sequential`.
+    An odd one out goes up a level by itself. The result is the same to the last bit whatever the executor.
+
+    Parameters
+    ----------
+    submaps, association, progress
+        As in :func:`join_sequential`.
+    executor : optional
+        Where the joins are made: in this process (default); ``"processes"``, a pool of spawned processes that lives for
+        this tree; a ``concurrent.futures`` executor or a Dask client to share; or the address of a Dask scheduler, to
+        which the tree goes as one graph of tasks. In one process a few thousand submaps take about a second: others pay
+        where pools are kept, or where landmarks are to be recognised (see :mod:`graphslam.join.parallel`).
+    workers : int, optional
+        Processes of a pool made here; alone it means ``"processes"``. Default: as many as there are processors.
+
+    Returns
+    -------
+    JoinResult
+        ``times`` are CPU seconds of all that took part, ``seconds`` the longest way up the tree.
+
+    Raises
+    ------
+    DataError, CovarianceError, ConfigError
+    GraphSlamError
+        If a cluster is asked for and ``distributed`` is not installed.
     """
     identified = association is None
     check_chain(submaps, identified=identified)
     times = JoinTimes()
     with times.measure("update"):
-        level, matrices = JoinedMap.leaves(submaps, identified=identified)
+        leaves, matrices = JoinedMap.leaves(submaps, identified=identified)
         if identified:
-            for leaf, rank in zip(level, tree_ranks([leaf.ids for leaf in level])):
+            for leaf, rank in zip(leaves, tree_ranks([leaf.ids for leaf in leaves])):
                 leaf.rank, leaf.order = rank, np.argsort(rank)
-    with tqdm(total=len(level) - 1, desc="join", unit="join", disable=not progress) as bar:
-        while len(level) > 1:
-            above = [_join(a, b, association, times) for a, b in zip(level[::2], level[1::2])]
-            bar.update(len(above))
-            level = above + level[len(level) - len(level) % 2 :]
-    return finish(submaps, level[0], identified=identified, method="eif-tree", times=times, information=matrices)
+    joined, spent = join_leaves(leaves, association, executor, workers, progress)
+    for part, seconds in times.parts.items():
+        spent.parts[part] += seconds
+    spent.wall += times.wall
+    return finish(submaps, joined, identified=identified, method="eif-tree", times=spent, information=matrices)
