@@ -17,6 +17,7 @@ _VERBS = {
     "run": "graphslam.app.verbs",
     "compare": "graphslam.app.verbs",
     "join": "graphslam.app.verbs",
+    "local_maps": "graphslam.app.verbs",
     "solve": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",
     "open_run": "graphslam.app.verbs",

@@ -41,6 +41,16 @@ class RbpfEkf:
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`."""
+        for submap, _ in self.with_particles(log, seed=seed, after=after, drops=drops):
+            yield submap
+
+    def with_particles(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[tuple[Submap, ParticleSet]]:
+        """The submaps of :meth:`submaps`, each with the particles it was made of as they stood at its last scan.
+
+        To look at; with pooled filters those of the one that decides.
+        """
         prepared = prepare(log, self.config, drops if drops is not None else DropCounter())
         times = prepared.observations.times
         if after is None:
@@ -49,8 +59,8 @@ class RbpfEkf:
             t_start = after.interval[1]
             key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
         while scan < len(times):
-            submap, scan = self._build(prepared, key, scan, t_start, seed.child(key))
-            yield submap
+            submap, particles, scan = self._build(prepared, key, scan, t_start, seed.child(key))
+            yield submap, particles
             key, t_start = key + 1, submap.interval[1]
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
@@ -62,8 +72,10 @@ class RbpfEkf:
         """
         return landmark_stream(log, self.config.detector)
 
-    def _build(self, data: Prepared, key: int, first: int, t_start: float, seed: SeedTree) -> tuple[Submap, int]:
-        """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
+    def _build(
+        self, data: Prepared, key: int, first: int, t_start: float, seed: SeedTree
+    ) -> tuple[Submap, ParticleSet, int]:
+        """Filter from scan ``first`` until the submap ends; returns it, its particles and the next scan."""
         c, obs = self.config, data.observations
         miss_range = 0.9 * min(c.max_range, obs.max_range)
         branches = [seed, *(seed.child("pooled", k) for k in range(1, c.pooled))]
@@ -87,7 +99,7 @@ class RbpfEkf:
             previous = float(obs.times[scan])
             scan += 1
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        return self._summarise(data, filters, key, first, scan, t_start, slots, report), scan
+        return self._summarise(data, filters, key, first, scan, t_start, slots, report), particles, scan
 
     def _known(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
         """Slot of every observation in known-association mode, else -1."""

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app import compare as comparing
+from graphslam.app.local_maps import local_maps as local_maps
 from graphslam.app.outputs import open_run as open_run
 from graphslam.app.pipeline import load_log_source
 from graphslam.app.pipeline import run as run
@@ -22,7 +23,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 
-__all__ = ["compare", "join", "load", "open_run", "open_study", "run", "simulate", "solve", "study"]
+__all__ = ["compare", "join", "load", "local_maps", "open_run", "open_study", "run", "simulate", "solve", "study"]
 
 
 def load(source: str | Path, **options: Any) -> SensorLog:
