@@ -14,7 +14,7 @@ from frontends.landmarks.config import RbpfEkfConfig
 from graphslam.app import config as cfg
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ["concepts.md", "how-to.md", "limits.md"]
+PAGES = ["concepts.md", "how-to.md", "limits.md", "without-truth.md"]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 every_page = pytest.mark.parametrize("name", PAGES)
 
@@ -41,7 +41,7 @@ def test_links_lead_somewhere(name: str) -> None:
             assert part in {anchor(h) for h in headings}, f"{name}: {target}"
 
 
-@pytest.mark.parametrize("name", ["concepts.md", "how-to.md"])
+@pytest.mark.parametrize("name", ["concepts.md", "how-to.md", "without-truth.md"])
 def test_python_of_the_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     """Blocks that name a file are that file; the rest is one script, run in an empty folder."""
     script = []
