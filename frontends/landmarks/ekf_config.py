@@ -44,7 +44,7 @@ class EkfFilterConfig:
     """Observation noise in the filter; None: the log's sigmas."""
     min_hits: int = 1
     """Landmarks handed over were seen at least this often."""
-    active_margin: float = 30.0
+    active_margin: float = 20.0
     """The filter works on landmarks this far beyond the sensor's range and leaves the rest for later [m]. Changes the
     time it takes, not the result."""
     detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)

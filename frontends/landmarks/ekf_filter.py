@@ -31,9 +31,10 @@ Ints = npt.NDArray[np.int64]
 IGNORED = -1
 # Up to this many landmarks nothing is passive: the bookkeeping would cost more than it saves.
 _SMALL = 48
-# A passive landmark this many times nearer the gate than "surely new" becomes active with those that have to.
+# When one landmark has to become active, so do those within this multiple of its gate.
 _GENEROUS = 3.0
 _ROWS = 1024
+_ROOM = 96
 
 
 class EkfMap:
@@ -74,8 +75,7 @@ class EkfMap:
         self._ax, self._aP, self._aPhi = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0))
         self._n0 = 0
         self._C, self._V, self._rows, self._theta = np.zeros((0, 3)), np.zeros((0, 0)), 0, np.zeros(0)
-        self._passive = np.zeros(0, dtype=np.int64)
-        self._anchor = np.zeros(2)
+        self._passive, self._anchor = np.zeros(0, dtype=np.int64), np.zeros(2)
         # association: every founding has a number; an observation refers to it
         self._founding = np.full(256, IGNORED, dtype=np.int64)
         self.foundings = 0
@@ -127,8 +127,7 @@ class EkfMap:
             at, fresh, polar = self._by_distance(observations)
         self._update(observations, at)
         paired = at >= 0
-        first = self.observations
-        self._remember(q)
+        first = self._remember(q)
         seen = self._active[at[paired]]
         np.add.at(self.hits, seen, 1)
         self.misses[seen] = 0
@@ -183,9 +182,9 @@ class EkfMap:
     def _by_distance(self, observations: Array) -> tuple[Ints, list[int], Array]:
         c = self.config
         if self._n0 and len(observations):
-            share = self._passive_distance(observations)
-            if np.any(share < 1.0):
-                self._choose(np.concatenate([self._active, self._passive[share < _GENEROUS]]))
+            cross = np.vstack([self._aPhi[:3, : self._n0], self._theta]) @ self._C
+            if np.any(self._distance(observations, self._passive, cross) < 1.0):
+                self._choose(None, observations)
         alive = self.hits[self._active] > 0
         p = pair(
             self._ax,
@@ -205,30 +204,32 @@ class EkfMap:
         self.unfounded += int(np.count_nonzero(far & flat))
         return p.landmark, [int(o) for o in np.flatnonzero(far & ~flat)], p.polar
 
-    def _passive_distance(self, observations: Array) -> Array:
-        """Least distance² of any observation to each passive landmark, at most; as a share of "surely new"."""
-        n0, new = self._n0, gates_by_dof(self.config.gate_new, 2)
-        cross = np.vstack([self._aPhi[:3, :n0], self._theta]) @ self._C
+    def _distance(self, observations: Array, slots: Ints, cross: Array) -> Array:
+        """Least distance² of any observation to each passive landmark, at most; as a share of "surely new".
+
+        cross (4, N): covariance of the pose with the whole state, and how far that has moved since it was folded in.
+        """
+        new = gates_by_dof(self.config.gate_new, 2)
         weights = np.broadcast_to([1.0 / new[1], 1.0 / new[2]], (len(observations), 2))
-        out = np.empty(len(self._passive))
+        out = np.empty(len(slots))
         passive_distance_kernel(
-            self._ax[:3], self._aP[:3, :3], cross[:3], cross[3], self._passive, self._x, self._P,
+            self._ax[:3], self._aP[:3, :3], cross[:3], cross[3], slots, self._x, self._P,
             np.hstack([observations, weights]), self.sensor, out,
         )  # fmt: skip
         return out
 
     def _drop_spurious(self, at: Ints, polar: Array) -> None:
         k = len(polar)  # landmarks founded in this very scan are not judged
-        if k == 0:
-            return
         dropped = np.zeros(k, dtype=np.bool_)
         slots = self._active[:k]
         if misses_kernel(slots, self.scans, at, polar, self.hits, self.misses, self.born, self._limits, dropped):
             self.hits[slots[dropped]] = 0  # marginalised out: the row stays until the active part is chosen anew
 
-    def _remember(self, q: int) -> None:
+    def _remember(self, q: int) -> int:
+        """Room for the association of ``q`` more observations; index of the first."""
         while self.observations + q > len(self._founding):
             self._founding = np.pad(self._founding, (0, len(self._founding)), constant_values=IGNORED)
+        return self.observations
 
     # ---- landmarks and the active part
 
@@ -246,10 +247,9 @@ class EkfMap:
         self.foundings += 1
         n = 3 + 2 * len(self._active)
         if n + 2 > len(self._ax):
-            pad = 2 * _SMALL
-            self._ax = np.pad(self._ax, (0, pad))
-            self._aP = np.pad(self._aP, ((0, pad), (0, pad)))
-            self._aPhi = np.pad(self._aPhi, ((0, pad), (0, 0)))
+            self._ax = np.pad(self._ax, (0, _ROOM))
+            self._aP = np.pad(self._aP, ((0, _ROOM), (0, _ROOM)))
+            self._aPhi = np.pad(self._aPhi, ((0, _ROOM), (0, 0)))
         augment_kernel(self._ax, self._aP, n, self._aPhi, self._n0, row, self.sensor)
         self._place[slot] = len(self._active)
         self._active = np.append(self._active, slot)
@@ -299,13 +299,12 @@ class EkfMap:
         self._n0 = self._rows = 0
         self._active = self._passive = np.zeros(0, dtype=np.int64)
 
-    def _choose(self, needed: Ints | None) -> None:
-        """Fold in, then make the landmarks around the vehicle active, and ``needed`` in any case."""
+    def _choose(self, needed: Ints | None, observations: Array | None = None) -> None:
+        """Fold in, then make the landmarks around the vehicle active, and in any case ``needed`` and those observed."""
         self._fold()
         slots = np.flatnonzero(self.hits[: self._slots] > 0)
         x, y, th = self._x[:3]
-        if needed is None:  # else it only grows, until the vehicle has moved on
-            self._anchor = self._x[:2].copy()
+        self._anchor = self._x[:2].copy()
         active = np.ones(len(slots), dtype=np.bool_)
         if len(slots) > _SMALL:
             m = self.config.active_margin
@@ -318,11 +317,14 @@ class EkfMap:
                 active |= self.hits[slots] < self.config.confirm_hits
             if needed is not None:
                 active |= np.isin(slots, needed)
+            if observations is not None:
+                cross = np.vstack([self._P[:, :3].T, np.zeros(len(self._x))])
+                active |= self._distance(observations, slots, cross) < _GENEROUS
         self._active, self._passive = slots[active], slots[~active]
         self._place[self._active] = np.arange(len(self._active))
         mine = _columns(self._active)
         n = len(mine)
-        room = n + 2 * _SMALL
+        room = n + _ROOM
         self._ax, self._aP = np.zeros(room), np.zeros((room, room))
         self._ax[:n] = self._x[mine]
         gather_kernel(self._P, mine, mine, self._aP)
