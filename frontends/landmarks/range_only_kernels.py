@@ -93,7 +93,7 @@ def circle_starts(anchors, ranges, limit):
     out = np.empty((circles * STARTS, 2))
     for i in range(len(out)):
         k = order[0] if i < STARTS else order[len(ranges) // 2]
-        angle = TWO_PI * (i % STARTS) / STARTS
+        angle = TWO_PI * (i % STARTS + 0.3) / STARTS  # not on the axis of a straight path: a saddle
         out[i, 0] = anchors[k, 0] + ranges[k] * math.cos(angle)
         out[i, 1] = anchors[k, 1] + ranges[k] * math.sin(angle)
     return out

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from frontends.landmarks.config import RbpfEkfConfig
+from frontends.landmarks.config import DelayedStart, RbpfEkfConfig
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.measurement_kernels import observe
 from graphslam.core.geometry import se2_compose, wrap_angle
@@ -53,18 +54,25 @@ def world(rng, scans=25, clutter=0.3):
 
 @pytest.mark.parametrize("proposal", ["1.0", "2.0"])
 @pytest.mark.parametrize("association", ["likelihood", "known"])
-@pytest.mark.parametrize("seed", range(4))
-def test_step_equals_slow_twin(proposal, association, seed):
+@pytest.mark.parametrize("ranges_only", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_step_equals_slow_twin(proposal, association, ranges_only, seed):
     rng = np.random.default_rng(seed)
-    config = RbpfEkfConfig(particles=5, proposal=proposal, association=association, ess_fraction=1e-9)
+    outlier = 6.0 if ranges_only else 0.0
+    never = DelayedStart(min_ranges=10**6)  # what waits for a landmark is no part of the step
+    config = RbpfEkfConfig(
+        particles=5, proposal=proposal, association=association, ess_fraction=1e-9, outlier_gate=outlier, delayed=never
+    )
     recorded = Recorded(rng)
     fast = ParticleSet(config, SENSOR, FOV, 9.0, recorded)
     slow = [SlowParticle() for _ in range(5)]
     margin = np.deg2rad(1.0)
-    cfg = {"proposal": proposal, "gate": config.gate, "gate_new": config.gate_new, "confirm": config.confirm_hits,
+    values = {"gate": config.gate, "gate_new": config.gate_new, "outlier": outlier or np.inf}
+    gates = {name: {2: v, 1: chi2.isf(chi2.sf(v, 2), 1)} for name, v in values.items()}
+    cfg = {"proposal": proposal, **gates, "confirm": config.confirm_hits,
                "misses": config.drop_misses, "scans": config.drop_scans, "miss_range": 9.0,
                "fov": (FOV[0] + margin, FOV[1] - margin)}  # fmt: skip
-    dropped = matched = 0
+    dropped = matched = rejected = 0
     slots: dict[int, int] = {}
     for u, Q, obs, ids in world(rng):
         if association == "known":
@@ -72,6 +80,9 @@ def test_step_equals_slow_twin(proposal, association, seed):
             known = np.array([slots.setdefault(int(i), len(slots)) for i in ids], dtype=np.int64)
         else:
             known = np.full(len(obs), -1, dtype=np.int64)
+        if ranges_only:
+            blind = rng.random(len(obs)) < 0.4
+            obs[blind, 1], obs[blind, 3] = 0.0, np.inf
         first = fast.observations
         raw = fast.log_weight.copy()
         before = [len(p.features) for p in slow]
@@ -81,6 +92,7 @@ def test_step_equals_slow_twin(proposal, association, seed):
             p.step(first, obs, u, Q, recorded.normals[-1][i], SENSOR, cfg, known if association == "known" else None)
             matched += sum(o >= first for o in p.assoc)
             dropped += len(p.features) < before[i]
+            rejected += sum(k in p.features and first + o not in p.assoc for o, k in enumerate(known))
         shift = max(p.log_weight for p in slow)
         for i, p in enumerate(slow):
             np.testing.assert_allclose(fast.pose[i], p.pose, atol=2e-7)
@@ -97,6 +109,8 @@ def test_step_equals_slow_twin(proposal, association, seed):
     assert matched > 100  # the comparison had something to compare
     if association == "likelihood":
         assert dropped > 0  # and the spurious-feature logic ran
+    elif ranges_only:
+        assert rejected > 0  # and the outlier gate
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -36,13 +36,17 @@ def dense_residual(v, p, l, u, k, j, z):
     predicted = np.array([measure(P[a], SENSOR, l[b]) for a, b in zip(k, j)])
     d = predicted - z[:, :2]
     d[:, 1] = wrap_angle(d[:, 1])
-    return np.concatenate([(e / np.sqrt(np.diag(Q))).ravel(), (d / R).ravel()])
+    return np.concatenate([(e / np.sqrt(np.diag(Q))).ravel(), (d / np.sqrt(z[:, 2:])).ravel()])
 
 
+@pytest.mark.parametrize("ranges_only", [False, True])
 @pytest.mark.parametrize("seed", range(3))
-def test_smoother_equals_dense_least_squares(seed):
+def test_smoother_equals_dense_least_squares(seed, ranges_only):
     rng = np.random.default_rng(seed)
     truth, landmarks, u, k, j, z = drive(rng)
+    if ranges_only:  # a third of the observations lose their bearing, and one landmark all of them
+        blind = (rng.random(len(z)) < 0.33) | (j == 2)
+        z[blind, 1], z[blind, 3] = 0.0, np.inf
     T, L = len(truth), len(landmarks)
     start_p, start_l = truth + 0.05 * rng.normal(size=truth.shape), landmarks + 0.2 * rng.normal(size=landmarks.shape)
     s = smooth(start_p, start_l, u, np.tile(Q, (T, 1, 1)), k, j, z, SENSOR)
@@ -54,6 +58,7 @@ def test_smoother_equals_dense_least_squares(seed):
     r = f(np.zeros(n))
     assert s.chi2 == pytest.approx(r @ r, rel=1e-9)
     assert s.chi2 == pytest.approx(s.parts.sum(), rel=1e-9)
+    assert s.dof == np.isfinite(z[:, 2:]).sum() - 2 * L
     assert 2 * least_squares(f, np.zeros(n)).cost == pytest.approx(s.chi2, rel=1e-7)  # it is the minimum
     C = np.linalg.inv(J.T @ J)
     for t in range(T):

@@ -28,6 +28,16 @@ def numeric_jacobians(pose, sensor, landmark, h=1e-6):
     return Hx, Hl
 
 
+def channels(z):
+    """Channels of an observation: range and bearing, or the range alone where the bearing's variance is infinite."""
+    return [0] if np.isinf(z[3]) else [0, 1]
+
+
+def log_density(d2, S):
+    """Log of a Gaussian density at Mahalanobis distance² d2."""
+    return -0.5 * (d2 + len(S) * np.log(2 * np.pi) + np.log(np.linalg.det(S)))
+
+
 class SlowParticle:
     """One particle with its features in a dictionary ``slot -> dict``."""
 
@@ -46,21 +56,28 @@ class SlowParticle:
 
     def step(self, first_obs, obs, u, Q, normal, sensor, cfg, known=None):
         m, P = se2_compose(self.pose, u), Q.copy()
+        rejected = set()
         if cfg["proposal"] == "1.0":
             m, P = se2_compose(m, np.linalg.cholesky(P) @ normal), np.zeros((3, 3))
         match, nearest, polar = self._associate(m, P, obs, sensor, cfg, known)
         for o, z in enumerate(obs):
-            R = np.diag(z[2:])
+            ch = channels(z)
+            R = np.diag(z[2:])[np.ix_(ch, ch)]
             if o not in match:
                 if known is None:
-                    self.log_weight -= 0.5 * cfg["gate"] + np.log(2 * np.pi) + 0.5 * np.log(np.linalg.det(R))
+                    self.log_weight += log_density(cfg["gate"][len(ch)], R)
                 continue
             f = self.features[match[o]]
-            Hx, Hl = numeric_jacobians(m, sensor, f["mean"])
+            Hx, Hl = (H[ch] for H in numeric_jacobians(m, sensor, f["mean"]))
             S = Hx @ P @ Hx.T + Hl @ f["cov"] @ Hl.T + R
-            nu = z[:2] - measure(m, sensor, f["mean"])
-            nu[1] = wrap_angle(nu[1])
-            self.log_weight -= 0.5 * nu @ np.linalg.solve(S, nu) + np.log(2 * np.pi) + 0.5 * np.log(np.linalg.det(S))
+            nu = self._innovation(m, sensor, f, z)
+            d2 = nu @ np.linalg.solve(S, nu)
+            if known is not None and d2 > cfg["outlier"][len(ch)]:
+                self.log_weight += log_density(cfg["outlier"][len(ch)], S)
+                del match[o]
+                rejected.add(o)
+                continue
+            self.log_weight += log_density(d2, S)
             if cfg["proposal"] == "2.0":
                 K = P @ Hx.T @ np.linalg.inv(S)
                 m, P = se2_compose(m, K @ nu), P - K @ S @ K.T
@@ -68,28 +85,39 @@ class SlowParticle:
             m = se2_compose(m, np.linalg.cholesky(P) @ normal)
         self.pose = m
         for o, z in enumerate(obs):
-            R = np.diag(z[2:])
+            ch = channels(z)
             if o in match:
                 f = self.features[match[o]]
-                _, H = numeric_jacobians(m, sensor, f["mean"])
-                S = H @ f["cov"] @ H.T + R
+                H = numeric_jacobians(m, sensor, f["mean"])[1][ch]
+                S = H @ f["cov"] @ H.T + np.diag(z[2:])[np.ix_(ch, ch)]
                 K = f["cov"] @ H.T @ np.linalg.inv(S)
-                nu = z[:2] - measure(m, sensor, f["mean"])
-                nu[1] = wrap_angle(nu[1])
+                nu = self._innovation(m, sensor, f, z)
                 f["mean"], f["cov"] = f["mean"] + K @ nu, f["cov"] - K @ S @ K.T
                 f["hits"], f["misses"] = f["hits"] + 1, 0
                 self.assoc[first_obs + o] = match[o]
-            elif known is not None or nearest[o] > cfg["gate_new"]:
+            elif len(ch) == 2 and o not in rejected and (known is not None or nearest[o] > cfg["gate_new"][2]):
                 slot = known[o] if known is not None else self._free_slot()
                 s = se2_compose(m, sensor)
                 mean = se2_transform(s, z[0] * np.array([np.cos(z[1]), np.sin(z[1])]))
                 J = rotation2(s[2] + z[1]) @ np.diag([1.0, z[0]])
-                self.features[slot] = {"mean": mean, "cov": J @ R @ J.T, "hits": 1, "misses": 0, "born": self.scan}
+                self.features[slot] = {
+                    "mean": mean,
+                    "cov": J @ np.diag(z[2:]) @ J.T,
+                    "hits": 1,
+                    "misses": 0,
+                    "born": self.scan,
+                }
                 polar[slot] = None
                 self.assoc[first_obs + o] = slot
         if known is None:
             self._drop_spurious(first_obs, len(obs), polar, cfg)
         self.scan += 1
+
+    @staticmethod
+    def _innovation(m, sensor, f, z):
+        nu = z[:2] - measure(m, sensor, f["mean"])
+        nu[1] = wrap_angle(nu[1])
+        return nu[channels(z)]
 
     def _associate(self, m, P, obs, sensor, cfg, known):
         polar = {j: measure(m, sensor, f["mean"]) for j, f in self.features.items()}
@@ -99,13 +127,13 @@ class SlowParticle:
         pairs = []
         for o, z in enumerate(obs):
             for j, f in self.features.items():
-                Hx, Hl = numeric_jacobians(m, sensor, f["mean"])
-                S = Hx @ P @ Hx.T + Hl @ f["cov"] @ Hl.T + np.diag(z[2:])
-                nu = z[:2] - polar[j]
-                nu[1] = wrap_angle(nu[1])
+                ch = channels(z)
+                Hx, Hl = (H[ch] for H in numeric_jacobians(m, sensor, f["mean"]))
+                S = Hx @ P @ Hx.T + Hl @ f["cov"] @ Hl.T + np.diag(z[2:])[np.ix_(ch, ch)]
+                nu = self._innovation(m, sensor, f, z)
                 d2 = nu @ np.linalg.solve(S, nu)
                 nearest[o] = min(nearest[o], d2)
-                if d2 < cfg["gate"]:
+                if d2 < cfg["gate"][len(ch)]:
                     pairs.append((d2 + np.log(np.linalg.det(S)), o, j))
         match, taken = {}, set()
         for _, o, j in sorted(pairs):
