@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -56,14 +57,18 @@ class MapView(Protocol):
     The state ``x`` ``(n,)`` is in the frame of the map's first base, headings not wrapped. ``pose_at`` ``(m,)`` and
     ``landmark_at`` ``(L,)`` say where each end pose (x, y, θ) and landmark (x, y) begins in it; landmarks stand in the
     order of first sighting. ``ids`` ``(L,)`` int64 are the ids they were joined by, -1 where they were recognised
-    instead. ``entries[k]`` ``(n_k,)`` says which landmark each entry of submap k became.
+    instead.
     """
 
     x: Array
     pose_at: Index
     landmark_at: Index
     ids: Ids
-    entries: tuple[Index, ...]
+
+    @property
+    def entries(self) -> tuple[Index, ...]:
+        """For every submap inside, the landmark ``(n_k,)`` each of its entries became."""
+        ...
 
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` of ``x``."""
@@ -161,8 +166,10 @@ class JoinedMap:
     landmark_node : (L,)
         Node of landmark j, landmarks in the order of first sighting.
     ids : (L,) int64
-    entries : tuple of (n_k,)
-        For every submap inside, the landmark each of its entries became.
+    entry_landmark : (E,)
+        Which landmark each entry of the submaps inside became, submap by submap.
+    entry_count : (m,)
+        Entries of each submap.
     order : (N,)
         Elimination order of the nodes.
     fill : float
@@ -180,7 +187,8 @@ class JoinedMap:
     pose_node: Nodes
     landmark_node: Nodes
     ids: Ids
-    entries: tuple[Index, ...]
+    entry_landmark: Index
+    entry_count: Nodes
     order: Nodes
     fill: float
     rank: Nodes | None = None
@@ -194,7 +202,13 @@ class JoinedMap:
 
     def __getstate__(self) -> dict[str, Any]:
         # Factors are cheap to make again and dear to send.
-        return {**self.__dict__, "_symbolic": None, "_factor": None}
+        kept = {k: v for k, v in self.__dict__.items() if k != "entries"}
+        return {**kept, "_symbolic": None, "_factor": None}
+
+    @cached_property
+    def entries(self) -> tuple[Index, ...]:
+        """For every submap inside, the landmark each of its entries became."""
+        return tuple(np.split(self.entry_landmark, np.cumsum(self.entry_count)[:-1]))
 
     def symbolic(self) -> BlockSymbolic:
         """Symbolic factorisation under the present order, made once."""
@@ -269,7 +283,7 @@ class JoinedMap:
 
     @classmethod
     def of_landmarks(cls, landmarks: LandmarkMap, entries: Index, information: Array, *, identified: bool) -> JoinedMap:
-        """A landmark map, each landmark once, with its information matrix; ``entries`` as in :class:`JoinedMap`."""
+        """A landmark map, each landmark once, its information matrix, and which landmark each entry became."""
         n = len(landmarks)
         width = np.full(n + 1, 2, dtype=np.int64)
         width[0] = 3
@@ -286,7 +300,8 @@ class JoinedMap:
             pose_node=np.zeros(1, dtype=np.int64),
             landmark_node=nodes[1:],
             ids=landmarks.ids if identified else np.full(n, -1, dtype=np.int64),
-            entries=(entries,),
+            entry_landmark=entries,
+            entry_count=np.array([len(entries)]),
             order=nodes,
             fill=0.5,
         )

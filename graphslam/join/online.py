@@ -186,7 +186,8 @@ def _relinearise(
         pose_node=np.arange(m),
         landmark_node=m + np.arange(len(problem.ids)),
         ids=joined.ids,
-        entries=joined.entries,
+        entry_landmark=joined.entry_landmark,
+        entry_count=joined.entry_count,
         order=pattern.order,
         fill=pattern.symbolic.nnz / len(values),
     )
