@@ -13,6 +13,7 @@ from graphslam.app.config import BackEndConfig, GpsConfig
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
+from graphslam.graph.identity import doubtful_identities
 from graphslam.graph.landmark_association import AssociationConfig, associate
 from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
 from graphslam.graph.noise import NO_KERNEL, Robust
@@ -98,9 +99,22 @@ class BackEnd:
             self.solver.solve_to_optimum()
         start = time.perf_counter()
         self.solver.solve_to_optimum()
+        self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start
         return solution
+
+    def split_wrong_identities(self) -> int:
+        """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""
+        split = 0
+        while self.config.identity_gate > 0 and split < 10 * len(self.graph.submaps):
+            doubts = doubtful_identities(self.graph, self.config.identity_gate)
+            if not doubts:
+                break
+            self.graph.split_landmark(doubts[0].factor_id, doubts[0].entry)
+            self.solver.solve_to_optimum()
+            split += 1
+        return split
 
     def landmark_hits(self, submaps: list[Submap]) -> dict[int, int]:
         """Sightings of every landmark over all submaps (1 a submap where a submap does not count them)."""

@@ -50,6 +50,8 @@ class BackEndConfig:
     """How landmarks are associated."""
     gate: float = 11.8
     """χ² gate of one pairing given the ones before (2 dof: 99.7 %)."""
+    identity_gate: float = 0.0
+    """At the end, a sighting that contradicts the map by this χ² (2 dof) becomes a landmark of its own; 0 = never."""
     merge_distance: float = 0.0
     """Landmarks nearer than this after the join are one [m]; 0 = never merge by distance."""
     merge_reach: float = 5.0

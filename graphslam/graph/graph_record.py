@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
@@ -122,6 +122,36 @@ class GraphRecord:
         self._drop_landmarks([drop])
         self.revision += 1
         self._event("merged", keep=keep, drop=drop, distance=distance)
+
+    def split_landmark(self, factor_id: int, entry: int) -> int:
+        """One sighting was of another landmark: entry ``entry`` of a submap factor gets a new landmark of its own.
+
+        Returns
+        -------
+        int
+            Id of the new landmark, which stands where the submap saw it.
+
+        Raises
+        ------
+        DataError
+            No such submap factor or entry, or nothing else sees its landmark.
+        """
+        record = self.records.get(factor_id)
+        if not isinstance(record, SubmapRecord) or not 0 <= entry < len(record.landmark_ids):
+            raise DataError("no such sighting to split off", got=(factor_id, entry), wanted="a submap factor's entry")
+        old, new = int(record.landmark_ids[entry]), self._next_landmark
+        ids = record.landmark_ids.copy()
+        ids[entry] = new
+        if old not in ids and len(self._seen_in[old]) < 2:
+            raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two sightings")
+        self._next_landmark += 1
+        seen = se2_transform(self.values.poses[record.start], record.z[3 + 2 * entry : 5 + 2 * entry])
+        self._start_landmarks(ids[entry : entry + 1], seen[None])
+        if old not in ids:
+            self._seen_in[old].discard(factor_id)
+        self._insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
+        self._event("split", factor_id=factor_id, submap=record.submap_key, landmark=old, new=new)
+        return new
 
     def set_values(self, values: Values) -> None:
         """Take a solver's values (same variables).

@@ -1,0 +1,96 @@
+"""Landmark identities that cannot be right: a test of every sighting against the whole of the map, at the optimum.
+
+A barcode misread three times in a row, or a wrong association, puts a landmark of one submap where another one stands.
+Inside that submap nothing contradicts it; the map does. The test is that of Baarda (1968, "data snooping"): were
+landmark i of a submap displaced by an unknown amount, by how much would the objective fall if that were allowed?
+With the submap's residual r, its information Ω and the covariance of the residual ``S = Ω⁻¹ - J P Jᵀ``::
+
+    T_i = (Ω r)_iᵀ [(Ω S Ω)_ii]⁻¹ (Ω r)_i      ~ χ² with 2 degrees of freedom if nothing is wrong
+
+A sighting that fails is split off into a landmark of its own (:meth:`PoseGraph.split_landmark`): nothing is thrown
+away, the submap keeps all its information about itself, and the event log says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.graph.graph_record import GraphRecord
+from graphslam.graph.records import SubmapRecord
+from graphslam.graph.submap_model import submap_jacobians, submap_residual
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """A sighting whose identity contradicts the map.
+
+    Parameters
+    ----------
+    factor_id, entry : int
+        Factor, and place of the landmark in its submap.
+    landmark_id : int
+    statistic : float
+        By how much the objective would fall.
+    """
+
+    factor_id: int
+    entry: int
+    landmark_id: int
+    statistic: float
+
+
+def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
+    """``T_i`` of every landmark ``(n,)`` of one submap factor at the graph's values; nan where only it sees one.
+
+    The values must be the optimum: the residuals are judged by what the optimum leaves of them.
+    """
+    ids = record.landmark_ids
+    n = len(ids)
+    lonely = np.array([len(graph.sightings(int(i))) < 2 for i in ids])
+    if n == 0 or bool(lonely.all()):
+        return np.full(n, np.nan)
+    start, end = graph.values.poses[record.start], graph.values.poses[record.start + 1]
+    points = np.array([graph.landmark(int(i)) for i in ids])
+    r = submap_residual(start, end, points, record.z)
+    J_start, J_end, J_point = submap_jacobians(start, end, points, tangent=True)
+    variables = record.variables()
+    column = {name: k for k, name in enumerate(variables[2:])}
+    J = np.zeros((len(r), 6 + 2 * len(column)))
+    J[:, :3], J[:, 3:6] = J_start, J_end
+    for k, i in enumerate(ids.tolist()):
+        c = 6 + 2 * column[f"l{i}"]
+        J[3 + 2 * k : 5 + 2 * k, c : c + 2] = J_point
+    if record.start == 0:
+        J = J[:, 3:]  # the first base is fixed and has no columns
+    P = graph.covariance().joint(variables)
+    omega = record.whitener.T @ record.whitener
+    g = (omega @ r)[3:].reshape(n, 2)
+    JtO = J.T @ omega
+    C = omega - JtO.T @ P @ JtO  # Ω S Ω
+    rows = 3 + 2 * np.arange(n)[:, None] + np.arange(2)
+    blocks = C[rows[:, :, None], rows[:, None, :]]
+    # a landmark that only this submap holds in place has no redundancy: its block vanishes
+    share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3:, 3:]) / n, 1e-300)
+    testable = ~lonely & (share > 1e-9)
+    out = np.full(n, np.nan)
+    if np.any(testable):
+        y = np.linalg.solve(blocks[testable], g[testable][..., None])[..., 0]
+        out[testable] = np.sum(g[testable] * y, axis=1)
+    return out
+
+
+def doubtful_identities(graph: GraphRecord, gate: float) -> list[Doubt]:
+    """Sightings beyond ``gate``, the worst first.
+
+    One wrong sighting makes others look wrong, too: split off the worst alone, solve again, and ask again.
+    """
+    found = []
+    for record in graph.records.values():
+        if isinstance(record, SubmapRecord):
+            T = identity_statistics(graph, record)
+            beyond = np.flatnonzero(np.nan_to_num(T) > gate)
+            found += [Doubt(record.factor_id, int(k), int(record.landmark_ids[k]), float(T[k])) for k in beyond]
+    return sorted(found, key=lambda d: -d.statistic)
