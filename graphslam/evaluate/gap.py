@@ -1,7 +1,8 @@
 """How far above the least-squares optimum a method stands: along the sequence, up the tree, and step by step.
 
 The objective ``Σ rᵀ P⁻¹ r`` over the submaps in a map has one minimum that every method should reach. A map above it
-stands at values that the same information contradicts; the difference, in units of χ², is the price of one linearisation.
+stands at values that the same information contradicts; the difference, in units of χ², is the price of linearising
+once.
 """
 
 from __future__ import annotations

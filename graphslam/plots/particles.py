@@ -1,0 +1,211 @@
+"""Particles of a submap: where they end, what is left of their paths, and which Gaussian results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from frontends.landmarks.filter import ParticleSet
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, se2_between
+from graphslam.core.log import Truth
+from graphslam.core.submap import Submap
+from graphslam.evaluate.submap_consistency import true_submap
+from graphslam.plots import style
+from graphslam.plots.map import landmark_blocks, plot_ellipses
+
+_COLOURS = (style.ESTIMATE, style.VERMILION, style.PURPLE, style.ORANGE, style.SKY)
+
+
+def plot_exit(
+    ax: Axes | None,
+    handovers: Mapping[str, Submap],
+    *,
+    particles: ParticleSet | None = None,
+    truth: Truth | None = None,
+    confidence: float = 0.95,
+    title: str | None = None,
+) -> Axes:
+    """Where a submap ends: the Gaussians of several hand-overs, the particles behind one of them, the truth.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    handovers : mapping of label to Submap
+        2-D landmark submaps of the same scans.
+    particles : ParticleSet, optional
+        Their exit positions; the area of a dot grows with the weight.
+    truth : Truth, optional
+        The true exit in the frame of the first base: nothing is aligned.
+    confidence : float
+        Of the ellipses.
+    """
+    if not handovers:
+        raise DataError("no submap to draw")
+    ax = style.new_axes(ax, (5.0, 4.5))
+    if particles is not None:
+        n = len(particles.weights)
+        # one dot for particles that stand on the same spot, so that a collapsed set looks collapsed
+        at, which = np.unique(particles.pose[:, :2], axis=0, return_inverse=True)
+        weight = np.bincount(which.ravel(), weights=particles.weights)
+        ax.scatter(at[:, 0], at[:, 1], s=np.minimum(12.0 * n * weight, 90.0), color=style.GREY, alpha=0.55, lw=0,
+                   label="particles", zorder=2)  # fmt: skip
+    for k, (label, submap) in enumerate(handovers.items()):
+        mean, cov = _vector(submap)
+        colour = _COLOURS[k % len(_COLOURS)]
+        plot_ellipses(ax, mean[:2], cov[None, :2, :2], confidence=confidence, colour=colour, alpha=0.12,
+                      label=f"{label}, {confidence:.0%}")  # fmt: skip
+        ax.plot(*mean[:2], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=5, mec="white", mew=0.6, zorder=4)
+    if truth is not None:
+        exit_pose = true_submap(next(iter(handovers.values())), truth)[0]
+        ax.plot(*exit_pose[:2], "x", color=style.TRUTH, ms=9, mew=1.8, label="true exit", zorder=5)
+    style.metric_axes(ax)
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax, outside=False, loc="best")
+    return ax
+
+
+def plot_exit_panels(
+    panels: Mapping[str, tuple[ParticleSet | None, Mapping[str, Submap]]],
+    *,
+    truth: Truth | None = None,
+    confidence: float = 0.95,
+) -> list[Axes]:
+    """One :func:`plot_exit` per title, side by side on the same scales; the legend stands beside the last."""
+    if not panels:
+        raise DataError("no submap to draw")
+    n = len(panels)
+    fig, made = plt.subplots(1, n, dpi=style.DPI, layout="constrained", sharex=True, sharey=True, squeeze=False)
+    axes = list(made.ravel())
+    for ax, (title, (particles, handovers)) in zip(axes, panels.items(), strict=True):
+        plot_exit(ax, handovers, particles=particles, truth=truth, confidence=confidence, title=title)
+        ax.label_outer()
+        if (box := ax.get_legend()) is not None:
+            box.remove()
+    style.legend(axes[-1])
+    # equal scales in x and y: a figure of the data's own shape wastes no space
+    wide = float(np.ptp(axes[0].get_xlim()) / np.ptp(axes[0].get_ylim()))
+    fig.set_size_inches(n * float(np.clip(4.0 * wide, 1.6, 4.0)) + 2.5, float(np.clip(4.0 / wide, 2.4, 4.4)))
+    return axes
+
+
+def plot_handovers(
+    ax: Axes | None,
+    handovers: Mapping[str, Submap],
+    *,
+    truth: Truth | None = None,
+    confidence: float = 0.95,
+    title: str | None = None,
+) -> Axes:
+    """Several hand-overs of the same scans as maps over each other: exits and landmarks with their ellipses.
+
+    Parameters
+    ----------
+    handovers : mapping of label to Submap
+        2-D landmark submaps.
+    truth : Truth, optional
+        In the frame of the first base: nothing is aligned.
+    """
+    if not handovers:
+        raise DataError("no submap to draw")
+    ax = style.new_axes(ax)
+    for k, (label, submap) in enumerate(handovers.items()):
+        mean, cov = _vector(submap)
+        colour = _COLOURS[k % len(_COLOURS)]
+        points = np.vstack([mean[None, :2], mean[3:].reshape(-1, 2)])
+        blocks = np.concatenate([cov[None, :2, :2], landmark_blocks(cov, (len(mean) - 3) // 2, offset=3)])
+        plot_ellipses(ax, points, blocks, confidence=confidence, colour=colour, label=f"{label}, {confidence:.0%}",
+                      alpha=0.10)  # fmt: skip
+    ax.plot(0.0, 0.0, "s", color=style.BLACK, ms=6, label="base: zero by definition", zorder=4)
+    if truth is not None:
+        exit_pose, _, points = true_submap(next(iter(handovers.values())), truth)
+        ax.plot(*exit_pose[:2], "+", color=style.TRUTH, ms=10, mew=1.6, label="true exit", zorder=5)
+        ax.plot(points[:, 0], points[:, 1], "x", color=style.TRUTH, ms=5, mew=1.0, label="true landmark", zorder=5)
+    style.metric_axes(ax)
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax)
+    return ax
+
+
+def plot_lineage(
+    ax: Axes | None, particles: ParticleSet, submap: Submap, *, sigmas: float = 2.0, title: str | None = None
+) -> Axes:
+    """Paths of the particles that are left at the end, sideways from the smoothed path, over its own band.
+
+    Every resampling kills histories: towards the start all particles share one path, and no spread is left where the
+    posterior has some.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    particles : ParticleSet
+        At the end of the submap.
+    submap : Submap
+        Smoothed, of the same scans, with its trajectory.
+    sigmas : float
+        Half width of the band in the smoothed path's own standard deviations.
+    """
+    path = submap.trajectory
+    scans = particles.scans
+    if path is None or path.covariances is None or len(path.poses) < scans or scans < 1:
+        raise DataError(f"submap {submap.key} has no path for {scans} scans", wanted="a trajectory with covariances")
+    ax = style.new_axes(ax, (8.0, 3.6))
+    smooth, cov = path.poses[-scans:], path.covariances[-scans:]
+    off = se2_between(smooth[None], particles.path[:, :scans])[..., 1]  # sideways in the smoothed body frame
+    sigma = np.sqrt(cov[:, 1, 1])  # right tangent: the same frame
+    x = np.arange(1, scans + 1)
+    ax.fill_between(x, -sigmas * sigma, sigmas * sigma, color=style.ESTIMATE, alpha=0.18, lw=0,
+                    label=f"smoothed path, ±{sigmas:g}σ", zorder=0)  # fmt: skip
+    histories = np.unique(off, axis=0)
+    ax.plot(x, histories.T, color=style.GREY, lw=0.7, alpha=0.6, zorder=2)
+    ax.plot([], [], color=style.GREY, lw=1.0, label=f"{len(particles.weights)} particles' paths")
+    ax.axhline(0.0, color=style.ESTIMATE, lw=0.9, zorder=1)
+    ax.set_xlabel("scan of the submap")
+    ax.set_ylabel("sideways [m]")
+    ancestors = particles.ancestors
+    descent = f"{particles.resamplings} resamplings, {ancestors} ancestor{'s' if ancestors != 1 else ''} left"
+    ax.set_title(title or descent, fontsize="medium")
+    style.legend(ax)
+    return ax
+
+
+def plot_histories(ax: Axes | None, sets: Mapping[str, ParticleSet], *, title: str | None = None) -> Axes:
+    """How many different histories of every scan are still carried at the end of the submap.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    sets : mapping of label to ParticleSet
+    """
+    if not sets:
+        raise DataError("no particles to draw")
+    ax = style.new_axes(ax, (8.0, 3.2))
+    for k, (label, particles) in enumerate(sets.items()):
+        left = histories_left(particles)
+        every = max(1, len(left) // 8)
+        ax.plot(np.arange(1, len(left) + 1), left, lw=1.5, ms=4.5, markevery=every, label=label, **style.line(k))
+    ax.set_yscale("log")
+    ax.set_xlabel("scan of the submap")
+    ax.set_ylabel("different poses left")
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax)
+    return ax
+
+
+def histories_left(particles: ParticleSet) -> Array:
+    """Number of different poses ``(scans,)`` of every scan that the particles of the end still remember."""
+    path = particles.path[:, : particles.scans]
+    return np.array([len(np.unique(path[:, t], axis=0)) for t in range(particles.scans)])
+
+
+def _vector(submap: Submap) -> tuple[Array, Array]:
+    """Mean and covariance of ``[x, y, θ, l1x, …]`` of a 2-D landmark submap."""
+    if submap.dim != 2 or submap.landmarks is None:
+        raise DataError(f"submap {submap.key} is no 2-D landmark map", wanted="a Gaussian over exit and landmarks")
+    return submap.landmarks.mean, submap.landmarks.dense_covariance()
