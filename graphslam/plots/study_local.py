@@ -48,7 +48,8 @@ def plot_local_honesty(
     ratios = np.concatenate([d2 / dof for d2, dof in found.values()])
     left = min(0.3, float(ratios.min(initial=0.3)))
     right = max(3.0, float(np.quantile(ratios, 0.995)))
-    edges = np.geomspace(left, right, 60)
+    most = max(len(d2) for d2, _ in found.values())
+    edges = np.geomspace(left, right, 1 + int(np.clip(2.5 * np.sqrt(most), 12, 60)))
     x = np.geomspace(left, right, 400)
     sizes, counts = np.unique(found[names[0]][1], return_counts=True)
     f = stats.chi2.pdf(x[:, None] * sizes, sizes) * sizes * x[:, None]
@@ -70,8 +71,7 @@ def plot_local_honesty(
     ax.set_ylim(bottom=0.0)
     ax.set_xlabel("joint NEES / n of a local map")
     ax.set_ylabel("density over ln(NEES / n)")
-    count = max(len(d2) for d2, _ in found.values())
-    ax.set_title(f"{count} local maps, each in the frame of its first pose" if title is None else title,
+    ax.set_title(f"{most} local maps, each in the frame of its first pose" if title is None else title,
                  fontsize="medium")  # fmt: skip
     # long labels: under the axes, which they would else squeeze
     style.legend(ax, outside=False, loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)
