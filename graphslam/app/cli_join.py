@@ -28,6 +28,8 @@ def join(
     polish: bool = typer.Option(False, "--polish", help="Gauss-Newton from the joined map to the optimum."),
     associate: str = typer.Option("given", help="given ids, or recognise landmarks: nearest or joint."),
     scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),
+    workers: int | None = typer.Option(None, help="Processes that share the joins of eif-tree."),
+    cluster: str | None = typer.Option(None, help="Address of a Dask scheduler to send the joins of eif-tree to."),
     out: Path | None = typer.Option(None, help="Folder for joined.npz and nodes.tum."),
     as_json: bool = JSON,
 ) -> None:
@@ -39,7 +41,14 @@ def join(
     s = submap_source(source)
     factor = s.covariance_scale if scale is None else scale
     estimate = comparing.join(
-        s.submaps, method, polish=polish, associate=associate, covariance_scale=factor, progress=not as_json
+        s.submaps,
+        method,
+        polish=polish,
+        associate=associate,
+        covariance_scale=factor,
+        workers=workers,
+        cluster=cluster,
+        progress=not as_json,
     )
     truth = s.truth if associate == "given" else None
     value = comparing.join_json(s.submaps, method, estimate, truth=truth)

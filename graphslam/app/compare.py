@@ -72,6 +72,8 @@ def join(
     polish: bool = False,
     associate: str | Association = "given",
     covariance_scale: float = 1.0,
+    workers: int | None = None,
+    cluster: str | None = None,
     progress: bool = False,
 ) -> SubmapEstimate:
     """Join submaps into one map.
@@ -90,6 +92,8 @@ def join(
         take ids that were recognised by joining in sequence.
     covariance_scale : float
         Factor on every submap's covariance.
+    workers, cluster : optional
+        Number of processes, or address of a Dask scheduler, that share the joins of ``eif-tree``.
     progress : bool
         Show a progress bar.
 
@@ -104,13 +108,18 @@ def join(
     """
     if method not in JOINERS and method not in SOLVERS:
         raise UnknownNameError("method", method, [*JOINERS, *SOLVERS])
+    if (workers is not None or cluster is not None) and method != "eif-tree":
+        raise ConfigError(f"only eif-tree can be joined by several workers; got {method!r}")
+    if workers is not None and cluster is not None:
+        raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
     association = _association(associate)
     submaps = list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
     if method in SOLVERS:
         if association is not None:
             submaps = identify(submaps, association, progress=progress)
         return SOLVERS[method](submaps, polish=polish, progress=progress)
-    joined = JOINERS[method](submaps, association=association, progress=progress)
+    shared = {"workers": workers, "executor": cluster} if method == "eif-tree" else {}
+    joined = JOINERS[method](submaps, association=association, progress=progress, **shared)
     return polish_join(submaps, joined) if polish else joined
 
 
