@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import matplotlib.pyplot as plt
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
@@ -19,6 +20,8 @@ from graphslam.evaluate.map_error import match_ids
 from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.plots import style
 from graphslam.plots.map import landmark_blocks, plot_ellipses
+
+Ids = npt.NDArray[np.int64]
 
 
 def plot_method_maps(
@@ -89,7 +92,7 @@ def plot_method_maps(
     return axes
 
 
-def _state(one: SubmapEstimate | Submap) -> tuple[Array, Array, Array, Array]:
+def _state(one: SubmapEstimate | Submap) -> tuple[Array, Ids, Array, Array]:
     """Path, ids, features and their marginals."""
     if isinstance(one, SubmapEstimate):
         at = 3 * (len(one.poses) - 1) + np.arange(2 * len(one.landmark_ids))
