@@ -16,9 +16,11 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from graphslam.core.errors import UnknownNameError
+from graphslam.core.errors import DataError, UnknownNameError
 from graphslam.core.geometry import Array
+from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
+from graphslam.evaluate.consistency import Consistency, nees, vector_pose_error
 from graphslam.graph.submap_blocks import SubmapProblem, check_identified
 from graphslam.graph.submap_solver import SubmapEstimate, minimise
 from graphslam.join.ekf import join_ekf
@@ -116,6 +118,51 @@ def gap_along(
             pd.DataFrame({"submap": keys, "method": method, "objective": own, "optimum": best, "gap": own - best})
         )
     return pd.concat(tables, ignore_index=True)
+
+
+def pose_consistency_along(
+    submaps: Sequence[Submap],
+    truth: MapTruth,
+    methods: Sequence[str] = ("eif-sequential", "eif-online", "optimum"),
+    *,
+    progress: bool = False,
+) -> dict[str, Consistency]:
+    """NEES (eq. 18) of the last end pose right after every submap, a row of one run for each method.
+
+    Parameters
+    ----------
+    submaps, progress
+        See :func:`objectives_along`.
+    truth : MapTruth
+        With the ends of all submaps.
+    methods : sequence of str
+        Of :func:`objectives_along`, without ``isam2``.
+
+    Raises
+    ------
+    UnknownNameError
+    DataError
+        A submap's end is not in the truth.
+    """
+    at = {int(key): i for i, key in enumerate(truth.keys)}
+    unknown = [s.key for s in submaps if s.key not in at]
+    if unknown:
+        raise DataError("the end of a submap is not in the truth", got=unknown[0], wanted="the ends of all of them")
+    ends = truth.exit_poses[[at[s.key] for s in submaps]]
+    found = {}
+    for method in methods:
+        if method not in _JOINERS:
+            raise UnknownNameError("method with covariances along a sequence", method, _JOINERS)
+        d2 = np.empty(len(submaps))
+
+        def note(k: int, view: MapView, d2: Array = d2) -> None:
+            d2[k] = nees(vector_pose_error(view.pose(), ends[k]), view.pose_covariance())
+
+        _JOINERS[method](submaps, on_join=note, progress=progress)
+        found[method] = Consistency(
+            quantity="pose at the end of the submap", nees=d2[None], dof=np.array(3), gauge="first base fixed"
+        )
+    return found
 
 
 def gap_by_tree(submaps: Sequence[Submap], *, progress: bool = False) -> pd.DataFrame:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from graphslam.core.errors import DataError, UnknownNameError
-from graphslam.evaluate.gap import METHODS, gap_along, gap_by_tree, objectives_along, polish_history
+from graphslam.core.geometry import wrap_angle
+from graphslam.evaluate.gap import (
+    METHODS,
+    gap_along,
+    gap_by_tree,
+    objectives_along,
+    polish_history,
+    pose_consistency_along,
+)
 from graphslam.graph.submap_blocks import relabel
 from graphslam.graph.submap_solver import solve_submaps
 from graphslam.join.ekf import join_ekf
@@ -65,6 +75,22 @@ def test_polish_history_goes_down_to_the_optimum(submaps) -> None:
     assert history[-1] == pytest.approx(best, rel=1e-9)
     assert np.all(np.diff(history) <= 1e-9 * best)
     assert polish_history(submaps)[0] > history[0]  # the chain is the poorer start
+
+
+def test_pose_consistency_along_is_eq_18_of_every_prefix(rng: np.random.Generator) -> None:
+    submaps, truth = submap_chain(rng, submaps=6)
+    found = pose_consistency_along(submaps, truth)
+    for method, make in (("eif-sequential", join_sequential), ("optimum", solve_submaps)):
+        for k in (0, 3, 5):
+            one = make(submaps[: k + 1])
+            e = truth.exit_poses[k] - one.poses[-1]
+            e[2] = wrap_angle(e[2])
+            expected = e @ np.linalg.solve(one.pose_covariance(k + 1), e)
+            assert found[method].nees[0, k] == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(DataError, match="not in the truth"):
+        pose_consistency_along(submaps, replace(truth, keys=truth.keys + 100))
+    with pytest.raises(UnknownNameError, match="isam2"):
+        pose_consistency_along(submaps, truth, ["isam2"])
 
 
 def test_refusals(submaps) -> None:
