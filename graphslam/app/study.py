@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 from tqdm import tqdm
@@ -20,9 +20,6 @@ from graphslam.app.threads import hold_one_thread, one_blas_thread
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.evaluate.executors import Executor, Job, execute
 from graphslam.evaluate.montecarlo import check_measurements, trial_seed
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 logger = logging.getLogger(__name__)
 
@@ -88,26 +85,26 @@ class Study:
         return self.definition.report(self.table, self.timings)
 
     def plot_consistency(
-        self, quantity: str = "pose_nees", *, world: str | None = None, ax: Axes | None = None, **options: Any
-    ) -> Axes:
+        self, quantity: str = "pose_nees", *, world: str | None = None, ax: Any = None, **options: Any
+    ) -> Any:
         """Consistency index along the run; see :func:`graphslam.plots.study.plot_ci`."""
         from graphslam.plots.study import plot_ci
 
         return plot_ci(ax, self._of(self.table, world), quantity, **options)
 
-    def plot_rms(self, *, world: str | None = None, **options: Any) -> Sequence[Axes]:
+    def plot_rms(self, *, world: str | None = None, **options: Any) -> Sequence[Any]:
         """RMS errors of poses and features of every algorithm; see :func:`graphslam.plots.study.plot_rms_panels`."""
         from graphslam.plots.study import plot_rms_panels
 
         return plot_rms_panels(self._of(self.table, world), **options)
 
-    def plot_errors(self, algorithm: str | None = None, *, world: str | None = None, **options: Any) -> Sequence[Axes]:
+    def plot_errors(self, algorithm: str | None = None, *, world: str | None = None, **options: Any) -> Sequence[Any]:
         """Error of one run with its 3σ band; see :func:`graphslam.plots.study.plot_error_panels`."""
         from graphslam.plots.study import plot_error_panels
 
         return plot_error_panels(self._of(self.table, world), algorithm, **options)
 
-    def plot_time(self, *, world: str | None = None, ax: Axes | None = None, **options: Any) -> Axes:
+    def plot_time(self, *, world: str | None = None, ax: Any = None, **options: Any) -> Any:
         """Cumulative time along the run; see :func:`graphslam.plots.study_time.plot_cumulative_time`."""
         from graphslam.plots.study_time import plot_cumulative_time
 
