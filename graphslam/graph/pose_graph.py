@@ -68,7 +68,8 @@ class PoseGraph(GraphRecord):
         Parameters
         ----------
         submap : Submap
-            Starts where the last one ended. Without landmarks it becomes a between-factor.
+            Starts where the last one ended, or where :meth:`start_session` put its base. Without landmarks it becomes
+            a between-factor.
         landmark_ids : (n,) int, optional
             Graph landmark of every entry, -1 = new; by default the submap's own ids. An id may stand twice.
         covariance_scale : float
@@ -125,6 +126,32 @@ class PoseGraph(GraphRecord):
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self._tie_fixes(self.submaps[-1])
         return fid
+
+    def start_session(self, T_world_base: ArrayLike) -> int:
+        """Begin another chain of submaps whose first base is free: another robot, or another day.
+
+        Nothing but landmarks that both chains see ties it to what is there, so it needs at least two of them.
+
+        Parameters
+        ----------
+        T_world_base : (3,)
+            Where the chain is thought to begin; only a start value.
+
+        Returns
+        -------
+        int
+            Node of the new first base; the next submap begins there.
+        """
+        T = np.asarray(T_world_base, dtype=np.float64)
+        if T.shape != (3,) or not np.all(np.isfinite(T)):
+            raise GeometryError("start of a session is not usable", got=T_world_base, wanted="three finite numbers")
+        if not self.submaps:
+            raise DataError("the first session needs no start", wanted="submaps before another session begins")
+        self.values.poses = np.vstack([self.values.poses, T])
+        self.revision += 1
+        node = len(self.values.poses) - 1
+        self._event("session", node=node, T_world_base=T.tolist())
+        return node
 
     def add_between(
         self,

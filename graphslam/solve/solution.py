@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -123,11 +123,17 @@ class Solution:
         P = self.covariance.columns(np.arange(lay.datum_start))
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
 
-    def trajectory(self, *, covariances: bool = True) -> Trajectory:
+    def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
         """Path at full rate: ``x_k ∘ T_start_body(t)`` for every submap with a trajectory of its own.
 
         Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the node and the local path taken as
         independent. Where two submaps share an instant the later one has it: a fresh base is surer than a long arm.
+
+        Parameters
+        ----------
+        covariances : bool
+        keys : collection of int, optional
+            Only of these submaps: those of one robot, where several share the graph.
 
         Raises
         ------
@@ -136,7 +142,8 @@ class Solution:
         """
         P_nodes = self.node_covariances() if covariances else None
         times, poses, covs = [], [], []
-        with_path = [s for s in self._submaps if s.trajectory is not None and len(s.trajectory)]
+        chosen = [s for s in self._submaps if keys is None or s.key in keys]
+        with_path = [s for s in chosen if s.trajectory is not None and len(s.trajectory)]
         if not with_path:
             raise MissingDataError("no submap has a trajectory", wanted="submaps with T_start_body(t)")
         last = np.inf
