@@ -264,6 +264,28 @@ class SubmapProblem:
         """End poses ``(m, 3)`` and landmarks ``(L, 2)``."""
         return x[: 3 * self.m].reshape(-1, 3), x[3 * self.m :].reshape(-1, 2)
 
+    def bent(self, x: Array, step: Array) -> Array:
+        """Take a step along the chain instead of along a straight line ``(size,)``.
+
+        ``x + step`` moves everything behind a corrected heading along a tangent, which over kilometres leaves the
+        valley of the objective. Here the step is taken in what the submaps measure: every end pose as seen from its
+        start and every landmark as seen from the start of the submap that saw it first change by what ``step`` means
+        to first order, and the chain is laid out again. To first order both are the same point.
+        """
+        ends, marks = self._split(x)
+        d_ends, d_marks = self._split(step)
+        starts, d_starts = self.starts(x), self.starts(step)
+        turned = starts[:, 2] + d_starts[:, 2]
+        moves = _turn(turned, _seen(starts, d_starts, ends[:, :2], d_ends[:, :2]))
+        bent = np.empty_like(x)
+        new_ends, new_marks = self._split(bent)
+        new_ends[:, :2] = np.cumsum(moves, axis=0)
+        new_ends[:, 2] = ends[:, 2] + d_ends[:, 2]
+        o = self._first_owner
+        local = _seen(starts[o], d_starts[o], marks, d_marks)
+        new_marks[:] = self.starts(bent)[o, :2] + _turn(turned[o], local)
+        return bent
+
     def residual(self, x: Array) -> Array:
         """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15)."""
         poses, points = self._split(np.ascontiguousarray(x, dtype=np.float64))
@@ -292,6 +314,19 @@ class SubmapProblem:
             self._omega_ptr, r, pair_ptr, slots, g, values,
         )  # fmt: skip
         return float(f), g, values
+
+
+def _turn(heading: Array, q: Array) -> Array:
+    """Points ``q`` ``(n, 2)`` turned by ``heading`` ``(n,)``."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], -1)
+
+
+def _seen(starts: Array, d_starts: Array, points: Array, d_points: Array) -> Array:
+    """Points ``(n, 2)`` as seen from poses ``(n, 3)``, plus their change to first order."""
+    q = _turn(-starts[:, 2], points - starts[:, :2])
+    dq = _turn(-starts[:, 2], d_points - d_starts[:, :2])
+    return q + dq + d_starts[:, 2:] * np.stack([q[:, 1], -q[:, 0]], -1)
 
 
 def _offsets(counts: npt.NDArray[np.int64]) -> Index:

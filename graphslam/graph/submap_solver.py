@@ -140,6 +140,10 @@ class SubmapEstimate:
         )
 
 
+# A step is halved no further than this before its direction is given up and damped.
+_SHORTEST = 0.05
+
+
 @dataclass(frozen=True)
 class Minimum:
     """What :func:`minimise` found.
@@ -169,9 +173,12 @@ class Minimum:
 def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_iterations: int = 50) -> Minimum:
     """Damped Gauss–Newton.
 
-    A step is undamped until one fails to lower the objective; then Levenberg–Marquardt damping on the diagonal grows
-    until one does. The search ends when the decrease that the linear model still promises, ``gᵀ H⁻¹ g``, is below
-    ``rtol · max(objective, 1)``: the objective is a χ², so 1 is its natural unit where it vanishes.
+    A step is tried as a straight line and along the chain (:meth:`SubmapProblem.bent`), and the lower end is taken:
+    after a long loop the correction of one heading moves kilometres of map along a circle, not along its tangent.
+    A step that does not lower the objective is halved a few times; if that does not help, Levenberg–Marquardt damping
+    on the diagonal grows until one does. The search ends when the decrease that the linear model still promises,
+    ``gᵀ H⁻¹ g``, is below ``rtol · max(objective, 1)``: the objective is a χ², so 1 is its natural unit where it
+    vanishes.
 
     Parameters
     ----------
@@ -198,10 +205,13 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
         iterations += 1
         step = -pattern.factor(data, damping).solve(g)
         promised = float(-(g @ step))  # = gᵀ H⁻¹ g, the decrease of the linear model, when there is no damping
-        trial = x + step
-        trial[headings] = wrap_angle(trial[headings])
-        f_trial = problem.objective(trial)
         small = promised <= rtol * max(f, 1.0)
+        f_trial, trial = _lowest(problem, x, step)
+        shorter = 0.5
+        while not small and f_trial > f and shorter > _SHORTEST:  # costs no factorisation
+            f_trial, trial = _lowest(problem, x, shorter * step)
+            shorter *= 0.5
+        trial[headings] = wrap_angle(trial[headings])
         if np.isfinite(f_trial) and f_trial <= f + (rtol * max(f, 1.0) if small else 0.0):
             x = trial
             damping = 0.0 if damping < 1e-6 else damping / 10.0
@@ -221,6 +231,12 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
     if not converged:
         logger.warning("no convergence after %d iterations: objective %.9g", iterations, f)
     return Minimum(x, f, iterations, converged, data, history)
+
+
+def _lowest(problem: SubmapProblem, x: Array, step: Array) -> tuple[float, Array]:
+    """The better end of a step, straight or along the chain, and its objective (infinite where it has none)."""
+    ends = [(problem.objective(t), t) for t in (x + step, problem.bent(x, step))]
+    return min(((f if np.isfinite(f) else np.inf, t) for f, t in ends), key=lambda end: end[0])
 
 
 def solve_submaps(

@@ -204,3 +204,32 @@ def test_symmetric_factor_solves_and_names_singular_systems(rng: np.random.Gener
 def test_zero_covariance_is_refused_where_it_enters() -> None:
     with pytest.raises(CovarianceError, match="positive definite"):
         LandmarkMap(ids=np.array([1]), exit_pose=np.zeros(3), positions=np.zeros((1, 2)), covariance=np.zeros((5, 5)))
+
+
+def test_a_bent_step_is_the_straight_one_to_first_order(rng: np.random.Generator) -> None:
+    """The difference falls with the square of the step; a rigid turn of what follows a pose is followed exactly."""
+    problem = SubmapProblem(submap_chain(rng, submaps=9, landmarks=30)[0])
+    x = problem.initial()
+    step = rng.standard_normal(problem.size)
+    step[2 : 3 * problem.m : 3] *= 0.1
+    gaps = [np.abs(problem.bent(x, h * step) - (x + h * step)).max() for h in (1e-2, 1e-3)]
+    assert gaps[0] > 0.0
+    assert gaps[1] / gaps[0] == pytest.approx(1e-2, rel=0.1)
+    # turn everything behind the first end pose about it: in what the submaps measure, only one heading changes
+    angle, pivot = 0.7, x[:2].copy()
+    turn = np.zeros(problem.size)
+    ends, marks = turn[: 3 * problem.m].reshape(-1, 3), turn[3 * problem.m :].reshape(-1, 2)
+    behind = problem._first_owner >= 1
+    poses, points = x[: 3 * problem.m].reshape(-1, 3), x[3 * problem.m :].reshape(-1, 2)
+    J = np.array([[0.0, -1.0], [1.0, 0.0]])
+    ends[:, :2] = angle * (poses[:, :2] - pivot) @ J.T
+    ends[:, 2] = angle
+    marks[behind] = angle * (points[behind] - pivot) @ J.T
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    bent = problem.bent(x, turn)
+    np.testing.assert_allclose(
+        bent[: 3 * problem.m].reshape(-1, 3)[:, :2], (poses[:, :2] - pivot) @ R.T + pivot, atol=1e-9
+    )
+    moved = bent[3 * problem.m :].reshape(-1, 2)
+    np.testing.assert_allclose(moved[behind], (points[behind] - pivot) @ R.T + pivot, atol=1e-9)
+    np.testing.assert_allclose(moved[~behind], points[~behind], atol=1e-12)

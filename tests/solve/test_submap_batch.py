@@ -8,12 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.worlds import simulate
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import wrap_angle
+from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.graph.submap_blocks import SubmapProblem
 from graphslam.graph.submap_solver import minimise
 from graphslam.io.slsjf import read_slsjf_local_maps
+from graphslam.join.order import join_sequential
+from graphslam.join.polish import polish
 from graphslam.solve.submap_batch import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
@@ -50,11 +55,22 @@ def test_published_local_maps_from_a_worse_start(local_maps: list[Submap], rng: 
     assert again.objective == pytest.approx(best.objective, rel=1e-9)
 
 
-def test_damping_saves_a_start_from_which_plain_steps_fail(rng: np.random.Generator) -> None:
+def _plain(problem: SubmapProblem, x: np.ndarray, steps: int = 40) -> float:
+    """Where full Gauss-Newton steps along straight lines end."""
+    x = x.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(steps):
+            _, g, data = problem.linearise(x)
+            x = x - problem.pattern.factor(data, 0.0).solve(g)
+            x[2 : 3 * problem.m : 3] = wrap_angle(x[2 : 3 * problem.m : 3])
+        return problem.objective(x)
+
+
+def test_shorter_bent_and_damped_steps_save_starts_from_which_plain_steps_fail(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=15, landmarks=40)
     problem = SubmapProblem(submaps)
     best = minimise(problem, problem.initial())
-    refused, reached = 0, 0
+    saved, reached = 0, 0
     for _ in range(16):
         x = best.x.copy()
         x[2:45:3] = wrap_angle(x[2:45:3] + rng.normal(0.0, 1.1, 15))
@@ -65,9 +81,21 @@ def test_damping_saves_a_start_from_which_plain_steps_fail(rng: np.random.Genera
         if found.objective < best.objective * (1 + 1e-9):
             assert found.converged
             reached += 1
-            refused += found.iterations - len(steps)
-    assert refused >= 2  # damping was at work on the way to the optimum
+            saved += not _plain(problem, x) < best.objective * (1 + 1e-6)
+    assert saved >= 2
     assert reached >= 10  # some starts are wound up by a turn, and a descent cannot unwind them
+
+
+def test_a_kilometre_loop_joined_in_sequence_is_polished_in_a_few_steps() -> None:
+    """Where headings are corrected by degrees, straight steps leave the valley and damped ones crawl along it."""
+    log = simulate("landmark-field", preset="A", seed=3, layout_seed=1, laps=1.08, lap_length=2500.0, landmarks=260)
+    options = {**recommended(log, "rbpf-ekf")["frontend"], "particles": 20}
+    submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(0)))
+    joined, tree = join_sequential(submaps), solve_submaps(submaps)
+    polished = polish(submaps, joined)
+    assert polished.converged
+    assert polished.iterations <= 9  # 16 with straight and damped steps alone
+    assert polished.objective_polished == pytest.approx(tree.objective, rel=1e-9)
 
 
 def test_the_cap_on_iterations_is_told(rng: np.random.Generator) -> None:
