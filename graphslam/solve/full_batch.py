@@ -138,7 +138,7 @@ def full_batch(
         has_initial=np.ones(n + 1, dtype=bool),
         edges=np.column_stack([np.arange(n), np.arange(1, n + 1)]),
         measurements=measured,
-        information=np.linalg.inv(back @ Q @ back.T),
+        information=np.asarray(np.linalg.inv(back @ Q @ back.T), dtype=np.float64),
         fixed=np.arange(n + 1) == 0,
         landmark_ids=n + 1 + np.arange(len(ids)),
         landmarks=np.array([initial_landmarks[int(i)] for i in ids], dtype=np.float64).reshape(-1, 2),
@@ -154,7 +154,7 @@ def full_batch(
     x, l = problem.arrays(best.values)
     objective = problem.objective((x, l))
     if not np.isfinite(objective):
-        raise SolverError("full batch diverged", got=objective, wanted="a finite objective")
+        raise SolverError(f"full batch diverged: objective {objective}; wanted a finite one")
     layout = Layout.of(network)
     J, r = linearise(network, x, l, layout)
     return FullBatch(

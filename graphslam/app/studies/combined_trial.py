@@ -115,7 +115,7 @@ class _Trial:
         made = make_front_end(front_end, self._options(front_end, options))
         submaps = list(made.submaps(self.log, seed=self.seed.child("frontend")))
         if len(submaps) != len(self.cuts):
-            raise GraphSlamError("a front end cut elsewhere", got=len(submaps), wanted=len(self.cuts))
+            raise GraphSlamError(f"{front_end} made {len(submaps)} submaps; wanted {len(self.cuts)}, cut as the others")
         return submaps
 
     def _single_map(
