@@ -15,23 +15,37 @@ from graphslam.core.geometry import Array
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeBearingNoise:
-    """σ_r = range_sigma + range_slope · r, σ_β = bearing_sigma; without it the log's own sigmas are used."""
+    """Errors of a range-bearing sensor: σ_r = range_sigma + range_slope · r, σ_β = bearing_sigma, and systematic ones.
+
+    Without it the log's own sigmas are used, and its ranges as they are. Scale and offset are those of the filter's
+    noise; a noise for the smoothing has no say in them.
+    """
 
     range_sigma: float
     """Constant part of the range σ [m]."""
     range_slope: float = 0.0
     """Part of the range σ proportional to range [m/m]."""
     bearing_sigma: float
-    """σ of the bearing [rad]."""
+    """σ of the bearing [rad]; inf: bearings are not used."""
+    range_scale: float = 1.0
+    """A distance d is measured as range_scale · d + range_offset; both are taken out before anything else."""
+    range_offset: float = 0.0
+    """[m]."""
 
     def __post_init__(self) -> None:
         if not (self.range_sigma > 0 and self.range_slope >= 0 and self.bearing_sigma > 0):
             raise ConfigError(f"range-bearing noise must be positive, got {self}")
+        if not (self.range_scale > 0 and np.isfinite(self.range_offset)):
+            raise ConfigError(f"range_scale must be > 0 and range_offset finite, got {self}")
 
     def variances(self, ranges: Array) -> Array:
         """``(q, 2)`` variances of range and bearing."""
         s = self.range_sigma + self.range_slope * ranges
         return np.stack([s**2, np.full_like(s, self.bearing_sigma**2)], -1)
+
+    def distances(self, ranges: Array) -> Array:
+        """Distances ``(q,)`` [m] that measured ranges stand for."""
+        return np.asarray((ranges - self.range_offset) / self.range_scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -88,6 +88,11 @@ class Prepared:
         """Number of scans."""
         return len(self.observations.times)
 
+    @property
+    def has_bearing(self) -> npt.NDArray[np.bool_]:
+        """Which observations have a bearing that is used ``(q,)``."""
+        return np.asarray(np.isfinite(self.rows[:, 3]))
+
 
 def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, LandmarkObservations]:
     """Name of the stream to work on, and the landmark observations in it (detected, where it holds raw scans).
@@ -136,23 +141,28 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     drops.drop(stream, "after the last odometry", len(observations.times) - late)
     scans = observations.take(slice(early, late))
     first_row = int(observations.offsets[early])
-    usable = scans.ranges <= config.max_range
-    drops.drop(stream, f"observations beyond {config.max_range:g} m", int((~usable).sum()))
+    if config.noise is not None:
+        scans = replace(scans, ranges=config.noise.distances(scans.ranges))
+    positive = scans.ranges > 0.0
+    drops.drop(stream, "ranges not positive", int((~positive).sum()))
+    usable = positive & (scans.ranges <= config.max_range)
+    drops.drop(stream, f"observations beyond {config.max_range:g} m", int((positive & ~usable).sum()))
     if config.association == "known":
         if scans.ids is None:
             raise MissingDataError("known association needs identities", where=where, wanted="ids")
         unknown = usable & (scans.ids < 0)
         drops.drop(stream, "observations without identity", int(unknown.sum()))
         usable &= ~unknown
-    elif len(scans.ranges) and not np.any(scans.has_bearing):
-        raise MissingDataError(
-            "ranges alone cannot be associated by likelihood", where=where, wanted='association = "known"'
-        )
     scans, kept = _only(scans, usable)
     if len(scans.times) == 0:
         raise MissingDataError("no scan to work on", where=where)
     filter_var = _variances(scans, config.noise)
-    smooth_var = filter_var if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
+    if config.association != "known" and len(filter_var) and np.all(np.isinf(filter_var[:, 1])):
+        raise MissingDataError(
+            "ranges alone cannot be associated by likelihood", where=where, wanted='association = "known"'
+        )
+    smooth_var = filter_var.copy() if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
+    smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # the map is made of what the filter saw
     t_start = float(min(motion.times[0], scans.times[0]))
     stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
     odometry, motion_name = dead_reckoning(log, stamps, config.motion, hold=config.control_hold)

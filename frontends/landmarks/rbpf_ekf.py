@@ -137,7 +137,7 @@ class RbpfEkf:
             min_hits=c.min_hits,
         )
         smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
-        if not obs.has_bearing.all():
+        if not data.has_bearing.all():
             settled = settle_rivals(problem, smoothed, c.delayed)
             smoothed = settled.smoothed
             report |= {

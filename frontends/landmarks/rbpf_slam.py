@@ -173,7 +173,7 @@ class RbpfSlam:
             "dropped_particles": dropped,
             "regulariser": REGULARISER,
         }
-        if not data.observations.has_bearing.all():
+        if not data.has_bearing.all():
             report |= {
                 "beacons_without_landmark": len(p.waiting.slots),
                 "ranges_unspent": len(p.waiting) + p.waiting.unspent,
