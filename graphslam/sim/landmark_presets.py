@@ -18,7 +18,6 @@ _AVENUE = dataclasses.replace(
     landmarks=30,
     row_spacing=4.0,
     sigma_speed=6.0,
-    sigma_steering=math.radians(10.0),
     sigma_range=0.1,
     sigma_bearing=math.radians(1.0),
     scan_rate=1.0,
