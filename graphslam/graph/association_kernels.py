@@ -26,9 +26,11 @@ def joint_compatibility(
     seeds: Index,
     gate: float,
     joint_limit: Array,
+    persistent: bool,
     out_pairs: Index,
     out_count: Index,
     out_score: Array,
+    out_cost: Array,
 ) -> None:
     """From every seed pairing, add the best compatible pairing, conditioned on those taken, until none is left.
 
@@ -47,8 +49,10 @@ def joint_compatibility(
         χ² gate of each added pairing, conditional on the accepted ones.
     joint_limit : (most + 1,)
         χ² limit of the joint distance with 1, 2, … pairings (index = number of pairings).
-    out_pairs : (k, most) int; out_count : (k,) int; out_score : (k,)
-        Accepted pairings of each start in order, how many, and ``Σ (gate - d²)``.
+    persistent : bool
+        A pairing that would break the joint limit is passed over for the next likely one, instead of ending the start.
+    out_pairs : (k, most) int; out_count : (k,) int; out_score : (k,); out_cost : (k,)
+        Accepted pairings of each start in order, how many, ``Σ (gate - d²)``, and ``Σ (d² + ln det)``.
     """
     p = observed.shape[0]
     for s in range(seeds.shape[0]):
@@ -61,13 +65,16 @@ def joint_compatibility(
         count = 0
         total = 0.0
         score = 0.0
+        summed = 0.0
         pick = seeds[s]
-        d2, _ = _mahalanobis(v[pick, 0], v[pick, 1], D[pick, 0], D[pick, 1], D[pick, 2])
+        d2, first = _mahalanobis(v[pick, 0], v[pick, 1], D[pick, 0], D[pick, 1], D[pick, 2])
+        best = d2 + np.log(first)
         while pick >= 0:
             if total + d2 > joint_limit[count + 1]:
                 break
             total += d2
             score += gate - d2
+            summed += best
             out_pairs[s, count] = pick
             # Cholesky of the accepted 2×2 block and its whitened rows over all pairings
             l00 = np.sqrt(D[pick, 0])
@@ -98,12 +105,15 @@ def joint_compatibility(
             # most likely next pairing: d² + ln|S|, so that a sharp prediction beats a vague one
             pick = -1
             best = np.inf
+            if count == out_pairs.shape[1]:
+                break
             for j in range(p):
                 if free[j] and D[j, 0] > 0.0 and D[j, 2] > 0.0:
                     e2, det = _mahalanobis(v[j, 0], v[j, 1], D[j, 0], D[j, 1], D[j, 2])
-                    if det > 0.0 and e2 <= gate:
+                    if det > 0.0 and e2 <= gate and (not persistent or total + e2 <= joint_limit[count + 1]):
                         cost = e2 + np.log(det)
                         if cost < best:
                             best, pick, d2 = cost, j, e2
         out_count[s] = count
         out_score[s] = score
+        out_cost[s] = summed

@@ -9,17 +9,15 @@ Mahalanobis distance is the plain alternative.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
-from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import Submap
-from graphslam.graph.association_kernels import joint_compatibility
+from graphslam.graph.compatibility import distance2, joint_limits, most_pairings, nearest, search
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.pose_graph import PoseGraph
 
@@ -84,7 +82,7 @@ class Pairings:
 
     def distance2(self) -> Array:
         """Individual Mahalanobis distances ``(p,)``."""
-        return _distance2(self.innovation, _blocks(self.covariance))
+        return distance2(self.innovation, _blocks(self.covariance))
 
 
 def associate(graph: PoseGraph, submap: Submap, config: AssociationConfig | None = None) -> Ids:
@@ -113,7 +111,7 @@ def associate(graph: PoseGraph, submap: Submap, config: AssociationConfig | None
     if len(pairs.observed) == 0:
         return ids
     if cfg.method == "nearest-neighbour":
-        chosen = _nearest(pairs)
+        chosen = nearest(pairs.distance2(), pairs.observed, pairs.target)
     else:
         chosen = _search(pairs, cfg)
     ids[pairs.observed[chosen]] = graph.values.landmark_ids[pairs.target[chosen]]
@@ -157,7 +155,7 @@ def pairings(
     i = np.arange(len(entries))
     own = P_z.reshape(len(entries), 2, len(entries), 2)[i, :, i, :]
     nu = z[:, None, :] - q[near][None, :, :]
-    d2 = _distance2(nu, S_pred[None] + own[:, None])
+    d2 = distance2(nu, S_pred[None] + own[:, None])
     obs, tar = np.nonzero((d2 <= config.gate) & (np.sum(nu**2, axis=2) <= config.max_distance**2))
     if len(obs) == 0:
         return none
@@ -205,45 +203,15 @@ def _blocks(C: Array) -> Array:
     return C.reshape(p, 2, p, 2)[i, :, i, :]
 
 
-def _distance2(nu: Array, S: Array) -> Array:
-    """``νᵀ S⁻¹ ν`` of ``(…, 2)`` and ``(…, 2, 2)``."""
-    a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
-    x, y = nu[..., 0], nu[..., 1]
-    return np.asarray((c * x * x - 2 * b * x * y + a * y * y) / (a * c - b * b))
-
-
-def _nearest(pairs: Pairings) -> npt.NDArray[np.intp]:
-    """Pairings in order of individual distance, each entry and each landmark once."""
-    chosen, seen, used = [], set(), set()
-    for k in np.argsort(pairs.distance2(), kind="stable"):
-        i, j = int(pairs.observed[k]), int(pairs.target[k])
-        if i not in seen and j not in used:
-            chosen.append(int(k))
-            seen.add(i)
-            used.add(j)
-    return np.array(chosen, dtype=np.intp)
-
-
 def _search(pairs: Pairings, cfg: AssociationConfig) -> npt.NDArray[np.intp]:
     """Best of the beam search: the start with the greatest ``Σ (gate - d²)``."""
     seeds = _seeds(pairs, cfg.starts)
-    most = min(len(np.unique(pairs.observed)), len(np.unique(pairs.target)))
-    limit = np.array(_joint_limits(cfg.joint_probability, most))
-    limit[1] = max(limit[1], cfg.gate)  # a single pairing is judged by its own gate
-    out = np.zeros((len(seeds), most), dtype=np.int64)
-    count, score = np.zeros(len(seeds), dtype=np.int64), np.zeros(len(seeds))
-    joint_compatibility(
-        pairs.observed, pairs.target, np.ascontiguousarray(pairs.innovation), np.ascontiguousarray(pairs.covariance),
-        seeds, cfg.gate, limit, out, count, score,
-    )  # fmt: skip
-    best = int(np.argmax(score))
-    return out[best, : count[best]].astype(np.intp)
-
-
-@cache
-def _joint_limits(probability: float, most: int) -> tuple[float, ...]:
-    """χ² limits of 0 (none), 1, … ``most`` pairings together."""
-    return (np.inf, *(chi2_quantile(probability, 2 * k) for k in range(1, most + 1)))
+    limits = joint_limits(cfg.joint_probability, most_pairings(pairs.observed, pairs.target))
+    limits[1] = max(limits[1], cfg.gate)  # a single pairing is judged by its own gate
+    found = search(
+        pairs.observed, pairs.target, pairs.innovation, pairs.covariance, seeds, cfg.gate, limits, persistent=False
+    )
+    return found.of(int(np.argmax(found.score)))
 
 
 def _seeds(pairs: Pairings, starts: int) -> npt.NDArray[np.int64]:

@@ -8,6 +8,7 @@ conditioning the rest. Both are exclusive: one landmark, one entry.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,12 +21,15 @@ from scipy.spatial import cKDTree
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
+from graphslam.graph.compatibility import distance2, joint_limits, most_pairings, nearest, search
 from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
 
+logger = logging.getLogger(__name__)
 Index = npt.NDArray[np.intp]
 
-# Working memory of a joint search: 8 million doubles. Where two halves of a run meet, fewer beams must do.
-_BEAM_SCALARS = 8_000_000
+# Where a dead-reckoned lap meets an old one, everything may be anything: the joint covariance of 2,000 pairs takes
+# 128 MB, and a search among more would be a lottery anyway.
+_MOST_PAIRS = 2_000
 
 
 @dataclass(frozen=True)
@@ -196,97 +200,39 @@ class CandidatePairs:
 
     def mahalanobis2(self) -> Array:
         """Squared distance of every pair by itself ``(p,)``."""
-        return _quadratic(self.innovation, self.covariances())[0]
+        return distance2(self.innovation, self.covariances())
 
     def nearest(self) -> Index:
         """Exclusive nearest neighbours: the smallest Mahalanobis distance of all is taken first, and so on."""
-        return _take_exclusively(np.argsort(self.mahalanobis2(), kind="stable"), self.i, self.j)
+        return nearest(self.mahalanobis2(), self.i, self.j)
 
     def joint(self, confidence: float, starts: int) -> Index:
-        """Largest jointly compatible set that a beam search finds.
+        """Largest jointly compatible set that a search from ``starts`` pairs finds.
 
-        Every beam begins with one pair and takes, again and again, the likeliest pair that is compatible *given* those
-        taken, as long as the whole set stays inside its chi-square gate. Conditioning uses rows ``w`` of a partial
-        Cholesky factor of the joint covariance C: ``C | taken = C - Σ wᵀ w``, so that C is formed once.
+        Every start takes, again and again, the likeliest pair that is compatible *given* those taken, as long as the
+        whole set stays inside its chi-square gate. Of two sets of the same size the likelier one wins.
         """
-        p = len(self.i)
-        if p == 0:
+        if len(self.i) == 0:
             return np.zeros(0, dtype=np.intp)
-        C = self.joint_covariance()
+        # The best pairs of every observation come first, so that no cluttered corner eats all the starts.
         d2 = self.mahalanobis2()
-        # The best pairs of every observation come first, so that no cluttered corner eats all the beams.
         order = np.lexsort((d2, self.i))
-        rank = np.empty(p, dtype=np.intp)
-        first = np.searchsorted(self.i[order], self.i[order])
-        rank[order] = np.arange(p) - first
-        most = int(min(len(np.unique(self.i)), len(np.unique(self.j))))
-        affordable = max(1, _BEAM_SCALARS // (4 * most * p))
-        seeds = np.lexsort((d2, rank))[: min(starts, affordable)]
-        gates = np.array([chi2_quantile(confidence, 2 * (t + 1)) for t in range(most)])
-
-        B = len(seeds)
-        beam = np.arange(B)
-        nu = np.tile(self.innovation, (B, 1, 1))
-        S = np.tile(self.covariances(), (B, 1, 1, 1))
-        W = np.zeros((B, 2 * most, 2 * p))
-        taken = np.full((B, most), -1, dtype=np.intp)
-        total, cost = np.zeros(B), np.zeros(B)
-        free = np.ones((B, p), dtype=bool)
-        alive = np.ones(B, dtype=bool)
-        for t in range(most):
-            d2, logdet = _quadratic(nu, S)
-            allowed = free & (d2 <= gates[0]) & (total[:, None] + d2 <= gates[t])
-            score = np.where(allowed, d2 + logdet, np.inf)
-            pick = seeds if t == 0 else np.argmin(score, axis=1)
-            alive &= np.isfinite(score[beam, pick])
-            if not np.any(alive):
-                break
-            live, k = beam[alive], pick[alive]
-            taken[live, t] = k
-            total[live] += d2[live, k]
-            cost[live] += score[live, k]
-            cross = C[landmark_scalars(2 * k)]  # (live, 2, 2p)
-            if t:
-                past = W[live, : 2 * t]
-                cross = (
-                    cross - np.take_along_axis(past, landmark_scalars(2 * k)[:, None, :], axis=2).swapaxes(1, 2) @ past
-                )
-            L = np.linalg.cholesky(S[live, k])
-            w = np.linalg.solve(L, cross)
-            W[live, 2 * t : 2 * t + 2] = w
-            white = np.linalg.solve(L, nu[live, k][..., None])
-            wp = w.reshape(len(live), 2, p, 2)
-            nu[live] -= np.einsum("brpx,br->bpx", wp, white[..., 0])
-            S[live] -= np.einsum("brpx,brpy->bpxy", wp, wp)
-            free[live] &= (self.i != self.i[k][:, None]) & (self.j != self.j[k][:, None])
-        size = np.sum(taken >= 0, axis=1)
-        best = np.lexsort((cost, -size))[0]
-        return taken[best, : size[best]]
-
-
-def _quadratic(nu: Array, S: Array) -> tuple[Array, Array]:
-    """``νᵀ S⁻¹ ν`` and ``ln det S`` of stacked 2-vectors and 2×2 matrices.
-
-    A pair that is known exactly once others are taken (two entries for one thing) has no say: its distance is infinite.
-    """
-    det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
-    fit = det > 0
-    safe = np.where(fit, det, 1.0)
-    d2 = S[..., 1, 1] * nu[..., 0] ** 2 - 2.0 * S[..., 0, 1] * nu[..., 0] * nu[..., 1] + S[..., 0, 0] * nu[..., 1] ** 2
-    return np.where(fit, d2 / safe, np.inf), np.log(safe)
-
-
-def _take_exclusively(order: Index, i: Index, j: Index) -> Index:
-    """Go through the pairs in ``order`` and keep those of which neither side is taken."""
-    seen_i: set[int] = set()
-    seen_j: set[int] = set()
-    kept = []
-    for k in order:
-        if int(i[k]) not in seen_i and int(j[k]) not in seen_j:
-            seen_i.add(int(i[k]))
-            seen_j.add(int(j[k]))
-            kept.append(k)
-    return np.asarray(kept, dtype=np.intp)
+        rank = np.empty(len(order), dtype=np.intp)
+        rank[order] = np.arange(len(order)) - np.searchsorted(self.i[order], self.i[order])
+        best_first = np.lexsort((d2, rank))
+        if len(order) > _MOST_PAIRS:
+            logger.warning(
+                "%d candidate pairs of %d landmarks are too many for a joint search; the nearest %d are tried",
+                len(order), len(np.unique(self.i)), _MOST_PAIRS,
+            )  # fmt: skip
+            few = self.subset(np.sort(best_first[:_MOST_PAIRS]))
+            return np.sort(best_first[:_MOST_PAIRS])[few.joint(confidence, starts)]
+        limits = joint_limits(confidence, most_pairings(self.i, self.j))
+        found = search(
+            self.i, self.j, self.innovation, self.joint_covariance(), best_first[:starts], limits[1], limits,
+            persistent=True,
+        )  # fmt: skip
+        return found.of(int(np.lexsort((found.cost, -found.count))[0]))
 
 
 def merge_close(ids: npt.ArrayLike, positions: npt.ArrayLike, radius: float) -> npt.NDArray[np.int64]:

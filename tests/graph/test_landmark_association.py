@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.association_kernels import joint_compatibility
+from graphslam.graph.compatibility import search
 from graphslam.graph.landmark_association import AssociationConfig, Pairings, associate, pairings
 from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
 from graphslam.graph.pose_graph import PoseGraph
@@ -81,8 +81,10 @@ def test_gate_covers_what_it_should(rng):
     assert 0.8 < np.mean(n2) < 1.2  # individually they share the pose's error, so fewer count
 
 
-def slow_search(p: Pairings, seed: int, gate: float, limit: np.ndarray) -> tuple[list[int], float]:
-    """The greedy search by explicit conditioning with inverses."""
+def slow_search(
+    p: Pairings, seed: int, gate: float, limit: np.ndarray, *, persistent: bool
+) -> tuple[list[int], float, float]:
+    """The greedy search by explicit conditioning with inverses: pairings, score, cost."""
 
     def conditional(k: int, taken: list[int]) -> tuple[float, float]:
         a = np.array([2 * k, 2 * k + 1])
@@ -96,41 +98,58 @@ def slow_search(p: Pairings, seed: int, gate: float, limit: np.ndarray) -> tuple
         return float(v @ np.linalg.inv(S) @ v), float(np.log(np.linalg.det(S)))
 
     taken, total, pick = [], 0.0, seed
-    score = 0.0
+    score = cost = 0.0
     while True:
-        d2 = conditional(pick, taken)[0]
+        d2, volume = conditional(pick, taken)
         if total + d2 > limit[len(taken) + 1]:
-            return taken, score
-        total, score = total + d2, score + gate - d2
+            return taken, score, cost
+        total, score, cost = total + d2, score + gate - d2, cost + d2 + volume
         taken.append(pick)
         best = (np.inf, -1)
         for k in range(len(p.observed)):
             if any(p.observed[k] == p.observed[t] or p.target[k] == p.target[t] for t in taken):
                 continue
             e2, logdet = conditional(k, taken)
-            if e2 <= gate:
+            if e2 <= gate and not (persistent and total + e2 > limit[len(taken) + 1]):
                 best = min(best, (e2 + logdet, k))
         if best[1] < 0:
-            return taken, score
+            return taken, score, cost
         pick = best[1]
 
 
-def test_kernel_is_its_slow_twin(rng):
-    for _ in range(5):
+def random_pairings(rng: np.random.Generator, observed: int, known: int) -> Pairings:
+    """Every pair of some observations and landmarks, with covariances of very different sizes."""
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(observed), np.arange(known), indexing="ij"))
+    n = 2 * len(i)
+    A = np.exp(rng.uniform(-1.5, 1.5, len(i))).repeat(2)[:, None] * (
+        np.eye(n) + rng.standard_normal((n, n)) / np.sqrt(n)
+    )
+    C = A @ A.T
+    nu = 0.6 * np.linalg.cholesky(C) @ rng.standard_normal(n)
+    return Pairings(i.astype(np.int64), j.astype(np.int64), nu.reshape(-1, 2), C)
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+def test_search_is_its_slow_twin(rng, persistent):
+    cases = [random_pairings(rng, 5, 5) for _ in range(4)]
+    for _ in range(3):
         x, y = np.meshgrid(np.arange(4) * 2.0, np.arange(2) * 2.0)
         points = np.stack([x.ravel(), y.ravel()], -1) + rng.uniform(-0.5, 0.5, (8, 2))
         g, submap = drifted_graph(rng, np.array([1.2, -0.4, 0.02]), points)
-        p = pairings(g, submap, np.arange(8), JC)
+        cases.append(pairings(g, submap, np.arange(8), JC))
+    differ = 0
+    for p in cases:
         assert len(p.observed) > 15
-        limit = np.array([np.inf, 11.8, 16.0, 20.0, 25.0, 28.0, 31.0, 34.0, 37.0])
+        limit = np.array([np.inf, 11.8, *np.linspace(1.5, 3.0, 7)])
         seeds = np.arange(len(p.observed))
-        out = np.zeros((len(seeds), 8), dtype=np.int64)
-        count, score = np.zeros(len(seeds), dtype=np.int64), np.zeros(len(seeds))
-        joint_compatibility(p.observed, p.target, p.innovation, p.covariance, seeds, 11.8, limit, out, count, score)
+        found = search(p.observed, p.target, p.innovation, p.covariance, seeds, 11.8, limit, persistent=persistent)
         for s in seeds:
-            taken, value = slow_search(p, int(s), 11.8, limit)
-            assert out[s, : count[s]].tolist() == taken
-            assert score[s] == pytest.approx(value, abs=1e-6)
+            taken, value, cost = slow_search(p, int(s), 11.8, limit, persistent=persistent)
+            assert found.of(s).tolist() == taken
+            assert found.score[s] == pytest.approx(value, abs=1e-6)
+            assert found.cost[s] == pytest.approx(cost, abs=1e-6)
+            differ += len(slow_search(p, int(s), 11.8, limit, persistent=not persistent)[0]) != len(taken)
+    assert differ > 0  # the limits are tight enough for persistence to matter
 
 
 def test_nothing_is_matched_where_nothing_is(rng):

@@ -12,6 +12,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
+from graphslam.join import association
 from graphslam.join.association import Association, CandidatePairs, associate, merge_close
 from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
@@ -130,6 +131,23 @@ def test_joint_rule_survives_a_drift_that_fools_the_nearest_neighbour(rng: np.ra
             wrong[rule] += int(np.sum(pairs.i[chosen] != pairs.j[chosen]))
     assert wrong["joint"] <= 6
     assert wrong["nearest"] > 5 * max(wrong["joint"], 1)
+
+
+def test_too_many_pairs_are_cut_to_the_nearest_of_every_landmark(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pairs, _ = problem(rng, known=25, observed=10, drift=2.0)
+    whole = pairs.joint(0.9973, 25)
+    assert not caplog.records
+    assert len(pairs.i) > 40
+    monkeypatch.setattr(association, "_MOST_PAIRS", 40)
+    few = pairs.joint(0.9973, 25)
+    assert f"{len(pairs.i)} candidate pairs" in caplog.text
+    d2 = pairs.mahalanobis2()
+    for k in few:  # nobody nearer was left out for a pair that was tried
+        assert np.sum((pairs.i == pairs.i[k]) & (d2 < d2[k])) <= 40 // 10 + 1
+    monkeypatch.setattr(association, "_MOST_PAIRS", len(pairs.i))
+    np.testing.assert_array_equal(pairs.joint(0.9973, 25), whole)
 
 
 def test_nearest_takes_the_smallest_distance_first(rng: np.random.Generator) -> None:
