@@ -18,6 +18,7 @@ _VERBS = {
     "compare": "graphslam.app.verbs",
     "join": "graphslam.app.verbs",
     "local_maps": "graphslam.app.verbs",
+    "merge": "graphslam.app.merge",
     "solve": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",
     "open_run": "graphslam.app.verbs",

@@ -67,3 +67,25 @@ def aligned_nees(error: ArrayLike, covariance: ArrayLike, directions: ArrayLike)
     if size.min() < 1e-9 * size.max():
         raise CovarianceError("a rigid motion is not determined", got=f"{len(e)} scalars", wanted="two points apart")
     return float(y @ y - np.sum((Q.T @ y) ** 2))
+
+
+def inner_covariance(covariance: ArrayLike, directions: ArrayLike) -> Array:
+    """Covariance of a map's shape: what is left when the best rigid motion of it is taken out (inner constraints).
+
+    The frame of the first base makes everything far from it look uncertain by the base's own heading. This is the
+    covariance in the frame in which the map as a whole neither moves nor turns: ``S P Sᵀ`` with the projection
+    ``S = 1 - G (GᵀG)⁻¹ Gᵀ`` (Meissl, 1962). It is singular by three.
+
+    Parameters
+    ----------
+    covariance : (n, n)
+    directions : (n, 3)
+        :func:`gauge_directions`, counted from the middle of the map for a well-conditioned projection.
+    """
+    P, G = np.asarray(covariance, dtype=np.float64), np.asarray(directions, dtype=np.float64)
+    if G.shape != (len(P), 3):
+        raise DataError("covariance and directions do not fit", got=(P.shape, G.shape), wanted="(n, n) and (n, 3)")
+    Q, _ = np.linalg.qr(G)
+    left = P - Q @ (Q.T @ P)
+    out = left - (left @ Q) @ Q.T
+    return np.asarray(0.5 * (out + out.T))

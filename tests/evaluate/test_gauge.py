@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import se2_compose, se2_transform
 from graphslam.evaluate.consistency import joint_nees, vector_pose_error
-from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+from graphslam.evaluate.gauge import aligned_nees, gauge_directions, inner_covariance
 
 POSES = np.array([[1.0, 2.0, 0.3], [4.0, -1.0, 2.0], [0.5, 5.0, -3.0]])
 POINTS = np.array([[3.0, 3.0], [-2.0, 1.0], [0.0, -4.0], [6.0, 1.0]])
@@ -62,3 +62,15 @@ def test_what_cannot_be_judged_is_refused(rng):
     twice = np.array([[1.0, 1.0], [1.0, 1.0]])
     with pytest.raises(CovarianceError, match="not determined"):
         aligned_nees(np.zeros(4), np.eye(4), gauge_directions(np.zeros((0, 3)), twice))
+
+
+def test_inner_covariance_is_that_of_aligned_errors(rng):
+    P = covariance(rng, 8)
+    G = gauge_directions(np.zeros((0, 3)), POINTS - POINTS.mean(axis=0))
+    got = inner_covariance(P, G)
+    draws = rng.multivariate_normal(np.zeros(8), P, size=20000)
+    left = draws - (G @ np.linalg.lstsq(G, draws.T, rcond=None)[0]).T
+    np.testing.assert_allclose(got, np.cov(left.T), atol=0.05 * np.diag(got).max())
+    np.testing.assert_allclose(got @ G, 0, atol=1e-12)
+    # the frame in which the map was first known does not matter
+    np.testing.assert_allclose(inner_covariance(P + G @ np.diag([4.0, 4.0, 0.1]) @ G.T, G), got, atol=1e-9)

@@ -1,0 +1,35 @@
+"""``graphslam merge``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import typer
+
+from graphslam.app.cli_run import JSON
+from graphslam.app.terminal import emit, table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    app.command()(merge)
+
+
+def merge(
+    runs: list[Path] = typer.Argument(..., help="Run folders, at least two; the first one's base is the origin."),
+    by: str = typer.Option("auto", help="identity, constellation (the pattern of the landmarks), or auto."),
+    solver: str = typer.Option("batch", help="isam2 or batch."),
+    identity_gate: float = typer.Option(25.0, help="Split off sightings beyond this χ² (2 dof); 0 = never."),
+    tolerance: float = typer.Option(0.5, help="Landmarks of two maps this near after alignment agree [m]."),
+    out: Path = typer.Option(..., help="Folder for the merged map."),
+    as_json: bool = JSON,
+) -> None:
+    """Merge runs of several robots or days into one map, solved as one problem, by the landmarks they share."""
+    from graphslam.app.merge import By
+    from graphslam.app.merge import merge as merge_runs
+
+    merged = merge_runs(runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out)
+    rows = merged.metrics.to_dict("records")
+    text = f"{table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: map in {out / 'figures' / 'map.png'}"
+    emit({"out": str(out), "metrics": rows, "report": merged.report}, text, as_json=as_json)
