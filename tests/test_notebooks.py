@@ -18,6 +18,7 @@ from graphslam.core.errors import UnknownNameError
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 NEEDS_DATA = {"01_victoria_park"}
+USES_DATA = {"07_one_set_of_submaps"}  # runs without as well, and says what it left out
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:home|root|Users|tmp|work|mnt|media|opt|usr|var|srv|data)\b|\b[A-Za-z]:\\\\")
 TIMEOUT_S = 300
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -49,7 +50,13 @@ def outputs(book: Any) -> list[Any]:
 
 
 def test_there_are_notebooks() -> None:
-    assert {"00_five_minute_tour", "01_victoria_park"} <= {p.stem for p in NOTEBOOKS}
+    assert {
+        "00_five_minute_tour",
+        "01_victoria_park",
+        "02_what_a_submap_is",
+        "06_consistency_study",
+        "07_one_set_of_submaps",
+    } <= {p.stem for p in NOTEBOOKS}
 
 
 @every_notebook
@@ -89,7 +96,7 @@ def test_absolute_paths_are_found() -> None:
 @every_notebook
 def test_notebook_runs(path: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     data = {}
-    if path.stem in NEEDS_DATA:
+    if path.stem in NEEDS_DATA | USES_DATA:
         data["GRAPHSLAM_DATA"] = str(request.getfixturevalue("data_dir"))
     book = execute(path, tmp_path, **data)
     found = outputs(book)
@@ -112,6 +119,19 @@ def test_a_notebook_without_its_data_ends_in_a_sentence(tmp_path: Path) -> None:
     assert "GRAPHSLAM_DATA" in "\n".join(error.traceback)
     ran = [c.id for c in book.cells if c.cell_type == "code" and c.execution_count is not None]
     assert ran[-1] == "vp-load"
+
+
+def test_a_notebook_that_can_do_without_says_what_it_left_out(tmp_path: Path) -> None:
+    book = nbformat.read(FOLDER / "07_one_set_of_submaps.ipynb", as_version=4)
+    kept = [c for c in book.cells if c.id == "one-imports" or c.id.startswith("one-park")]
+    assert len(kept) >= 4
+    book.cells = kept
+    part = tmp_path / "part.ipynb"
+    nbformat.write(book, part)
+    found = outputs(execute(part, tmp_path, GRAPHSLAM_DATA=str(tmp_path / "nothing")))
+    assert not any("image/png" in o.get("data", {}) for o in found)
+    text = "".join(o.text for o in found if o.output_type == "stream")
+    assert "skipped: section 6 needs the data set victoria-park-local-maps" in text
 
 
 def test_stop_says_the_terms_and_refuses_unknown_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
