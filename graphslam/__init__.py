@@ -19,6 +19,7 @@ _VERBS = {
     "join": "graphslam.app.verbs",
     "local_maps": "graphslam.app.verbs",
     "merge": "graphslam.app.merge",
+    "export": "graphslam.app.export",
     "solve": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",
     "open_run": "graphslam.app.verbs",

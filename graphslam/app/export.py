@@ -1,0 +1,136 @@
+"""A run on the globe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.app.outputs import open_run
+from graphslam.app.run import Run
+from graphslam.core.errors import ConfigError, UnknownNameError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
+from graphslam.core.geometry import Array, rotation2, se2_transform
+from graphslam.io.geographic import WRITERS, GeographicMap
+
+_RING = 36  # corners of an ellipse
+
+
+def map_to_enu(run: Run, heading: float | None) -> Array:
+    """``T_enu_map`` (3,): the map in east and north from the datum.
+
+    Where GPS fixes were scored, their frame is east and north and its origin is the datum. Else the datum is the first
+    base, and only the user knows where it looked.
+
+    Raises
+    ------
+    ConfigError
+        A heading for a run that knows its own, or none for one that does not.
+    """
+    scored = run.gps.get("all")
+    if scored is not None:
+        if heading is not None:
+            raise ConfigError("the GPS of this run says how its map lies: leave the heading out")
+        return scored.T_gps_map
+    if heading is None:
+        raise ConfigError("this run has no GPS: give the heading of its first base, degrees clockwise from north")
+    if not np.isfinite(heading):
+        raise ConfigError(f"heading = {heading}; wanted degrees clockwise from north")
+    return np.array([0.0, 0.0, np.deg2rad(90.0 - heading)])
+
+
+def geographic_map(
+    run: Run, datum: tuple[float, float], *, heading: float | None = None, confidence: float = 0.95
+) -> GeographicMap:
+    """Path, landmarks with ellipses and GPS fixes of a run in latitude and longitude.
+
+    Parameters
+    ----------
+    run : Run
+    datum : (latitude, longitude)
+        Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84].
+    heading : float, optional
+        Of the first base's x axis, degrees clockwise from north; for runs without GPS.
+    confidence : float
+        Of the ellipses.
+
+    Raises
+    ------
+    ConfigError, GeometryError
+    """
+    if not 0 < confidence < 1:
+        raise ConfigError(f"confidence = {confidence}; wanted in (0, 1)")
+    check_geodetic(*datum)
+    T, m = map_to_enu(run, heading), run.map
+
+    def place(points: Array) -> Array:
+        return enu_to_geodetic(points, *datum)[..., :2]
+
+    R = rotation2(T[2])
+    centres = se2_transform(T, m.landmarks)
+    P = R @ m.landmark_covariances @ R.T
+    turn = np.linspace(0.0, 2.0 * np.pi, _RING + 1)
+    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
+    circle[-1] = circle[0]
+    # c + √χ² L u with L Lᵀ = P; L has a positive determinant, so rings keep their sense
+    rings = centres[:, None] + np.sqrt(chi2_quantile(confidence, 2)) * circle @ np.linalg.cholesky(P).swapaxes(1, 2)
+    scored = run.gps.get("all")
+    fixes = np.zeros((0, 2)) if scored is None else scored.points + scored.residuals
+    return GeographicMap(
+        name=run.name,
+        description=f"{len(run.submaps)} submaps, {len(m.landmarks)} landmarks; datum {datum[0]:.6f}, {datum[1]:.6f}",
+        path=place(se2_transform(T, m.trajectory.positions)),
+        landmarks=place(centres),
+        landmark_ids=m.landmark_ids,
+        landmark_sigmas=np.sqrt(np.linalg.eigvalsh(P)[:, -1]) if len(P) else np.zeros(0),
+        ellipses=place(rings),
+        confidence=confidence,
+        gps=place(fixes),
+    )
+
+
+def parse_datum(text: str) -> tuple[float, float]:
+    """``LAT,LON`` in degrees.
+
+    Raises
+    ------
+    ConfigError
+    """
+    try:
+        latitude, longitude = (float(v) for v in text.split(","))
+    except ValueError:
+        raise ConfigError(f"datum {text!r}; wanted LAT,LON in degrees, as -33.88,151.19") from None
+    return latitude, longitude
+
+
+def export(
+    run: Run | str | Path,
+    datum: tuple[float, float],
+    *,
+    format: str = "kml",
+    heading: float | None = None,
+    confidence: float = 0.95,
+    out: str | Path | None = None,
+) -> Path:
+    """Write a run as KML or GeoJSON; see :func:`geographic_map`.
+
+    Parameters
+    ----------
+    out : path, optional
+        Default: ``map.<format>`` in the run's folder.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    if format not in WRITERS:
+        raise UnknownNameError("format", format, WRITERS)
+    opened = run if isinstance(run, Run) else open_run(run)
+    if out is None and opened.folder is None:
+        raise ConfigError("a run without a folder needs a file name to be exported to")
+    target = Path(out) if out is not None else Path(opened.folder or ".") / f"map.{format}"
+    content = geographic_map(opened, datum, heading=heading, confidence=confidence)
+    WRITERS[format](target, content)
+    return target
