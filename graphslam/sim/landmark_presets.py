@@ -17,7 +17,9 @@ _AVENUE = dataclasses.replace(
     _LOOP,
     landmarks=30,
     row_spacing=4.0,
-    sigma_speed=6.0,
+    control_rate=2.0,
+    sigma_speed=1.4,
+    sigma_steering=math.radians(1.0),
     sigma_range=0.1,
     sigma_bearing=math.radians(1.0),
     scan_rate=1.0,
@@ -57,7 +59,7 @@ PRESETS: Mapping[str, LandmarkFieldConfig] = {
     "clutter": _LOOP_OF_CLUTTER,
     # the same lap, every feature has a twin 1.5 m away: nearer than a bearing of 5° can tell apart beyond 17 m
     "pairs": dataclasses.replace(_LOOP, pair_fraction=1.0, pair_distance=1.5),
-    # an avenue with few other features and a good sensor at 1 Hz, but a poor odometry: 0.95 m along the way between two
+    # an avenue with few other features and a good sensor at 1 Hz, but a wheel that slips: 1 m along the way between two
     # scans, a quarter of the distance between trees, so that now and then the next tree is the nearer one
     "rows": _AVENUE,
     # the avenue with everything at once: pairs, clutter, missed detections
