@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from scipy import stats
 
 from graphslam.core.errors import DataError
@@ -251,6 +251,11 @@ def plot_rms(
     values = np.concatenate(every) if every else np.ones(1)
     if log or (log is None and values.min() > 0 and values.max() > 30.0 * values.min()):
         ax.set_xscale("log")
+        # within a decade or two the default labels every minor tick, one over the other
+        few = bool(values.min() > 0 and values.max() < 300.0 * values.min())
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if few else (1.0,)))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
     else:
         ax.set_xlim(left=0.0)
     ax.set_ylim(-0.6, len(names) - 0.4)

@@ -74,5 +74,5 @@ def plot_local_honesty(
     ax.set_title(f"{most} local maps, each in the frame of its first pose" if title is None else title,
                  fontsize="medium")  # fmt: skip
     # long labels: under the axes, which they would else squeeze
-    style.legend(ax, outside=False, loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)
+    style.legend(ax, outside=False, loc="upper left", bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
     return ax
