@@ -1,8 +1,8 @@
-"""Sparse symmetric positive-definite systems with a fill-reducing order that is computed once and kept.
+"""Sparse symmetric positive-definite systems of any kind, and fill-reducing elimination orders.
 
-SuperLU in symmetric mode (diagonal pivots, minimum degree on ``A + Aᵀ``) serves as the sparse Cholesky of the joiners
-and of the batch solver. Finding the order costs about as much as the numbers themselves, so callers that solve one
-pattern many times arrange their unknowns in elimination order and factor with ``ordered=True``.
+SuperLU in symmetric mode (diagonal pivots, minimum degree on ``A + Aᵀ``) serves as the sparse Cholesky of matrices that
+are solved once. The joiners and the batch solver factorise the same blocks many times and take only the order from here
+(:mod:`~graphslam.graph.block_cholesky`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ class SymmetricFactor:
     ----------
     matrix : csc_matrix (n, n)
         Both triangles.
-    ordered : bool
-        The unknowns already stand in elimination order: do not look for another one.
 
     Raises
     ------
@@ -37,11 +35,11 @@ class SymmetricFactor:
         If the matrix is singular.
     """
 
-    def __init__(self, matrix: sp.csc_matrix, *, ordered: bool = False) -> None:
+    def __init__(self, matrix: sp.csc_matrix) -> None:
         try:
             self._lu = spla.splu(
                 matrix,
-                permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
+                permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
             )
