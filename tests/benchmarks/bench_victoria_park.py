@@ -3,7 +3,9 @@
     python tests/benchmarks/bench_victoria_park.py            speed (second run of two: compilation apart), one core
     python tests/benchmarks/bench_victoria_park.py --noise    evidence: χ²/dof and landmark splits against the noise
     python tests/benchmarks/bench_victoria_park.py --gps      honest use of GPS: what is withheld, and the laser χ²
-    python tests/benchmarks/bench_victoria_park.py --quick    the first 200 s only
+    python tests/benchmarks/bench_victoria_park.py --paper    EKF, local maps in sequence, by tree, ours: map, time
+                                                              (--seeds N; --figures DIR)
+    python tests/benchmarks/bench_victoria_park.py --quick    the first 200 s only; alone: speed, and the paper's ways
 
 The noise figures are chosen from the columns left of the bar alone. What stands right of it (published identities, GPS)
 is printed to show what the choice is worth, and was not used for it.
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -21,8 +24,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from graphslam.app.pipeline import load_log_source, run
 from graphslam.app.run import Run
+from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
+
+sys.path.insert(0, str(Path(__file__).parent))
+from victoria_park_paper import paper
 
 
 def speed(log: SensorLog) -> None:
@@ -69,7 +76,11 @@ def line(label: str, r: Run) -> None:
 def gps(log: SensorLog) -> None:
     """The laser χ² may rise by what honest fixes cost, a percent; more means that GPS bends the map."""
     base = run_with(log).metric("join_chi2")
-    print("fixes used     σ [m]  kernel  | withheld rmse  median  | laser χ² against none")
+    print(
+        "fixes used     σ [m]  kernel  | withheld rmse  median  | laser χ² against none | NIS/2 of the withheld: ",
+        end="",
+    )
+    print("each (autocorrelation, bounds), joint")
     for use, sigma, kernel in (
         ("every-second", 1.0, "cauchy"),
         ("every-second", 0.5, "cauchy"),
@@ -80,7 +91,12 @@ def gps(log: SensorLog) -> None:
         r = run_with(log, gps={"use": use, "sigma": sigma, "robust": kernel})
         rmse, median = r.metric("gps_withheld_rmse"), r.metric("gps_withheld_median")
         rise = r.metric("join_chi2") / base - 1
-        print(f"{use:14} {sigma:5.2f}  {kernel:7} | {rmse:13.3f}  {median:6.3f}  | {rise:+.2%}")
+        each, low, high = (r.metric(f"gps_nis_each_{k}") for k in ("value", "low", "high"))
+        nis = f"{each:.2f} ({r.metric('gps_nis_each_autocorrelation'):.2f}, {low:.2f} … {high:.2f}), "
+        print(
+            f"{use:14} {sigma:5.2f}  {kernel:7} | {rmse:13.3f}  {median:6.3f}  | {rise:+21.2%} | "
+            f"{nis}{r.metric('gps_nis_joint_value'):.2f}"
+        )
 
 
 def main() -> None:
@@ -88,6 +104,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--noise", action="store_true")
     parser.add_argument("--gps", action="store_true")
+    parser.add_argument("--paper", action="store_true")
+    parser.add_argument("--seeds", type=int, default=5, help="runs of the particle filter in --paper")
+    parser.add_argument("--figures", type=Path, help="folder for the figures of --paper")
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     try:
@@ -101,8 +120,11 @@ def main() -> None:
         noise(log, args.quick)
     elif args.gps:
         gps(log)
-    else:
+    if not (args.noise or args.gps or args.paper):
         speed(log)
+    if args.paper or (args.quick and not (args.noise or args.gps)):
+        with one_blas_thread():
+            paper(log, seeds=1 if args.quick else args.seeds, figures=args.figures)
 
 
 if __name__ == "__main__":
