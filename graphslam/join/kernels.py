@@ -37,7 +37,8 @@ def join_blocks(
     Parameters
     ----------
     x, width, ptr, idx, block, value
-        Map A: mean ``(n,)``, node widths ``(N,)``, neighbour lists, where their blocks begin in ``value``.
+        Map A: mean ``(n,)``, node widths ``(N,)``, neighbour lists, where their blocks begin in ``value``; the blocks
+        of a list stand one after the other.
     z, b_width, b_ptr, b_idx, b_block, b_value
         Map B alike, in the frame of ``start``.
     image : (N_b,)
@@ -137,37 +138,44 @@ def join_blocks(
     for d in range(3):
         gradient[at[start] + d] += gs[d]
 
-    # Lists and blocks of the joined map, row by row
+    # Lists and blocks of the joined map, row by row. Rows of A that B does not touch are copied whole, and in rows of
+    # new nodes every neighbour is new; only rows that both have a part in must look up what stands there already.
     room = len(idx) + len(b_idx) + 2 * NB + 1
     new_ptr = np.zeros(total + 1, np.int64)
     new_idx = np.empty(room, np.int64)
     new_block = np.empty(room, np.int64)
-    new_value = np.zeros(len(value) + len(b_value) + 6 * n + 9)
+    new_value = np.empty(len(value) + len(b_value) + 6 * n + 9)
     where = np.full(total, -1, np.int64)  # entry of each neighbour in the list of the row at hand
     e, k = 0, 0
     T = np.empty((3, 3))
     for i in range(total):
-        wi, first = new_width[i], e
+        wi, first, b = new_width[i], e, source[i]
         if i < N:
-            for f in range(ptr[i], ptr[i + 1]):
+            f0, f1 = ptr[i], ptr[i + 1]
+            shared = b >= 0 or i == start
+            size = 0
+            for f in range(f0, f1):
                 j = idx[f]
-                size = wi * width[j]
-                new_idx[e], new_block[e] = j, k
-                for p in range(size):
-                    new_value[k + p] = value[block[f] + p]
-                where[j] = e
+                new_idx[e], new_block[e] = j, k + block[f] - block[f0]
+                if shared:
+                    where[j] = e
                 e += 1
-                k += size
-        b = source[i]
+                size += wi * width[j]
+            for p in range(size):
+                new_value[k + p] = value[block[f0] + p]
+            k += size
         if b >= 0:
             for f in range(b_ptr[b], b_ptr[b + 1]):
                 j, wj, v = image[b_idx[f]], b_width[b_idx[f]], b_block[f]
-                if where[j] < first:
+                fresh = i >= N or where[j] < first
+                if fresh:
                     new_idx[e], new_block[e] = j, k
                     where[j] = e
+                    to = k
                     e += 1
                     k += wi * wj
-                to = new_block[where[j]]
+                else:
+                    to = new_block[where[j]]
                 for q in range(wj):  # T_b W T_jᵀ: rows, then columns
                     fx, fy = b_value[v + q], b_value[v + wj + q]
                     T[0, q], T[1, q] = c * fx - s * fy, s * fx + c * fy
@@ -175,25 +183,38 @@ def join_blocks(
                         T[2, q] = b_value[v + 2 * wj + q]
                 for p in range(wi):
                     fx, fy = T[p, 0], T[p, 1]
-                    new_value[to + p * wj] += c * fx - s * fy
-                    new_value[to + p * wj + 1] += s * fx + c * fy
-                    if wj == 3:
-                        new_value[to + p * wj + 2] += T[p, 2]
-            if where[start] < first:
+                    gx, gy = c * fx - s * fy, s * fx + c * fy
+                    at_p = to + p * wj
+                    if fresh:
+                        new_value[at_p], new_value[at_p + 1] = gx, gy
+                        if wj == 3:
+                            new_value[at_p + 2] = T[p, 2]
+                    else:
+                        new_value[at_p] += gx
+                        new_value[at_p + 1] += gy
+                        if wj == 3:
+                            new_value[at_p + 2] += T[p, 2]
+            fresh = i >= N or where[start] < first
+            if fresh:
                 new_idx[e], new_block[e] = start, k
                 where[start] = e
+                to = k
                 e += 1
                 k += 3 * wi
-            to = new_block[where[start]]
+            else:
+                to = new_block[where[start]]
             for p in range(wi):
                 for d in range(3):
-                    new_value[to + 3 * p + d] += V[b_at[b] + p, d]
+                    old = 0.0 if fresh else new_value[to + 3 * p + d]
+                    new_value[to + 3 * p + d] = old + V[b_at[b] + p, d]
         if i == start:
             for h in range(NB):
                 j, wj = image[h], b_width[h]
                 if where[j] < first:
                     new_idx[e], new_block[e] = j, k
                     where[j] = e
+                    for p in range(3 * wj):
+                        new_value[k + p] = 0.0
                     e += 1
                     k += 3 * wj
                 to = new_block[where[j]]
