@@ -33,9 +33,9 @@ from graphslam.io.text_records import find_text_file, read_table
 ROBOTS = 5
 CONTROL_DELAY = 0.2
 """A commanded velocity is driven this much later [s]: what the bearings of landmarks in turns say, of every robot."""
-RANGE_SIGMA, BEARING_SIGMA = 0.3, 0.015
+RANGE_SIGMA, BEARING_SIGMA = 0.45, 0.015
 """Stated σ of a range [m] and a bearing [rad]; the recording states none. Range errors last while a barcode is looked
-at from one side: their scatter is 0.15 m, and twice that covers what does not average out."""
+at from one side: they scatter by 0.15 m, and three times that covers what does not average out."""
 IDLE = 0.5
 """The camera looks several times a second, but a frame in which nothing was read left no record: where that lasts
 longer than this, empty scans are put in at this spacing [s], so that maps and paths can be told to have been blind."""

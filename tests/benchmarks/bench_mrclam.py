@@ -132,21 +132,21 @@ def together(runs: Sequence[Run], by: Any, out: Path | None) -> None:
 
 
 def noise(which: Sequence[int]) -> None:
-    """Settings by what they do inside the maps and to the join; all with covariance scale 1 and nothing split off."""
+    """Settings by what they do inside the maps and to the join."""
     print("robot setting                | inside: χ²/dof  range bearing odometry | join χ²/dof || landmark   path [m]")
-    plain: dict[str, Any] = {"backend": {"covariance_scale": 1.0, "identity_gate": 0.0}}
+    plain: dict[str, Any] = {"backend": {"identity_gate": 0.0}}
     settings: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
-        ("preset", {}, {}),
+        ("preset, nothing split", {}, {}),
         ("delay 0 s", {"control_delay": 0.0}, {}),
         ("delay 0.1 s", {"control_delay": 0.1}, {}),
         ("delay 0.3 s", {"control_delay": 0.3}, {}),
         ("range sigma 0.15 m", {}, sensor(0.15, 0.015)),
+        ("range sigma 0.3 m", {}, sensor(0.3, 0.015)),
         ("range sigma 0.6 m", {}, sensor(0.6, 0.015)),
-        ("bearing sigma 0.03", {}, sensor(0.3, 0.03)),
-        ("walks x 2", {}, {"frontend": {"motion": {"speed_walk": 0.02, "yaw_walk": 0.06}}}),
-        ("walks / 2", {}, {"frontend": {"motion": {"speed_walk": 0.005, "yaw_walk": 0.015}}}),
-        ("split at 25", {}, {"backend": {"identity_gate": 25.0}}),
-        ("scale 2, split at 25", {}, {"backend": {"covariance_scale": 2.0, "identity_gate": 25.0}}),
+        ("bearing sigma 0.03", {}, sensor(0.45, 0.03)),
+        ("walks / 2", {}, {"frontend": {"motion": {"speed_walk": 0.01, "yaw_walk": 0.03}}}),
+        ("walks x 2", {}, {"frontend": {"motion": {"speed_walk": 0.04, "yaw_walk": 0.12}}}),
+        ("split at 40", {}, {"backend": {"identity_gate": 40.0}}),
     ]
     for k in which:
         for label, reader, options in settings:
