@@ -217,7 +217,7 @@ def _truth(root: Path, robot: int, counter: DropCounter) -> Truth | None:
     except MissingDataError:
         return None
     table = read_table(path, 4)[0]
-    bad = {"pose is not finite": ~np.isfinite(table[:, 1:]).all(axis=1)}
+    bad = {"pose is not finite": np.asarray(~np.isfinite(table[:, 1:]).all(axis=1))}
     keep = usable_records(table[:, 0], bad, stream="truth", where=str(path), drops=counter)
     marks, lines = read_table(surveyed, 5)
     wrong = np.flatnonzero(~np.isfinite(marks).all(axis=1))

@@ -84,7 +84,7 @@ def read_plaza(
 def _controls(path: Path, truth: Truth | None, counter: DropCounter) -> tuple[VelocityControls, int]:
     """Speed and yaw rate over the interval *before* each stamp; zero from the last stamp on."""
     table = read_table(path, 3)[0]
-    bad = {"distance or heading change is not finite": ~np.isfinite(table[:, 1:]).all(axis=1)}
+    bad = {"distance or heading change is not finite": np.asarray(~np.isfinite(table[:, 1:]).all(axis=1))}
     keep = usable_records(table[:, 0], bad, stream="controls", where=str(path), drops=counter)
     times, moved = table[keep, 0], table[keep, 1:]
     if len(times) < 2:
@@ -151,7 +151,7 @@ def _truth(path: Path, counter: DropCounter) -> Truth | None:
     for array, columns, what in ((poses, 4, "GT"), (beacons, 3, "TL")):
         if array.ndim != 2 or array.shape[1] != columns:
             raise FormatError(f"{what} has the wrong shape", where=str(path), got=array.shape, wanted=f"(n, {columns})")
-    bad = {"pose is not finite": ~np.isfinite(poses[:, 1:]).all(axis=1)}
+    bad = {"pose is not finite": np.asarray(~np.isfinite(poses[:, 1:]).all(axis=1))}
     keep = usable_records(poses[:, 0], bad, stream="truth", where=str(path), drops=counter)
     xyt: Array = np.column_stack([poses[keep, 1:3], wrap_angle(poses[keep, 3])])
     order = np.argsort(beacons[:, 0])
