@@ -82,6 +82,6 @@ def plot_gps_maps(
         ax.set_title(title, fontsize="medium")
         style.metric_axes(ax, "east", "north")
         ax.label_outer()
-        if k == 0:
+        if k == len(paths) - 1:
             style.legend(ax, outside=False, loc="best")
     return axes

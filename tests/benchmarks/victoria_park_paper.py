@@ -213,12 +213,14 @@ def _all_methods(log: SensorLog, judge: Judge, out: Results, seed: int, *, progr
                 name = f"paper × {factor:g}, {order}, {rule}"
                 _join(out, judge, name, scaled, spent, join, rule, polished=order in ("sequence", "tree"))
                 bar.update()
+    _default(log, judge, out, settings, moments, spent, "paper: iSAM2, merged")
     smoothed, spent = local_maps(log, seed)
+    _join(out, judge, "default × 1, sequence, nearest", smoothed, spent, join_sequential, "nearest", polished=False)
     scaled = scale_covariances(smoothed, scale)
     for order, join in joiners(False):
         _join(out, judge, f"default × {scale:g}, {order}, joint", scaled, spent, join, "joint", polished=True)
         bar.update()
-    _default(log, judge, out, settings, smoothed, spent)
+    _default(log, judge, out, settings, smoothed, spent, "default: iSAM2, merged")
     bar.close()
 
 
@@ -269,10 +271,9 @@ def _join(
 
 
 def _default(
-    log: SensorLog, judge: Judge, out: Results, settings: cfg.RunConfig, submaps: list[Submap], spent: Array
+    log: SensorLog, judge: Judge, out: Results, settings: cfg.RunConfig, submaps: list[Submap], spent: Array, name: str
 ) -> None:
-    """What ``graphslam run`` does: association in the graph, iSAM2, merging, to the optimum."""
-    name = "default: iSAM2, merged"
+    """What ``graphslam run`` does: covariances scaled, association in the graph, iSAM2, merging, to the optimum."""
     clock = Clock()
     back = BackEnd(settings.backend, "isam2")
     for submap in submaps:
@@ -332,7 +333,7 @@ def levels(log: SensorLog, judge: Judge) -> None:
 
 def draw(table: pd.DataFrame, results: Results, gps: Gps, folder: Path) -> None:
     """Time against submaps, and maps on the GPS fixes."""
-    scale = next(n.split("× ")[1].split(",")[0] for n in results.maps if n.startswith("default ×"))
+    scale = next(n for n in results.maps if n.endswith("O(n³), nearest")).split()[2].rstrip(",")
     maps = f"paper × {scale}"
     _, (left, right) = plt.subplots(1, 2, figsize=(12.5, 4.6), dpi=style.DPI, layout="constrained")
     joins = {

@@ -59,7 +59,7 @@ def test_a_right_path_in_any_frame_lies_on_the_fixes(path: Trajectory) -> None:
     assert axes[0].get_title().startswith("here\n")
     assert axes[0].get_xlim() == axes[1].get_xlim()
     assert (axes[0].get_ylabel(), axes[1].get_xlabel()) == ("north [m]", "east [m]")
-    assert axes[0].get_legend() is not None
+    assert {t.get_text() for t in axes[-1].get_legend().get_texts()} == {"GPS", "path of the antenna", "landmark"}
 
 
 def test_a_wrong_path_does_not_and_its_title_says_by_how_much(path: Trajectory) -> None:
