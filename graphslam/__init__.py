@@ -11,16 +11,16 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# verb -> module that holds it
+# verb -> module that holds it. None may bear the name of a subpackage: importing that would take its place.
 _VERBS = {
     "load": "graphslam.app.verbs",
     "run": "graphslam.app.verbs",
     "compare": "graphslam.app.verbs",
-    "join": "graphslam.app.verbs",
+    "join_submaps": "graphslam.app.verbs",
     "local_maps": "graphslam.app.verbs",
     "merge": "graphslam.app.merge",
     "export": "graphslam.app.export",
-    "solve": "graphslam.app.verbs",
+    "solve_file": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",
     "open_run": "graphslam.app.verbs",
     "study": "graphslam.app.verbs",

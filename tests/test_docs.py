@@ -14,7 +14,16 @@ from frontends.landmarks.config import RbpfEkfConfig
 from graphslam.app import config as cfg
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ["concepts.md", "how-to.md", "limits.md", "without-truth.md", "association-ambiguity.md"]
+PAGES = [
+    "association-ambiguity.md",
+    "combined-slam.md",
+    "concepts.md",
+    "how-to.md",
+    "limits.md",
+    "mrclam.md",
+    "plaza.md",
+    "without-truth.md",
+]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 every_page = pytest.mark.parametrize("name", PAGES)
 

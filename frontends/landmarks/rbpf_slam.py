@@ -27,7 +27,7 @@ from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 
 Ints = npt.NDArray[np.int64]
-Joint = Literal["none", "last", "all"]
+Joint = Literal["never", "last", "all"]
 
 
 class WholeMapFilter:
@@ -100,7 +100,7 @@ def rbpf_snapshots(
     seed : SeedTree
     cuts : sequence of int
         Numbers of scans after which a snapshot is taken, increasing; the filter stops at the last one.
-    joint : {"last", "all", "none"}
+    joint : {"last", "all", "never"}
         Which snapshots carry the joint Gaussian; the others hold the marginals of pose and landmarks.
     drops : DropCounter, optional
 
@@ -116,8 +116,8 @@ def rbpf_snapshots(
     MissingDataError
         See :func:`frontends.landmarks.prepare.prepare`.
     """
-    if joint not in ("last", "all", "none"):
-        raise ConfigError(f"joint = {joint!r}; known: last, all, none")
+    if joint not in ("last", "all", "never"):
+        raise ConfigError(f"joint = {joint!r}; known: last, all, never")
     data = prepare(log, config, drops if drops is not None else DropCounter())
     at = [int(c) for c in cuts]
     if any(b <= a for a, b in zip([0, *at], at)) or (at and at[-1] > len(data)):

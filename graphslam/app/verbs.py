@@ -1,4 +1,4 @@
-"""The verbs of a notebook: ``graphslam.load``, ``run``, ``compare``, ``join``, ``solve`` and so on."""
+"""The verbs of a notebook: ``graphslam.load``, ``run``, ``compare``, ``join_submaps`` and so on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,18 @@ from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 
-__all__ = ["compare", "join", "load", "local_maps", "open_run", "open_study", "run", "simulate", "solve", "study"]
+__all__ = [
+    "compare",
+    "join_submaps",
+    "load",
+    "local_maps",
+    "open_run",
+    "open_study",
+    "run",
+    "simulate",
+    "solve_file",
+    "study",
+]
 
 
 def load(source: str | Path, **options: Any) -> SensorLog:
@@ -61,7 +72,7 @@ def compare(
         return comparing.compare(s.submaps, methods=methods, truth=truth or s.truth, **options)
 
 
-def join(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
+def join_submaps(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
     """Join submaps by one method; see :func:`graphslam.app.compare.join`."""
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
@@ -69,8 +80,8 @@ def join(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", 
         return comparing.join(s.submaps, method, **options)
 
 
-def solve(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
+def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
     """Solve a pose-graph file; see :func:`graphslam.app.solve_file.solve_file`."""
-    from graphslam.app.solve_file import solve_file
+    from graphslam.app import solve_file as solving
 
-    return solve_file(path, solver, **options)
+    return solving.solve_file(path, solver, **options)

@@ -115,12 +115,19 @@ def global_maps(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def online_consistency(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean pose CI along the run against the two-sided bounds of a mean over the runs."""
+def online_consistency(table: pd.DataFrame, quantity: str = "pose_nees") -> pd.DataFrame:
+    """Mean pose CI along the run against the two-sided bounds of a mean over the runs.
+
+    Parameters
+    ----------
+    table : DataFrame
+    quantity : str
+        ``pose_nees``, or ``pose_nees_tangent``: the same covariance, the error taken as a right perturbation.
+    """
     rows = []
     for world, t in _worlds(table):
         for name in GLOBAL:
-            nees = online(t, name, "pose_nees").to_numpy()
+            nees = online(t, name, quantity).to_numpy()
             if not nees.size:
                 continue
             ci = np.nanmean(nees, axis=0) / _POSE
@@ -271,6 +278,7 @@ def report(table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame
         "Local maps": local_maps(table),
         "Whole maps at the end": global_maps(table),
         "Pose CI along the run": online_consistency(table),
+        "Pose CI along the run, error as a right perturbation": online_consistency(table, "pose_nees_tangent"),
         "Run by run": paired(table),
         "Agreement": agreement(table),
         "Seconds": joining_times(timings),

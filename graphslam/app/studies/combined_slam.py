@@ -11,8 +11,9 @@ relinearisation at loop closures; ``default-optimum``: relinearised at every sub
 
 Quantities
 ----------
-After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom), ``error_*``, ``sigma_*``, and, after every ninth,
-``feature_nees`` (mean over features, 2 degrees of freedom each) and ``feature_rms``. At the end (submap -1):
+After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom; of the plain vector x, y, θ as in the paper) and
+``pose_nees_tangent`` (of the right perturbation ``Log(T_est⁻¹ T_true)``), ``error_*``, ``sigma_*``, and, after every
+ninth, ``feature_nees`` (mean over features, 2 degrees of freedom each) and ``feature_rms``. At the end (submap -1):
 ``pose_nees``, ``feature_nees``, ``feature_inside``, ``feature_joint_nees`` with ``feature_joint_dof``, ``feature_rms``,
 ``feature_median_error``, ``pose_rms``, ``heading_rms`` [rad], ``objective`` and ``objective_optimum``, ``diverged``.
 Of local map k: ``local_joint_nees`` with ``local_joint_dof``, ``local_pose_nees``, ``local_inside``, …

@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from frontends.landmarks.snapshot import Snapshot
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, se2_between
+from graphslam.core.geometry import Array, se2_between, vector_to_tangent_covariance
 from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
-from graphslam.evaluate.consistency import joint_nees, nees, vector_pose_error
+from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.graph.submap_solver import SubmapEstimate
@@ -80,6 +80,9 @@ class Judge:
         e = vector_pose_error(state.pose, self.end_poses[k])
         sigma = np.sqrt(np.diag(state.pose_covariance))
         yield Measurement(algorithm, "pose_nees", float(nees(e, state.pose_covariance)), k)
+        tangent = vector_to_tangent_covariance(state.pose, state.pose_covariance)
+        d2 = float(nees(pose_error(state.pose, self.end_poses[k]), tangent))
+        yield Measurement(algorithm, "pose_nees_tangent", d2, k)
         for i, axis in enumerate(("x", "y", "heading")):
             yield Measurement(algorithm, f"error_{axis}", float(e[i]), k)
             yield Measurement(algorithm, f"sigma_{axis}", float(sigma[i]), k)
