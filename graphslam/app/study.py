@@ -18,6 +18,7 @@ from graphslam.app.study_definition import StudyDefinition, find_study, fingerpr
 from graphslam.app.study_folder import StudyFolder
 from graphslam.app.threads import hold_one_thread, one_blas_thread
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.interrupt import heeded_interrupts
 from graphslam.evaluate.executors import Executor, Job, execute
 from graphslam.evaluate.montecarlo import check_measurements, trial_seed
 
@@ -224,12 +225,14 @@ def study(
     )
     try:
         with (
+            heeded_interrupts() as interrupt,
             closing(outcomes),  # ends the workers, whatever happens here
             one_blas_thread(),
             tqdm(total=len(wanted), desc=definition.name, disable=not progress) as bar,
         ):
             bar.update(len(wanted) - len(jobs))
             for outcome in outcomes:
+                interrupt.check()
                 w, k, job = jobs[outcome.job.name]
                 error = outcome.error or check_measurements(outcome.values)
                 if error:
