@@ -151,6 +151,8 @@ def test_ctrl_c_writes_what_is_done_and_leaves_no_worker(tmp_path: Path) -> None
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # a job in the background of a shell has Ctrl-C ignored, and hands that on
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120
     while process.poll() is None and len(trial_files(out)) < 3 and time.monotonic() < deadline:
