@@ -92,3 +92,11 @@ class SolverError(GraphSlamError):
 
 class RunFolderError(GraphSlamError):
     """A run folder cannot be written, read or resumed."""
+
+
+class GridError(DataError):
+    """An evidence grid was asked for something impossible (voxel size, shape, a place outside its cube)."""
+
+
+class GridLockedError(GraphSlamError):
+    """A locked map, which is only localised in, was about to be changed."""

@@ -1,0 +1,270 @@
+"""EvidenceGrid: a log-odds map of occupied and free space that copies in constant time.
+
+The deferred-reference-count octree of SegSLAM (section 2): a grid is a value-like handle on a tree in a shared pool.
+Copying shares the tree; writing copies only what it changes. So every particle of a filter owns a map, resampled
+particles share their history, and a submap that is entered again starts as a copy of what it was.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError, GridLockedError
+from graphslam.core.geometry import Array
+from graphslam.evidence.batch import insert, own_grids, report_of
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
+from graphslam.evidence.pool import GridPool, RootBox
+from graphslam.evidence.scan import UpdateReport, point_rows, pose_row, scan_rows
+from graphslam.evidence.tree_kernels import gather_bricks, list_bricks, read_values, write_bricks
+
+_DEFAULT_MODEL = BeamModel()
+
+
+class EvidenceGrid:
+    """A log-odds occupancy map, 3-D or 2-D, with O(1) copies.
+
+    Voxel (i, j, k) covers ``[i v, (i + 1) v) × …`` of the grid's frame, v the voxel size. A 2-D grid is the layer
+    k = 0 of the same thing.
+
+    Parameters
+    ----------
+    voxel_size : float
+        Edge of a voxel [m].
+    model : BeamModel, optional
+    pool : GridPool, optional
+        Storage shared with other grids; default a pool of its own.
+    dim : {3, 2}
+
+    Raises
+    ------
+    GridError
+        Voxel size not positive and finite, or another dimension.
+
+    Examples
+    --------
+    >>> grid = EvidenceGrid(0.1)
+    >>> report = grid.insert_scan([[2.0, 0.0, 0.0], [2.0, 0.5, 0.0]])
+    >>> before = grid.copy()
+    >>> report = grid.insert_scan([[2.0, 0.0, 0.0]])
+    >>> float(before.values_at([[2.05, 0.05, 0.05]])[0]) < float(grid.values_at([[2.05, 0.05, 0.05]])[0])
+    True
+    """
+
+    __slots__ = ("__weakref__", "_box", "dim", "locked", "model", "pool", "voxel_size")
+
+    def __init__(
+        self, voxel_size: float, *, model: BeamModel | None = None, pool: GridPool | None = None, dim: int = 3
+    ) -> None:
+        if not (isinstance(voxel_size, (int, float, np.number)) and math.isfinite(voxel_size) and voxel_size > 0):
+            raise GridError("impossible voxel size", got=voxel_size, wanted="> 0 m")
+        if dim not in (2, 3):
+            raise GridError("impossible dimension of a grid", got=dim, wanted="2 or 3")
+        self.voxel_size = float(voxel_size)
+        self.model = _DEFAULT_MODEL if model is None else model
+        self.pool = GridPool() if pool is None else pool
+        self.dim = dim
+        self.locked = False
+        self._box = RootBox(0, self.pool.dead)
+
+    # --- life ------------------------------------------------------------------------------------------------
+
+    def copy(self) -> EvidenceGrid:
+        """The same map under a second handle, in constant time; whichever is written first pays for what it changes.
+
+        The copy of a locked grid is not locked.
+        """
+        twin: EvidenceGrid = _new(EvidenceGrid)
+        twin.voxel_size = self.voxel_size
+        twin.model = self.model
+        twin.pool = self.pool
+        twin.dim = self.dim
+        twin.locked = False
+        box = self._box
+        box.shared = True
+        twin._box = box
+        return twin
+
+    __copy__ = copy
+
+    def __deepcopy__(self, memo: Any) -> EvidenceGrid:
+        return self.copy()
+
+    def empty(self) -> EvidenceGrid:
+        """An empty grid of the same kind in the same pool."""
+        return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool, dim=self.dim)
+
+    def release(self) -> None:
+        """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""
+        self._box = RootBox(0, self.pool.dead)
+        self.pool.collect()
+
+    def lock(self) -> None:
+        """Localise only: from here on, updating raises `GridLockedError` (SegSLAM A12)."""
+        self.locked = True
+
+    def unlock(self) -> None:
+        """Allow updates again."""
+        self.locked = False
+
+    @property
+    def root(self) -> int:
+        """Root node in the pool, 0 of an empty grid; valid until the next write."""
+        return self._box.root
+
+    def same_as(self, other: EvidenceGrid) -> bool:
+        """Whether two handles hold the very same tree (a copy that neither side has written to)."""
+        return self._box is other._box or (self.root == 0 == other.root)
+
+    # --- writing ---------------------------------------------------------------------------------------------
+
+    def _check_writable(self) -> None:
+        if self.locked:
+            raise GridLockedError("this evidence grid is locked: it is localised in, not updated; unlock or copy it")
+
+    def insert_scan(
+        self,
+        points: Any,
+        origin: Any = None,
+        *,
+        pose: Any = None,
+        max_range: float | None = None,
+        returns: Any = None,
+    ) -> UpdateReport:
+        """Insert beams by the beam model: free along the way, occupied at the end, each voxel once a scan.
+
+        All voxels from that of the origin up to, not including, that of the end are passed; that of the end is hit. A
+        voxel some beam hit counts as hit, whatever passed through it. Beams that cannot be used are dropped and
+        counted.
+
+        Parameters
+        ----------
+        points : (n, 3) or (n, 2)
+            Ends of the beams in the frame of the scan [m].
+        origin : (3,) or (n, 3), (2,) or (n, 2)
+            Where the beams start, in the same frame; one for each beam if the sensor moved. Default 0.
+        pose : (7,), (4, 4), or (3,) in 2-D
+            ``T_grid_scan``; default identity.
+        max_range : float, optional
+            Longer beams are cut there and give free space only [m].
+        returns : (n,) bool, optional
+            False where a beam met nothing: it is free up to its point. Default all True.
+
+        Raises
+        ------
+        GridError, GeometryError
+            Impossible shapes or pose; nothing was written.
+        GridLockedError
+        """
+        self._check_writable()
+        scan = scan_rows(points, origin, returns, max_range, self.dim, self.voxel_size)
+        T = pose_row(pose, self.dim)[None]
+        with self.pool.lock:
+            return report_of(insert((self,), T, scan, 1))
+
+    def write_bricks(self, coordinates: Any, values: Any) -> None:
+        """Replace whole bricks: the bulk way in for readers.
+
+        Parameters
+        ----------
+        coordinates : (n, 3) int
+            Signed; brick b holds voxels 8b … 8b + 7. None twice.
+        values : (n, 512) int16
+            In units of `layout.STEP`, x fastest; `layout.UNKNOWN` where nothing is known.
+
+        Raises
+        ------
+        GridError
+            Wrong shapes, a coordinate twice or outside the addressable cube; nothing was written.
+        """
+        self._check_writable()
+        c = np.ascontiguousarray(coordinates, dtype=np.int64)
+        v = np.ascontiguousarray(values)
+        if c.ndim != 2 or c.shape[1] != 3 or v.shape != (len(c), BRICK_VOXELS) or v.dtype != np.int16:
+            raise GridError(
+                "bricks have the wrong shape or type",
+                got=f"{c.shape}, {v.shape} {v.dtype}",
+                wanted=f"(n, 3) and (n, {BRICK_VOXELS}) int16",
+            )
+        half = self.pool.half // BRICK_EDGE
+        if len(c) == 0:
+            return
+        if c.min() < -half or c.max() >= half:
+            k = int(np.argwhere((c < -half) | (c >= half))[0][0])
+            raise GridError(
+                f"brick {k} lies outside the addressable cube of {self.pool.levels} levels",
+                got=c[k].tolist(),
+                wanted=f"[{-half}, {half})",
+            )
+        u = c + half
+        keys = (u[:, 2] << 40) | (u[:, 1] << 20) | u[:, 0]
+        if len(np.unique(keys)) != len(keys):
+            raise GridError("a brick stands twice in one write", wanted="each brick once")
+        pool = self.pool
+        with pool.lock:
+            pool.reserve(len(c) * (pool.levels - 1), len(c))
+            own_grids((self,), pool)
+            write_bricks(
+                self.root,
+                keys,
+                v,
+                self.model.threshold_step,
+                pool.levels,
+                *pool.tree_arrays(),
+                *pool.store_arrays(),
+            )
+
+    # --- reading ---------------------------------------------------------------------------------------------
+
+    def _bricks(self) -> npt.NDArray[np.int64]:
+        """Packed coordinates and ids of the bricks, ``(n, 2)``, ascending; hold the pool's lock."""
+        pool = self.pool
+        if self.root == 0:
+            return np.zeros((0, 2), np.int64)
+        n = list_bricks(self.root, pool.levels, pool.children, np.zeros((0, 2), np.int64))
+        out = np.empty((n, 2), np.int64)
+        list_bricks(self.root, pool.levels, pool.children, out)
+        return out[np.argsort(out[:, 0])]
+
+    def brick_coordinates(self) -> npt.NDArray[np.int64]:
+        """Signed coordinates of the bricks ``(n, 3)``, ascending in (z, y, x); brick b holds voxels 8b … 8b + 7."""
+        with self.pool.lock:
+            keys = self._bricks()[:, 0]
+        half = self.pool.half // BRICK_EDGE
+        return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1) - half
+
+    def brick_values(self) -> npt.NDArray[np.int16]:
+        """Values of the bricks ``(n, 512)``, in the order of :meth:`brick_coordinates`, in units of `layout.STEP`."""
+        with self.pool.lock:
+            ids = self._bricks()[:, 1]
+            out = np.empty((len(ids), BRICK_VOXELS), np.int16)
+            gather_bricks(np.ascontiguousarray(ids), self.pool.bricks, out)
+        return out
+
+    def values_at(self, points: Any) -> npt.NDArray[np.int16]:
+        """Values of the voxels points lie in ``(n,)``, in units of `layout.STEP`; `layout.UNKNOWN` where nothing is
+        known, outside the addressable cube, and for points that are not finite."""
+        p = point_rows(points, self.dim, self.voxel_size)
+        out = np.empty(len(p), np.int16)
+        with self.pool.lock:
+            read_values(
+                self.root, p, 1.0 / self.voxel_size, self.pool.half, self.pool.levels, self.pool.children,
+                self.pool.bricks, out,
+            )  # fmt: skip
+        return out
+
+    def __repr__(self) -> str:
+        state = ", locked" if self.locked else ""
+        return f"EvidenceGrid({self.voxel_size:g} m, {self.dim}-D, {len(self.brick_coordinates())} bricks{state})"
+
+
+_new = object.__new__  # a name of the module: copying is counted in tenths of microseconds
+
+
+def half_size(grid: EvidenceGrid) -> Array:
+    """Corners of the addressable cube, ``±`` [m]."""
+    return np.full(3, grid.pool.half * grid.voxel_size)

@@ -1,0 +1,197 @@
+"""The pool of nodes and bricks that any number of evidence grids share.
+
+Deferred reference counting (SegSLAM's DRCO): copying a grid touches nothing here; the copy is paid for by whichever
+side writes first, and only for what it writes. Maps that died are given back at the next use of the pool, in one call,
+because a finaliser may run at any moment, also while a kernel works on these arrays.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError
+from graphslam.evidence.compile import announce_compilation
+from graphslam.evidence.layout import BRICK_VOXELS, CHILDREN, DEFAULT_LEVELS, MAX_LEVELS, UNKNOWN, half_edge
+from graphslam.evidence.scratch import Scratch
+from graphslam.evidence.tree_kernels import (
+    BRICKS_FREE,
+    BRICKS_USED,
+    NODES_FREE,
+    NODES_USED,
+    own_roots,
+    release_roots,
+)
+
+NODE_BYTES = 4 * CHILDREN + 4 + 8
+BRICK_BYTES = 2 * BRICK_VOXELS + 4 + 2
+
+Ints = npt.NDArray[np.int64]
+
+
+class RootBox:
+    """Owner of one tree; grids that were copied from each other hold the same box until one of them writes."""
+
+    __slots__ = ("dead", "root", "shared")
+
+    def __init__(self, root: int, dead: deque[int]) -> None:
+        self.root = root
+        self.shared = False
+        self.dead = dead
+
+    def __del__(self) -> None:
+        if self.root:
+            self.dead.append(self.root)  # atomic; the pool takes it from there
+
+
+class GridPool:
+    """Shared storage of evidence grids.
+
+    Parameters
+    ----------
+    levels : int
+        Levels of nodes over the bricks, 2 … 7: the addressable cube has ``8·4**levels`` voxels a side (8,192 at the
+        default of 5, which is 819 m of 0.1 m voxels).
+
+    Raises
+    ------
+    GridError
+        An impossible number of levels.
+    """
+
+    def __init__(self, levels: int = DEFAULT_LEVELS) -> None:
+        if not (isinstance(levels, int) and 2 <= levels <= MAX_LEVELS):
+            raise GridError("impossible number of tree levels", got=levels, wanted=f"2 … {MAX_LEVELS}")
+        announce_compilation()
+        self.levels = levels
+        self.half = half_edge(levels)
+        self.lock = threading.RLock()
+        self.counters = np.array([1, 0, 1, 0], np.int64)  # node 0 and brick 0 are "absent"
+        self.children = np.zeros((64, CHILDREN), np.int32)
+        self.node_ref = np.zeros(64, np.int32)
+        self.node_occupied = np.zeros(64, np.uint64)
+        self.node_free = np.zeros(64, np.int32)
+        self.bricks = np.full((64, BRICK_VOXELS), UNKNOWN, np.int16)
+        self.brick_ref = np.zeros(64, np.int32)
+        self.brick_lines = np.zeros(64, np.uint16)
+        self.brick_free = np.zeros(64, np.int32)
+        self.dead: deque[int] = deque()
+        self._scratches: list[Scratch] = []
+
+    def tree_arrays(self) -> tuple[Any, ...]:
+        """``(children, node_ref, node_occupied, bricks, brick_ref, brick_lines)``; hold `lock` while they are used."""
+        return self.children, self.node_ref, self.node_occupied, self.bricks, self.brick_ref, self.brick_lines
+
+    def store_arrays(self) -> tuple[Any, ...]:
+        """``(node_free, brick_free, counters)``: what taking and dropping needs besides."""
+        return self.node_free, self.brick_free, self.counters
+
+    def scratch(self, thread: int) -> Scratch:
+        """Scratch memory of a thread of an update."""
+        while len(self._scratches) <= thread:
+            self._scratches.append(Scratch())
+        return self._scratches[thread]
+
+    # --- room ------------------------------------------------------------------------------------------------
+
+    def reserve(self, nodes: int, bricks: int) -> None:
+        """Make room for so many new nodes and bricks. All of it or, if memory is short, nothing."""
+        c = self.counters
+        more_nodes = nodes - (len(self.node_ref) - c[NODES_USED] + c[NODES_FREE])
+        more_bricks = bricks - (len(self.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
+        if more_nodes > 0:
+            n = len(self.node_ref) + max(int(more_nodes), len(self.node_ref) // 2)
+            grown = tuple(_longer(a, n) for a in (self.children, self.node_ref, self.node_occupied, self.node_free))
+            self.children, self.node_ref, self.node_occupied, self.node_free = grown
+        if more_bricks > 0:
+            n = len(self.brick_ref) + max(int(more_bricks), len(self.brick_ref) // 2)
+            grown = tuple(_longer(a, n) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free))
+            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = grown
+
+    @property
+    def used_nodes(self) -> int:
+        """Nodes of living grids."""
+        with self.lock:
+            self.collect()
+            return int(self.counters[NODES_USED] - 1 - self.counters[NODES_FREE])
+
+    @property
+    def used_bricks(self) -> int:
+        """Bricks of living grids."""
+        with self.lock:
+            self.collect()
+            return int(self.counters[BRICKS_USED] - 1 - self.counters[BRICKS_FREE])
+
+    @property
+    def used_bytes(self) -> int:
+        """Memory of living grids, shared parts once [bytes]."""
+        return self.used_nodes * NODE_BYTES + self.used_bricks * BRICK_BYTES
+
+    @property
+    def nbytes(self) -> int:
+        """Memory set aside [bytes]; what was never used of it is not in the machine's memory yet."""
+        return sum(a.nbytes for a in (*self.tree_arrays(), *self.store_arrays()))
+
+    # --- ownership -------------------------------------------------------------------------------------------
+
+    def collect(self) -> None:
+        """Give back the maps that died since."""
+        if not self.dead:
+            return
+        with self.lock:
+            roots = []
+            while self.dead:
+                roots.append(self.dead.popleft())
+            release_roots(
+                np.array(roots, np.int64),
+                self.levels,
+                self.children,
+                self.node_ref,
+                self.brick_ref,
+                self.node_free,
+                self.brick_free,
+                self.counters,
+            )
+
+    def own(self, boxes: list[RootBox]) -> list[RootBox]:
+        """Boxes that may be written to, one for each: the same, or a new one with a copied root. Hold `lock`.
+
+        The callers' old boxes must be dropped before :meth:`collect` is called, which makes the children of roots that
+        nobody else holds writable again.
+        """
+        foreign = [k for k, box in enumerate(boxes) if box.shared or not box.root]
+        if not foreign:
+            return boxes
+        self.reserve(len(foreign), 0)
+        roots = np.array([boxes[k].root for k in foreign], np.int64)
+        own_roots(
+            roots,
+            np.ones(len(foreign), np.uint8),
+            self.levels,
+            self.children,
+            self.node_ref,
+            self.node_occupied,
+            self.brick_ref,
+            self.node_free,
+            self.counters,
+        )
+        owned = list(boxes)
+        for k, root in zip(foreign, roots.tolist()):
+            owned[k] = RootBox(root, self.dead)
+        return owned
+
+    def __repr__(self) -> str:
+        return (
+            f"GridPool(levels={self.levels}): {self.used_nodes} nodes, {self.used_bricks} bricks, "
+            f"{self.used_bytes / 1e6:.1f} MB"
+        )
+
+
+def _longer(a: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    grown = np.empty((n, *a.shape[1:]), a.dtype)
+    grown[: len(a)] = a
+    return grown

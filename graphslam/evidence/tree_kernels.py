@@ -1,0 +1,284 @@
+"""Compiled bookkeeping of the shared node pool: allocate, own, descend, release.
+
+Arrays of the tree, always in this order: ``children (N, 64) int32``, ``node_ref (N,) int32``, ``node_occupied (N,)
+uint64``, ``bricks (B, 512) int16``, ``brick_ref (B,) int32``, ``brick_lines (B,) uint16`` (:mod:`layout`). Free
+nodes and bricks lie on the stacks ``node_free (N,)``, ``brick_free (B,)`` int32; ``counters (4,) int64`` holds [first
+node never used, free nodes on the stack, first brick never used, free bricks on the stack]. Nothing here checks
+capacity: callers reserve first, so that a tree is never left half-changed. Node 0 and brick 0 stand for "absent";
+brick 0 is all unknown, so that reading it as a source is right.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
+
+
+@numba.njit(cache=True, nogil=True)
+def free_nodes(node_free, counters):
+    """Nodes that can be taken without growing."""
+    return node_free.shape[0] - counters[NODES_USED] + counters[NODES_FREE]
+
+
+@numba.njit(cache=True, nogil=True)
+def free_bricks(brick_free, counters):
+    """Bricks that can be taken without growing."""
+    return brick_free.shape[0] - counters[BRICKS_USED] + counters[BRICKS_FREE]
+
+
+@numba.njit(cache=True, nogil=True)
+def take_node(children, node_ref, node_occupied, node_free, counters):
+    """An empty node with one parent."""
+    if counters[NODES_FREE] > 0:
+        counters[NODES_FREE] -= 1
+        n = int(node_free[counters[NODES_FREE]])
+    else:
+        n = int(counters[NODES_USED])
+        counters[NODES_USED] += 1
+    for c in range(64):
+        children[n, c] = 0
+    node_ref[n] = 1
+    node_occupied[n] = np.uint64(0)
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def take_brick(brick_ref, brick_free, counters):
+    """A brick with one parent; its voxels are whatever they were."""
+    if counters[BRICKS_FREE] > 0:
+        counters[BRICKS_FREE] -= 1
+        b = int(brick_free[counters[BRICKS_FREE]])
+    else:
+        b = int(counters[BRICKS_USED])
+        counters[BRICKS_USED] += 1
+    brick_ref[b] = 1
+    return b
+
+
+@numba.njit(cache=True, nogil=True)
+def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node_free, counters):
+    """A copy with one parent; the source has one parent less, the children one more."""
+    n = take_node(children, node_ref, node_occupied, node_free, counters)
+    for c in range(64):
+        child = children[source, c]
+        children[n, c] = child
+        if child != 0:
+            if level == 0:
+                brick_ref[child] += 1
+            else:
+                node_ref[child] += 1
+    node_occupied[n] = node_occupied[source]
+    node_ref[source] -= 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
+    """Node of level 0 over a brick, with no other parent on the way from the root: missing nodes are made, shared ones
+    copied. The root is the caller's own."""
+    node = root
+    for level in range(levels - 1, 0, -1):
+        shift = 2 * level
+        c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+        child = int(children[node, c])
+        if child == 0:
+            child = take_node(children, node_ref, node_occupied, node_free, counters)
+            children[node, c] = child
+        elif node_ref[child] > 1:
+            child = clone_node(child, level - 1, children, node_ref, node_occupied, brick_ref, node_free, counters)
+            children[node, c] = child
+        node = child
+    return node
+
+
+@numba.njit(cache=True, nogil=True)
+def find_node(root, bx, by, bz, levels, children):
+    """Node of level 0 over a brick, or 0."""
+    node = root
+    for level in range(levels - 1, 0, -1):
+        shift = 2 * level
+        c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+        node = int(children[node, c])
+        if node == 0:
+            return 0
+    return node
+
+
+@numba.njit(cache=True, nogil=True)
+def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
+    """Write on the path from the root whether a brick holds an occupied voxel. The path is the caller's own."""
+    path = np.empty(8, np.int64)
+    path[levels - 1] = root
+    for level in range(levels - 1, 0, -1):
+        shift = 2 * level
+        c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+        path[level - 1] = children[path[level], c]
+    bit = occupied
+    for level in range(levels):
+        shift = 2 * level
+        c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+        node = path[level]
+        mask = np.uint64(1) << np.uint64(c)
+        before = node_occupied[node]
+        if bit:
+            after = before | mask
+        else:
+            after = before & ~mask
+        if after == before:
+            return
+        node_occupied[node] = after
+        bit = after != np.uint64(0)
+
+
+@numba.njit(cache=True, nogil=True)
+def own_roots(roots, shared, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
+    """Copy the roots ``(n,)`` marked ``shared (n,)`` (and those that are 0: empty maps), in place.
+
+    The old root keeps its parent count: other handles still hold it.
+    """
+    for k in range(roots.shape[0]):
+        if roots[k] == 0:
+            roots[k] = take_node(children, node_ref, node_occupied, node_free, counters)
+        elif shared[k]:
+            old = roots[k]
+            roots[k] = clone_node(old, levels - 1, children, node_ref, node_occupied, brick_ref, node_free, counters)
+            node_ref[old] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def drop_brick(brick, brick_ref, brick_free, counters):
+    """One parent less; the last one frees it."""
+    brick_ref[brick] -= 1
+    if brick_ref[brick] == 0:
+        brick_free[counters[BRICKS_FREE]] = brick
+        counters[BRICKS_FREE] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick_free, counters):
+    """Give back trees; what other trees share stays."""
+    # at most 63 siblings wait on each level, besides the node itself
+    stack = np.empty(64 * 8, np.int64)
+    depth = np.empty(64 * 8, np.int64)
+    for k in range(roots.shape[0]):
+        stack[0], depth[0] = roots[k], levels - 1
+        n = 1
+        while n > 0:
+            n -= 1
+            node, level = stack[n], depth[n]
+            node_ref[node] -= 1
+            if node_ref[node] > 0:
+                continue
+            for c in range(64):
+                child = int(children[node, c])
+                if child == 0:
+                    continue
+                if level == 0:
+                    drop_brick(child, brick_ref, brick_free, counters)
+                else:
+                    stack[n], depth[n] = child, level - 1
+                    n += 1
+            node_free[counters[NODES_FREE]] = node
+            counters[NODES_FREE] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def list_bricks(root, levels, children, out):
+    """Number of bricks below a root; fills ``out (n, 2)`` [packed offset coordinates, brick] where it has rows."""
+    stack = np.empty((64 * 8, 5), np.int64)  # node, level, coordinates of its corner in bricks
+    stack[0, 0], stack[0, 1] = root, levels - 1
+    stack[0, 2], stack[0, 3], stack[0, 4] = 0, 0, 0
+    n, found = 1, 0
+    while n > 0:
+        n -= 1
+        node, level = stack[n, 0], stack[n, 1]
+        x, y, z = stack[n, 2], stack[n, 3], stack[n, 4]
+        shift = 2 * level
+        for c in range(64):
+            child = int(children[node, c])
+            if child == 0:
+                continue
+            cx, cy, cz = x + ((c & 3) << shift), y + (((c >> 2) & 3) << shift), z + ((c >> 4) << shift)
+            if level == 0:
+                if found < out.shape[0]:
+                    out[found, 0] = (cz << 40) | (cy << 20) | cx
+                    out[found, 1] = child
+                found += 1
+            else:
+                stack[n, 0], stack[n, 1] = child, level - 1
+                stack[n, 2], stack[n, 3], stack[n, 4] = cx, cy, cz
+                n += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def gather_bricks(ids, bricks, out):
+    """Copy bricks to rows of ``out (n, 512)``."""
+    for k in range(ids.shape[0]):
+        out[k] = bricks[ids[k]]
+
+
+@numba.njit(cache=True, nogil=True)
+def read_values(root, points, scale, half, levels, children, bricks, out):
+    """Values of the voxels that points ``(n, 3)`` lie in."""
+    edge = 2.0 * half
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] * scale + half, points[k, 1] * scale + half, points[k, 2] * scale + half
+        out[k] = -32768
+        if root == 0 or not (0.0 <= x < edge and 0.0 <= y < edge and 0.0 <= z < edge):
+            continue
+        i, j, l = int(x), int(y), int(z)
+        parent = find_node(root, i >> 3, j >> 3, l >> 3, levels, children)
+        if parent == 0:
+            continue
+        b = int(children[parent, (((l >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((i >> 3) & 3)])
+        out[k] = bricks[b, ((l & 7) << 6) | ((j & 7) << 3) | (i & 7)]
+
+
+@numba.njit(cache=True, nogil=True)
+def occupied_lines(brick, threshold, bricks):
+    """Bits of the lines of a brick that hold an occupied voxel."""
+    lines = 0
+    for line in range(16):
+        for j in range(32):
+            v = bricks[brick, 32 * line + j]
+            if v >= threshold and v != -32768:
+                lines |= 1 << line
+                break
+    return lines
+
+
+@numba.njit(cache=True, nogil=True)
+def write_bricks(
+    root,
+    keys,
+    values,
+    threshold,
+    levels,
+    children,
+    node_ref,
+    node_occupied,
+    bricks,
+    brick_ref,
+    brick_lines,
+    node_free,
+    brick_free,
+    counters,
+):
+    """Replace bricks (packed offset coordinates ``keys (n,)``) by ``values (n, 512)``. Root owned, room reserved."""
+    for k in range(keys.shape[0]):
+        bx, by, bz = keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40
+        parent = own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters)
+        c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
+        b = int(children[parent, c])
+        if b == 0 or brick_ref[b] > 1:
+            if b != 0:
+                brick_ref[b] -= 1
+            b = take_brick(brick_ref, brick_free, counters)
+            children[parent, c] = b
+        bricks[b] = values[k]
+        lines = occupied_lines(b, threshold, bricks)
+        brick_lines[b] = lines
+        set_occupied(root, bx, by, bz, levels, lines != 0, children, node_occupied)
