@@ -54,6 +54,8 @@ def info(name: str, as_json: bool = JSON) -> None:
         "citation": c.citation,
         "licence": c.licence,
         "terms": c.terms,
+        "reader": c.reader,
+        "options": dict(c.options),
         "caveats": list(c.caveats),
         "bytes": c.bytes,
         "files": [f.path for f in c.files],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -115,6 +116,11 @@ class Trajectory:
         """The same path in another frame; right-tangent covariances do not change."""
         f = se2_compose if self.dim == 2 else se3.se3_compose
         return replace(self, poses=f(np.broadcast_to(T_new_frame, self.poses.shape), self.poses))
+
+    def take(self, index: Any) -> Trajectory:
+        """The poses ``index`` (slice, mask or integer array) as a path: a trajectory can be a stream of a log."""
+        covariances = None if self.covariances is None else self.covariances[index]
+        return replace(self, times=self.times[index], poses=self.poses[index], covariances=covariances)
 
     def length(self) -> float:
         """Length of the path [m]."""

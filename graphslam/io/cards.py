@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from html import escape
 from pathlib import Path, PurePosixPath
@@ -88,6 +88,8 @@ class Card:
     archives : tuple of CardArchive
     reader : str or None
         Name in :data:`graphslam.io.catalog.READERS`.
+    options : mapping of str to float
+        What the reader must be told of this set, because its files do not say it.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Card:
     files: tuple[CardFile, ...]
     archives: tuple[CardArchive, ...] = ()
     reader: str | None = None
+    options: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     @property
     def bytes(self) -> int:
@@ -229,6 +232,8 @@ def _build(kind: Any, values: Mapping[str, Any], where: str) -> Any:
         good = (
             isinstance(value, list) and all(isinstance(v, str) for v in value)
             if text == "tuple[str, ...]"
+            else isinstance(value, dict) and all(type(v) in (int, float) for v in value.values())
+            if text.startswith("Mapping")
             else isinstance(value, tuple)
             if text.startswith("tuple")
             else isinstance(value, bool)

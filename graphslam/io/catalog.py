@@ -61,6 +61,7 @@ READERS: dict[str, Reader] = {
         "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
     ),
     "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
+    "lidar-pack": Reader("graphslam.io.lidar_pack:read_lidar_pack", ("xyz_i16_planar.npy.xz", "xyz_i16_planar.npy")),
 }
 """Readers of folders by name. A pose network is a file: :func:`load` gives its path."""
 
@@ -191,7 +192,7 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
             return _only_file(c)
         if c.reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
-        return READERS[c.reader](locate(c), **options)
+        return READERS[c.reader](locate(c), **{**c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
         c = card(name)
@@ -200,7 +201,7 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
             return _named_file(c, part)
         if part not in parts:
             raise UnknownNameError(f"part of data set {name!r}", part, parts)
-        return READERS[str(c.reader)](locate(c), **{**parts[part], **options})
+        return READERS[str(c.reader)](locate(c), **{**c.options, **parts[part], **options})
     path = Path(text)
     if path.is_file():
         return path

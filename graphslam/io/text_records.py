@@ -74,8 +74,17 @@ def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
     raise MissingDataError("no such file", where=str(Path(folder) / name), wanted=f"{name}, plain or with {endings}")
 
 
-def read_table(path: str | os.PathLike[str], columns: int) -> tuple[Array, npt.NDArray[np.int64]]:
+def read_table(
+    path: str | os.PathLike[str], columns: int, *, separator: str | None = None
+) -> tuple[Array, npt.NDArray[np.int64]]:
     """Rows of ``columns`` numbers, one a line; blank lines and lines that begin with ``#`` are skipped.
+
+    Parameters
+    ----------
+    path : path
+    columns : int
+    separator : str, optional
+        What stands between numbers, and perhaps after the last one; white space by default.
 
     Returns
     -------
@@ -94,8 +103,8 @@ def read_table(path: str | os.PathLike[str], columns: int) -> tuple[Array, npt.N
     rows: list[list[str]] = []
     lines: list[int] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+        words = line.split() if separator is None else line.strip().removesuffix(separator).split(separator)
+        if not line.strip() or words[0].startswith("#"):
             continue
         if len(words) != columns:
             raise FormatError(

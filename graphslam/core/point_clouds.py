@@ -1,0 +1,157 @@
+"""A stream of 3-D lidar scans whose points are decoded only when they are asked for.
+
+A recording holds 10⁷ points and more; a log is opened to look at its stamps far more often than at its points. The
+stream therefore keeps a *source*, which gives the points of one scan at a time, and an index into it, so that slicing
+a log copies no point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.records import check_times
+
+
+class CloudSource(Protocol):
+    """Where the points of a :class:`PointClouds` come from."""
+
+    @property
+    def counts(self) -> npt.NDArray[np.int64]:
+        """Points stored of every scan ``(n,)``, missing returns included; known without decoding any."""
+        ...
+
+    def cloud(self, k: int) -> Array:
+        """Points ``(m, 3)`` of scan ``k`` [m], sensor frame, all finite; m may be less than ``counts[k]``."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayClouds:
+    """Points held in memory.
+
+    Parameters
+    ----------
+    points : (q, 3)
+        Metres, sensor frame, all finite.
+    offsets : (n + 1,) int64
+        Points of scan k are rows ``offsets[k]:offsets[k + 1]``.
+
+    Raises
+    ------
+    DataError
+        Offsets that do not partition the points; a point that is not finite.
+    """
+
+    points: Array
+    offsets: npt.NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        points = np.ascontiguousarray(self.points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise GeometryError("points have the wrong shape", got=points.shape, wanted="(q, 3)")
+        if not np.all(np.isfinite(points)):
+            k = int(np.argwhere(~np.isfinite(points))[0][0])
+            raise DataError(f"point {k} is not finite", got=points[k], wanted="finite numbers")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "offsets", check_offsets(self.offsets, len(points)))
+
+    @property
+    def counts(self) -> npt.NDArray[np.int64]:
+        """See :class:`CloudSource`."""
+        return np.diff(self.offsets)
+
+    def cloud(self, k: int) -> Array:
+        """See :class:`CloudSource`."""
+        return self.points[self.offsets[k] : self.offsets[k + 1]]
+
+
+def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:
+    """Validate ``(n + 1,)`` offsets that partition ``total`` rows: from 0, not decreasing, to ``total``.
+
+    Raises
+    ------
+    DataError
+    """
+    a = np.asarray(offsets)
+    if a.ndim != 1 or len(a) < 1 or a.dtype.kind not in "iu":
+        raise DataError(
+            "offsets have the wrong shape or type", where=where, got=f"{a.dtype} {a.shape}", wanted="(n+1,)"
+        )
+    a = np.ascontiguousarray(a, dtype=np.int64)
+    if a[0] != 0 or np.any(np.diff(a) < 0):
+        k = 0 if a[0] != 0 else int(np.flatnonzero(np.diff(a) < 0)[0]) + 1
+        raise DataError(
+            f"offset {k} is impossible", where=where, got=int(a[k]), wanted="offsets that begin with 0 and never fall"
+        )
+    if a[-1] != total:
+        raise DataError("offsets do not match the points", where=where, got=int(a[-1]), wanted=f"{total}, the last one")
+    return a
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointClouds:
+    """Scans of a 3-D lidar.
+
+    Parameters
+    ----------
+    times : (n,)
+    source : CloudSource
+    index : (n,) int64, optional
+        Scan of the source that each record is; all in order by default.
+    origin : (3,)
+        Where the beams of a scan begin, in the frame of its points [m].
+    T_base_sensor : (7,)
+        Frame of the points in the base.
+    """
+
+    times: Array
+    source: CloudSource
+    index: npt.NDArray[np.int64] | None = None
+    origin: Array = field(default_factory=lambda: np.zeros(3))
+    T_base_sensor: Array = field(default_factory=lambda: np.array([0.0, 0, 0, 0, 0, 0, 1]))
+
+    def __post_init__(self) -> None:
+        known = len(self.source.counts)
+        index = np.arange(known) if self.index is None else np.asarray(self.index)
+        if index.ndim != 1 or (len(index) and (index.min() < 0 or index.max() >= known)):
+            raise DataError("index names scans that the source has not", got=index.shape, wanted=f"0 … {known - 1}")
+        object.__setattr__(self, "index", np.ascontiguousarray(index, dtype=np.int64))
+        object.__setattr__(self, "times", check_times(self.times, len(index)))
+        for name, n in (("origin", 3), ("T_base_sensor", 7)):
+            a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if a.shape != (n,) or not np.all(np.isfinite(a)):
+                raise GeometryError(f"{name} is impossible", got=a, wanted=f"{n} finite numbers")
+            object.__setattr__(self, name, a)
+
+    @classmethod
+    def from_arrays(cls, times: Any, points: Any, offsets: Any, **rest: Any) -> PointClouds:
+        """Scans held in memory; see :class:`ArrayClouds` for the arguments."""
+        return cls(times=times, source=ArrayClouds(points, offsets), **rest)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def counts(self) -> npt.NDArray[np.int64]:
+        """Points stored of every scan ``(n,)``."""
+        return self.source.counts[self.index]
+
+    def cloud(self, k: int) -> Array:
+        """Points ``(m, 3)`` of record ``k`` [m], sensor frame; decodes what is needed."""
+        assert self.index is not None
+        return self.source.cloud(int(self.index[k]))
+
+    def __iter__(self) -> Iterator[Array]:
+        return (self.cloud(k) for k in range(len(self)))
+
+    def take(self, index: Any) -> PointClouds:
+        """See :class:`graphslam.core.records.Stream`; no point is read."""
+        assert self.index is not None
+        return replace(self, times=self.times[index], index=self.index[index])
