@@ -9,8 +9,8 @@ import numpy as np
 from graphslam.app.merge import MergedMap
 from graphslam.app.outputs import landmarks_csv
 from graphslam.app.run_folder import RunFolder
+from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
-from graphslam.io.atomic import write_npz
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
 

@@ -13,13 +13,13 @@ import pandas as pd
 from graphslam.app.figures import save_figures
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
+from graphslam.core.atomic import read_json, read_npz, write_npz
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 from graphslam.graph.network import to_network
-from graphslam.io.atomic import read_json, read_npz, write_npz
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.config import dump_toml
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import RunFolderError
-from graphslam.io.atomic import atomic_open
 from graphslam.io.submap_store import SubmapStore
 
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from graphslam.core.atomic import atomic_open, read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.io.atomic import atomic_open, read_json, read_npz, write_json, write_npz
 
 logger = logging.getLogger(__name__)
 

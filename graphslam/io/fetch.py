@@ -8,8 +8,8 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError, FormatError, MissingDataError
-from graphslam.io.atomic import atomic_open
 from graphslam.io.cards import Card, CardArchive, CardFile, card
 from graphslam.io.catalog import cache_folder, check_file, data_roots
 

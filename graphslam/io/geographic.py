@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
-from graphslam.io.atomic import atomic_open
 
 KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
 _DIGITS = 9  # of a degree: 0.1 mm

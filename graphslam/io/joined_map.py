@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.atomic import read_npz, write_npz
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.atomic import read_npz, write_npz
 from graphslam.io.tum import write_tum
 
 JOINED_FORMAT = "graphslam.joined/1"

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError, GraphSlamError
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import (
@@ -27,7 +28,6 @@ from graphslam.core.records import (
     VelocityControls,
 )
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.atomic import read_json, read_npz, write_json, write_npz
 
 LOG_FORMAT = "graphslam.log/1"
 STREAM_FORMAT = "graphslam.stream/1"

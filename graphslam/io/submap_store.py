@@ -16,10 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import DensePayload, Submap
-from graphslam.io.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.io.submap_file import SUBMAP_FORMAT, submap_arrays, submap_from_arrays
 
 logger = logging.getLogger(__name__)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.core import se3
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.atomic import atomic_open
 
 # Files in the wild print quaternions with as few as three digits.
 _NORM_TOLERANCE = 1e-2

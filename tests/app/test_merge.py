@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 import graphslam
 from graphslam.app.cli import app
+from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, DataError, RunFolderError
 from graphslam.core.geometry import se2_between
-from graphslam.io.atomic import read_npz
 from graphslam.io.tum import read_tum
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import graphslam as gs
+from graphslam.core.atomic import read_npz
 from graphslam.core.errors import EvidenceReusedError, MissingDataError, RunFolderError, UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.io.atomic import read_npz
 from graphslam.io.tum import read_tum
 
 FILES = {

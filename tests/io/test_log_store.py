@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from graphslam.core.atomic import atomic_open, write_npz
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import (
@@ -22,7 +23,6 @@ from graphslam.core.records import (
     VelocityControls,
 )
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.atomic import atomic_open, write_npz
 from graphslam.io.log_store import load_log, save_log
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 
