@@ -16,7 +16,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
-from graphslam.evidence.batch_kernels import apply_grids, drop_sources, mark_grids, resolve_grids
+from graphslam.evidence.batch_kernels import apply_grids, mark_grids, resolve_grids
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
 from graphslam.evidence.update_kernels import (
@@ -29,6 +29,7 @@ from graphslam.evidence.update_kernels import (
     OUTSIDE,
     RAYS,
     ZERO_LENGTH,
+    drop_sources,
 )
 from graphslam.evidence.update_kernels import update_grids as update_kernel
 
@@ -170,6 +171,7 @@ def _insert_serial(
             scratch.slot_next,
             scratch.marks,
             scratch.marks64,
+            scratch.work,
             tally,
         )
         if done == len(roots):

@@ -9,10 +9,8 @@ otherwise write in place while another thread still copies from it. Arrays as in
 from __future__ import annotations
 
 import numba
-import numpy as np
 
-from graphslam.evidence.tree_kernels import drop_brick
-from graphslam.evidence.update_kernels import apply_marks, mark_scan, note_occupied, resolve_brick
+from graphslam.evidence.update_kernels import apply_slots, mark_scan, resolve_slots
 
 
 @numba.njit(cache=True, nogil=True)
@@ -78,27 +76,24 @@ def resolve_grids(
     counters,
 ):
     """Own the paths to all slots of grids ``begin … end-1`` of one thread's scratch. Room was reserved."""
-    out = np.zeros(7, np.int64)
-    s = 0
+    first = 0
     for g in range(begin, end):
-        out[0] = 0
-        while s < ends[g]:
-            resolve_brick(
-                roots[g],
-                slot_key[s],
-                levels,
-                children,
-                node_ref,
-                node_occupied,
-                brick_ref,
-                node_free,
-                brick_free,
-                counters,
-                out,
-            )
-            for k in range(4):
-                work[s, k] = out[k]
-            s += 1
+        resolve_slots(
+            first,
+            ends[g],
+            roots[g],
+            levels,
+            slot_key,
+            work,
+            children,
+            node_ref,
+            node_occupied,
+            brick_ref,
+            node_free,
+            brick_free,
+            counters,
+        )
+        first = ends[g]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -119,33 +114,21 @@ def apply_grids(
     brick_lines,
 ):
     """Apply the marks of grids ``begin … end-1``; touches nothing another thread does."""
-    miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
-    s = 0
+    first = 0
     for g in range(begin, end):
-        while s < ends[g]:
-            occupied = apply_marks(
-                int(work[s, 2]),
-                int(work[s, 3]),
-                s,
-                miss,
-                hit,
-                low,
-                high,
-                threshold,
-                bricks,
-                brick_lines,
-                marks,
-                marks64,
-            )
-            note_occupied(
-                roots[g], slot_key[s], levels, int(work[s, 0]), int(work[s, 1]), occupied, children, node_occupied
-            )
-            s += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def drop_sources(n, work, brick_ref, brick_free, counters):
-    """Take one parent from the bricks that were copied."""
-    for s in range(n):
-        if work[s, 2] != 0 and work[s, 2] != work[s, 3]:
-            drop_brick(int(work[s, 2]), brick_ref, brick_free, counters)
+        apply_slots(
+            first,
+            ends[g],
+            roots[g],
+            levels,
+            steps,
+            slot_key,
+            marks,
+            marks64,
+            work,
+            children,
+            node_occupied,
+            bricks,
+            brick_lines,
+        )
+        first = ends[g]

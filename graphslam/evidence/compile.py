@@ -66,6 +66,9 @@ def _uses() -> list[tuple[str, Callable[[], object]]]:
     uses: list[tuple[str, Callable[[], object]]] = [
         ("scans", lambda: grid.insert_scan(point)),
         ("threads", lambda: update_many([grid, other], poses, point, threads=2)),
+        ("merges", lambda: grid.merge(other)),
+        ("bricks", lambda: grid.write_bricks(grid.brick_coordinates(), grid.brick_values())),
+        ("values", lambda: grid.values_at(point)),
         ("clean-up", folder.cleanup),
     ]
     return uses

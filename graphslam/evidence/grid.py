@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError, GridLockedError
-from graphslam.core.geometry import Array
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
+from graphslam.evidence.merge import merge
 from graphslam.evidence.pool import GridPool, RootBox
 from graphslam.evidence.scan import UpdateReport, point_rows, pose_row, scan_rows
 from graphslam.evidence.tree_kernels import gather_bricks, list_bricks, read_values, write_bricks
@@ -116,13 +116,20 @@ class EvidenceGrid:
         """Root node in the pool, 0 of an empty grid; valid until the next write."""
         return self._box.root
 
+    def take(self, other: EvidenceGrid) -> None:
+        """Become what ``other``, a grid of the same pool and kind, is now: how a long change is made whole or not at
+        all."""
+        other._box.shared = True
+        self._box = other._box
+
     def same_as(self, other: EvidenceGrid) -> bool:
         """Whether two handles hold the very same tree (a copy that neither side has written to)."""
         return self._box is other._box or (self.root == 0 == other.root)
 
     # --- writing ---------------------------------------------------------------------------------------------
 
-    def _check_writable(self) -> None:
+    def check_writable(self) -> None:
+        """Raise `GridLockedError` if the grid is locked."""
         if self.locked:
             raise GridLockedError("this evidence grid is locked: it is localised in, not updated; unlock or copy it")
 
@@ -160,7 +167,7 @@ class EvidenceGrid:
             Impossible shapes or pose; nothing was written.
         GridLockedError
         """
-        self._check_writable()
+        self.check_writable()
         scan = scan_rows(points, origin, returns, max_range, self.dim, self.voxel_size)
         T = pose_row(pose, self.dim)[None]
         with self.pool.lock:
@@ -181,7 +188,7 @@ class EvidenceGrid:
         GridError
             Wrong shapes, a coordinate twice or outside the addressable cube; nothing was written.
         """
-        self._check_writable()
+        self.check_writable()
         c = np.ascontiguousarray(coordinates, dtype=np.int64)
         v = np.ascontiguousarray(values)
         if c.ndim != 2 or c.shape[1] != 3 or v.shape != (len(c), BRICK_VOXELS) or v.dtype != np.int16:
@@ -217,6 +224,10 @@ class EvidenceGrid:
                 *pool.tree_arrays(),
                 *pool.store_arrays(),
             )
+
+    def merge(self, other: EvidenceGrid, pose: Any = None) -> int:
+        """Add the log-odds of another map under ``T_self_other``; see `merge.merge`."""
+        return merge(self, other, pose)
 
     # --- reading ---------------------------------------------------------------------------------------------
 
@@ -263,8 +274,3 @@ class EvidenceGrid:
 
 
 _new = object.__new__  # a name of the module: copying is counted in tenths of microseconds
-
-
-def half_size(grid: EvidenceGrid) -> Array:
-    """Corners of the addressable cube, ``±`` [m]."""
-    return np.full(3, grid.pool.half * grid.voxel_size)

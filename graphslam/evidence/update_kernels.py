@@ -6,7 +6,8 @@ of any extent). Applying resolves the path to each touched brick once (copy-on-w
 voxels. A scan that is half marked has changed no map, and applying cannot fail, since room was reserved before.
 
 Scratch arrays: ``window (64³,) int32`` first slot of an entry or -1, ``slot_key (S,) int64`` packed brick coordinates,
-``slot_next (S,) int32`` next slot of the entry or -1, ``marks (S, 512) uint8``; between scans the window is all -1 and
+``slot_next (S,) int32`` next slot of the entry or -1, ``marks (S, 512) uint8``
+(``marks64 (S, 64)`` is the same memory), ``work (S, 4) int32``; between scans the window is all -1 and
 the marks are all 0. Scans are ``points (n, 3)``, ``origins (n, 3) or (1, 3)``, ``returns (n,) or (0,) uint8``; poses
 ``(12,)`` are R row by row, then t [m].
 """
@@ -18,15 +19,23 @@ import math
 import numba
 import numpy as np
 
-from graphslam.evidence.tree_kernels import drop_brick, free_bricks, free_nodes, own_parent, set_occupied, take_brick
+from graphslam.evidence.tree_kernels import (
+    clone_node,
+    drop_brick,
+    free_bricks,
+    free_nodes,
+    set_occupied,
+    take_brick,
+    take_node,
+)
 
 # what a tally counts, per call
 RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS, NEED_NODES, NEED_BRICKS = 0, 1, 2, 3, 4, 5, 6, 7, 8
 
 
 @numba.njit(cache=True, nogil=True)
-def find_slot(bx, by, bz, n, window, slot_key, slot_next):
-    """Slot of a brick, or -1; -2 - entry would be ambiguous, so the caller asks :func:`add_slot` to make one."""
+def find_slot(bx, by, bz, window, slot_key, slot_next):
+    """Slot of a brick, or -1."""
     key = (bz << 40) | (by << 20) | bx
     s = int(window[((bz & 63) << 12) | ((by & 63) << 6) | (bx & 63)])
     while s >= 0 and slot_key[s] != key:
@@ -119,7 +128,7 @@ def mark_scan(pose, points, origins, returns, max_range, scale, half, first, win
         while steps > 0:
             if (x >> 3) != bx or (y >> 3) != by or (z >> 3) != bz:
                 bx, by, bz = x >> 3, y >> 3, z >> 3
-                slot = find_slot(bx, by, bz, n, window, slot_key, slot_next)
+                slot = find_slot(bx, by, bz, window, slot_key, slot_next)
                 if slot < 0:
                     if n == capacity:
                         full = True
@@ -151,7 +160,7 @@ def mark_scan(pose, points, origins, returns, max_range, scale, half, first, win
             break
         if hit:
             bx, by, bz = ex >> 3, ey >> 3, ez >> 3
-            slot = find_slot(bx, by, bz, n, window, slot_key, slot_next)
+            slot = find_slot(bx, by, bz, window, slot_key, slot_next)
             if slot < 0:
                 if n == capacity:
                     full = True
@@ -171,104 +180,148 @@ def mark_scan(pose, points, origins, returns, max_range, scale, half, first, win
 
 
 @numba.njit(cache=True, nogil=True)
-def apply_line(source, target, line, row, miss, hit, low, high, threshold, bricks):
-    """One line of 32 voxels from one brick to another; returns whether it holds an occupied voxel.
-
-    Arithmetic stays in int16 after each operation, or it is not vectorised; the model's range keeps it from overflow.
-    """
-    src = bricks[source, 32 * line : 32 * line + 32]
-    dst = bricks[target, 32 * line : 32 * line + 32]
-    m = row[32 * line : 32 * line + 32]
-    occupied = np.int16(0)
-    for j in range(32):
-        v = src[j]
-        base = np.int16(0) if v == np.int16(-32768) else v
-        w = np.int16(base + (hit if m[j] >= 2 else miss))
-        w = low if w < low else w
-        w = high if w > high else w
-        w = w if m[j] != 0 else v
-        dst[j] = w
-        occupied |= np.int16(1) if w >= threshold else np.int16(0)
-    return occupied != 0
-
-
-@numba.njit(cache=True, nogil=True)
-def apply_line_in_place(target, line, row, miss, hit, low, high, threshold, bricks):
-    """As :func:`apply_line` on one brick; reading and writing through one name is what lets it be vectorised."""
-    dst = bricks[target, 32 * line : 32 * line + 32]
-    m = row[32 * line : 32 * line + 32]
-    occupied = np.int16(0)
-    for j in range(32):
-        v = dst[j]
-        base = np.int16(0) if v == np.int16(-32768) else v
-        w = np.int16(base + (hit if m[j] >= 2 else miss))
-        w = low if w < low else w
-        w = high if w > high else w
-        w = w if m[j] != 0 else v
-        dst[j] = w
-        occupied |= np.int16(1) if w >= threshold else np.int16(0)
-    return occupied != 0
-
-
-@numba.njit(cache=True, nogil=True)
-def apply_marks(source, target, slot, miss, hit, low, high, threshold, bricks, brick_lines, marks, marks64):
-    """Write ``target`` = ``source`` updated by the marks of a slot, which are cleared; lines without marks are copied.
-
-    Brick 0 as a source is a brick nobody has seen. Returns whether the brick holds an occupied voxel.
-    """
-    lines = int(brick_lines[source])
-    row = marks[slot]
-    words = marks64[slot]
-    for line in range(16):
-        k = 4 * line
-        if (words[k] | words[k + 1] | words[k + 2] | words[k + 3]) == np.uint64(0):
-            if source != target:
-                bricks[target, 32 * line : 32 * line + 32] = bricks[source, 32 * line : 32 * line + 32]
-            continue
-        if source == target:
-            occupied = apply_line_in_place(target, line, row, miss, hit, low, high, threshold, bricks)
-        else:
-            occupied = apply_line(source, target, line, row, miss, hit, low, high, threshold, bricks)
-        for i in range(4):
-            words[k + i] = np.uint64(0)
-        if occupied:
-            lines |= 1 << line
-        else:
-            lines &= ~(1 << line)
-    brick_lines[target] = lines
-    return lines != 0
-
-
-@numba.njit(cache=True, nogil=True)
-def resolve_brick(
-    root, key, levels, children, node_ref, node_occupied, brick_ref, node_free, brick_free, counters, out
+def resolve_slots(
+    begin,
+    end,
+    root,
+    levels,
+    slot_key,
+    work,
+    children,
+    node_ref,
+    node_occupied,
+    brick_ref,
+    node_free,
+    brick_free,
+    counters,
 ):
-    """Own the path to a brick and a brick of one's own at its end: ``out`` = [parent node, child, source, target].
+    """Own the paths to the bricks of slots ``begin … end-1`` and a brick at the end of each; room was reserved.
 
-    Source equals target where the brick is nobody else's; a copied brick has still all its parents (the caller takes
-    one away when it has read it).
+    ``work (S, 4)`` becomes [parent node, child, source, target]. Source equals target where the brick is nobody
+    else's; a copied brick keeps all its parents until :func:`drop_sources`, when everybody has read it. One function
+    with the loop inside: handing a dozen arrays to a function for every brick would cost more than the work.
     """
-    bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
-    if out[0] == 0 or (bx >> 2) != out[4] or (by >> 2) != out[5] or (bz >> 2) != out[6]:
-        out[0] = own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters)
-        out[4], out[5], out[6] = bx >> 2, by >> 2, bz >> 2
-    parent = out[0]
-    c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
-    out[1] = c
-    source = int(children[parent, c])
-    out[2] = source
-    if source != 0 and brick_ref[source] == 1:
-        out[3] = source
-    else:
-        out[3] = take_brick(brick_ref, brick_free, counters)
-        children[parent, c] = out[3]
+    path = np.empty(8, np.int64)
+    path[levels - 1] = root
+    px, py, pz = 0, 0, 0
+    known = levels - 1  # lowest level at which path holds
+    for s in range(begin, end):
+        key = slot_key[s]
+        bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
+        # climb to the lowest node that this brick shares with the last one
+        differ = ((bx ^ px) | (by ^ py) | (bz ^ pz)) >> 2
+        level = known
+        if level == 0:
+            while differ != 0:
+                differ >>= 2
+                level += 1
+        px, py, pz = bx, by, bz
+        known = 0
+        while level > 0:
+            shift = 2 * level
+            c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+            node = path[level]
+            child = np.int64(children[node, c])
+            level -= 1
+            if child == 0:
+                child = take_node(children, node_ref, node_occupied, node_free, counters)
+                children[node, c] = child
+            elif node_ref[child] > 1:
+                child = clone_node(child, level, children, node_ref, node_occupied, brick_ref, node_free, counters)
+                children[node, c] = child
+            path[level] = child
+        parent = path[0]
+        c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
+        source = np.int64(children[parent, c])
+        target = source
+        if source == 0 or brick_ref[source] > 1:
+            target = take_brick(brick_ref, brick_free, counters)
+            children[parent, c] = target
+        work[s, 0] = parent
+        work[s, 1] = c
+        work[s, 2] = source
+        work[s, 3] = target
 
 
 @numba.njit(cache=True, nogil=True)
-def note_occupied(root, key, levels, parent, c, occupied, children, node_occupied):
-    """Carry a brick's flag up the tree where it changed."""
-    if (((node_occupied[parent] >> np.uint64(c)) & np.uint64(1)) != np.uint64(0)) != occupied:
-        set_occupied(root, key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40, levels, occupied, children, node_occupied)
+def apply_slots(
+    begin,
+    end,
+    root,
+    levels,
+    steps,
+    slot_key,
+    marks,
+    marks64,
+    work,
+    children,
+    node_occupied,
+    bricks,
+    brick_lines,
+):
+    """Write the bricks of slots ``begin … end-1``: each target is its source updated by the marks, which are cleared.
+
+    Brick 0 as a source is a brick nobody has seen. Lines without marks are copied, or not touched at all: a planar
+    scanner marks few lines of the bricks it crosses, and with many particles the bricks are not in the cache.
+    Arithmetic stays in int16 after each operation, or it is not vectorised (the model's range keeps it from overflow);
+    so does having one loop that reads and writes one brick and another that copies.
+    """
+    miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
+    for s in range(begin, end):
+        source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
+        lines = np.int64(brick_lines[source])
+        for line in range(16):
+            k = 4 * line
+            a = 32 * line
+            if (marks64[s, k] | marks64[s, k + 1] | marks64[s, k + 2] | marks64[s, k + 3]) == np.uint64(0):
+                if source != target:
+                    for j in range(32):
+                        bricks[target, a + j] = bricks[source, a + j]
+                continue
+            greatest = np.int16(-32768)
+            if source == target:
+                for j in range(32):
+                    v = bricks[target, a + j]
+                    m = marks[s, a + j]
+                    base = np.int16(0) if v == np.int16(-32768) else v
+                    w = np.int16(base + (hit if m >= 2 else miss))
+                    w = low if w < low else w
+                    w = high if w > high else w
+                    w = w if m != 0 else v
+                    bricks[target, a + j] = w
+                    greatest = max(greatest, w)
+            else:
+                for j in range(32):
+                    v = bricks[source, a + j]
+                    m = marks[s, a + j]
+                    base = np.int16(0) if v == np.int16(-32768) else v
+                    w = np.int16(base + (hit if m >= 2 else miss))
+                    w = low if w < low else w
+                    w = high if w > high else w
+                    w = w if m != 0 else v
+                    bricks[target, a + j] = w
+                    greatest = max(greatest, w)
+            for i in range(4):
+                marks64[s, k + i] = np.uint64(0)
+            if greatest >= threshold:
+                lines |= 1 << line
+            else:
+                lines &= ~(1 << line)
+        brick_lines[target] = lines
+        # carry the brick's flag up the tree where it changed
+        bit = (node_occupied[work[s, 0]] >> np.uint64(work[s, 1])) & np.uint64(1)
+        if (bit != np.uint64(0)) != (lines != 0):
+            key = slot_key[s]
+            bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
+            set_occupied(root, bx, by, bz, levels, lines != 0, children, node_occupied)
+
+
+@numba.njit(cache=True, nogil=True)
+def drop_sources(end, work, brick_ref, brick_free, counters):
+    """Take one parent from the bricks that were copied."""
+    for s in range(end):
+        if work[s, 2] != 0 and work[s, 2] != work[s, 3]:
+            drop_brick(np.int64(work[s, 2]), brick_ref, brick_free, counters)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -298,6 +351,7 @@ def update_grids(
     slot_next,
     marks,
     marks64,
+    work,
     tally,
 ):
     """Insert one scan into grids ``begin …``, one after another; returns the first that was not done.
@@ -305,8 +359,6 @@ def update_grids(
     ``steps (5,) int16``: miss, hit, low, high, threshold. Where room is short it is asked for in ``tally``, and the
     grid it was for is as before. Roots are the caller's own.
     """
-    miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
-    out = np.zeros(7, np.int64)
     counted = np.zeros(6, np.int64)
     for g in range(begin, roots.shape[0]):
         counted[:] = tally[:6]
@@ -338,29 +390,36 @@ def update_grids(
         if short:
             tally[:6] = counted
             return g
-        root = roots[g]
-        out[0] = 0
-        for s in range(n):
-            key = slot_key[s]
-            resolve_brick(
-                root,
-                key,
-                levels,
-                children,
-                node_ref,
-                node_occupied,
-                brick_ref,
-                node_free,
-                brick_free,
-                counters,
-                out,
-            )
-            source, target = out[2], out[3]
-            occupied = apply_marks(
-                source, target, s, miss, hit, low, high, threshold, bricks, brick_lines, marks, marks64
-            )
-            if source != 0 and source != target:
-                drop_brick(source, brick_ref, brick_free, counters)
-            note_occupied(root, key, levels, out[0], out[1], occupied, children, node_occupied)
+        resolve_slots(
+            0,
+            n,
+            roots[g],
+            levels,
+            slot_key,
+            work,
+            children,
+            node_ref,
+            node_occupied,
+            brick_ref,
+            node_free,
+            brick_free,
+            counters,
+        )
+        apply_slots(
+            0,
+            n,
+            roots[g],
+            levels,
+            steps,
+            slot_key,
+            marks,
+            marks64,
+            work,
+            children,
+            node_occupied,
+            bricks,
+            brick_lines,
+        )
+        drop_sources(n, work, brick_ref, brick_free, counters)
         tally[BRICKS] += n
     return roots.shape[0]

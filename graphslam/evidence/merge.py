@@ -1,0 +1,117 @@
+"""Merging maps by adding their log-odds under a transform (SegSLAM A12)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError
+from graphslam.core.geometry import Array
+from graphslam.evidence.batch import own_grids
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
+from graphslam.evidence.merge_kernels import add_bricks, sample_bricks
+from graphslam.evidence.scan import pose_row
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
+
+CHUNK = 2048
+"""Bricks worked on at a time: bounds the memory of a merge to some megabytes."""
+
+
+def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
+    """Add the log-odds of ``other`` to ``grid``; returns how many voxels got something.
+
+    A voxel takes the value of the voxel of ``other`` that its centre lies in; unknown there adds nothing. Sums are
+    clamped to the bounds of ``grid``'s model. The two may be of different pools, and may share history.
+
+    Parameters
+    ----------
+    grid, other : EvidenceGrid
+        Of one voxel size and dimension.
+    pose : (7,), (4, 4), or (3,) in 2-D
+        ``T_grid_other``; default identity.
+
+    Raises
+    ------
+    GridError
+        Other voxel size or dimension, or a map that would reach out of the addressable cube; nothing was written.
+    GridLockedError
+    """
+    grid.check_writable()
+    if other.voxel_size != grid.voxel_size or other.dim != grid.dim:
+        raise GridError(
+            "grids of different voxel size or dimension cannot be merged",
+            got=f"{other.voxel_size} m, {other.dim}-D",
+            wanted=f"{grid.voxel_size} m, {grid.dim}-D",
+        )
+    source = other.copy()  # stays what it is, also where it shares bricks with the grid that is written to
+    T = pose_row(pose, grid.dim)
+    R, t = T[:9].reshape(3, 3), T[9:]
+    if grid.dim == 2 and abs(R[2, 2] - 1) + abs(t[2]) > 1e-9:
+        raise GridError("a 2-D grid was to be merged out of its plane", got=T.tolist(), wanted="rotation about z")
+    T_inverse = np.concatenate([R.T.ravel(), -R.T @ t])
+    keys = _touched(grid, source.brick_coordinates(), R, t)
+    work = grid.copy()  # the grid itself changes when all is done, or not at all
+    pool, scale = grid.pool, 1.0 / grid.voxel_size
+    found = 0
+    for begin in range(0, len(keys), CHUNK):
+        part = keys[begin : begin + CHUNK]
+        values = np.empty((len(part), BRICK_VOXELS), np.int16)
+        with source.pool.lock:
+            known = sample_bricks(
+                part,
+                T_inverse,
+                scale,
+                grid.voxel_size,
+                pool.half,
+                source.pool.half,
+                source.root,
+                source.pool.levels,
+                source.pool.children,
+                source.pool.bricks,
+                values,
+            )
+        if known == 0:
+            continue
+        found += known
+        with pool.lock:
+            pool.reserve(len(part) * (pool.levels - 1), len(part))
+            own_grids((work,), pool)
+            add_bricks(
+                work.root, part, values, grid.model.steps, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
+            )
+    grid.take(work)
+    return found
+
+
+def _touched(grid: EvidenceGrid, coordinates: npt.NDArray[np.int64], R: Array, t: Array) -> npt.NDArray[np.int64]:
+    """Packed coordinates of the target bricks that the boxes around the moved source bricks meet, ascending."""
+    edge = BRICK_EDGE * grid.voxel_size
+    half = grid.pool.half // BRICK_EDGE
+    if len(coordinates) == 0:
+        return np.zeros(0, np.int64)
+    centre = (coordinates + 0.5) * edge @ R.T + t
+    reach = 0.5 * edge * np.abs(R).sum(axis=1)  # of the box around a turned cube
+    # a millionth of a voxel keeps bricks that only touch out of a merge on the same lattice
+    slack = 1e-6 * grid.voxel_size
+    first = np.floor((centre - reach + slack) / edge).astype(np.int64)
+    last = np.floor((centre + reach - slack) / edge).astype(np.int64)
+    if grid.dim == 2:
+        first[:, 2] = last[:, 2] = 0
+    if first.min() < -half or last.max() >= half:
+        raise GridError(
+            "a merged map would reach out of the addressable cube",
+            got=f"bricks {first.min(axis=0).tolist()} … {last.max(axis=0).tolist()}",
+            wanted=f"[{-half}, {half}), or a pool of more levels",
+        )
+    span = int((last - first).max()) + 1
+    offsets = np.stack(np.meshgrid(*[np.arange(span)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    found = []
+    for offset in offsets:
+        b = first + offset
+        u = b[np.all(b <= last, axis=1)] + half
+        found.append((u[:, 2] << 40) | (u[:, 1] << 20) | u[:, 0])
+    return np.unique(np.concatenate(found))
