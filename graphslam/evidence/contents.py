@@ -1,0 +1,232 @@
+"""What an evidence grid holds as a whole: voxels in boxes, extent, clouds, entropy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError
+from graphslam.core.geometry import Array
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import STEP
+from graphslam.evidence.query_kernels import count_boxes, count_values, find_bounds, list_occupied, walk_once
+from graphslam.evidence.scan import point_rows
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class BoxCounts:
+    """Voxels in boxes, each ``(m,)`` int64.
+
+    Parameters
+    ----------
+    occupied, known : (m,)
+        Occupied ones; those that were observed.
+    voxels : (m,)
+        All, of the addressable cube.
+    """
+
+    occupied: Ints
+    known: Ints
+    voxels: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelCounts:
+    """Voxels of a whole grid: known = occupied + free."""
+
+    occupied: int
+    free: int
+
+    @property
+    def known(self) -> int:
+        """Voxels that were observed."""
+        return self.occupied + self.free
+
+
+@dataclass(frozen=True, slots=True)
+class BinnedCloud:
+    """Occupied voxels gathered in larger cells, ascending in (z, y, x) of the cells.
+
+    Parameters
+    ----------
+    points : (m, dim)
+        Centroid of the centres of the occupied voxels in each cell [m].
+    counts : (m,)
+        Their number.
+    """
+
+    points: Array
+    counts: Ints
+
+
+def box_query(grid: EvidenceGrid, lower: Any, upper: Any) -> BoxCounts:
+    """Occupied, known and all voxels that boxes overlap.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    lower, upper : (m, dim)
+        Corners in the grid's frame [m]; may be infinite. A voxel that a box only touches is not of it; a box of no
+        extent along an axis overlaps the voxels it lies in. Voxels outside the addressable cube are not there.
+
+    Raises
+    ------
+    GridError
+        Wrong shapes, NaN, or a lower corner above the upper one.
+    """
+    a = point_rows(lower, grid.dim, grid.voxel_size, "lower corners")
+    b = point_rows(upper, grid.dim, grid.voxel_size, "upper corners")
+    if a.shape != b.shape:
+        raise GridError("lower and upper corners differ in number", got=len(b), wanted=len(a))
+    wrong = ~(a <= b).all(axis=1)  # also NaN
+    if wrong.any():
+        k = int(np.flatnonzero(wrong)[0])
+        raise GridError(f"box {k} is no box", got=f"{a[k].tolist()} … {b[k].tolist()}", wanted="lower <= upper")
+    pool = grid.pool
+    edge = 2.0 * pool.half
+    scale = 1.0 / grid.voxel_size
+    low = np.floor(a * scale + pool.half)
+    high = np.maximum(np.ceil(b * scale + pool.half), low + 1.0)
+    low, high = np.clip(low, 0.0, edge).astype(np.int64), np.clip(high, 0.0, edge).astype(np.int64)
+    counts = np.empty((len(low), 2), np.int64)
+    with pool.lock:
+        count_boxes(
+            grid.root, low, high, pool.levels, grid.model.threshold_step, pool.children, pool.bricks, counts
+        )  # fmt: skip
+    return BoxCounts(counts[:, 0], counts[:, 1], np.prod(high - low, axis=1))
+
+
+def bounding_box(grid: EvidenceGrid) -> tuple[Array, Array] | None:
+    """Corners ``(dim,)``, ``(dim,)`` of the smallest box that holds all known voxels [m]; None of an empty map."""
+    pool = grid.pool
+    bounds = np.empty(6, np.int64)
+    with pool.lock:
+        find_bounds(grid._bricks(), pool.bricks, bounds)
+    if bounds[3] < bounds[0]:
+        return None
+    corners = np.stack([bounds[:3], bounds[3:] + 1]) - pool.half
+    lower, upper = np.asarray(corners[:, : grid.dim] * grid.voxel_size, dtype=np.float64)
+    return lower, upper
+
+
+def occupied_voxels(grid: EvidenceGrid) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int16]]:
+    """Signed coordinates ``(n, 3)`` and values ``(n,)`` [`layout.STEP`] of the occupied voxels.
+
+    They come brick by brick, ascending in (z, y, x) of the bricks, and so inside each brick.
+    """
+    pool = grid.pool
+    with pool.lock:
+        rows = grid._bricks()
+        rows = rows[pool.brick_lines[rows[:, 1]] != 0]
+        args = rows, pool.half, grid.model.threshold_step, pool.bricks, pool.brick_lines
+        n = list_occupied(*args, np.empty((0, 3), np.int32), np.empty(0, np.int16))
+        voxels, values = np.empty((n, 3), np.int32), np.empty(n, np.int16)
+        list_occupied(*args, voxels, values)
+    return voxels, values
+
+
+def occupied_cloud(grid: EvidenceGrid, *, with_log_odds: bool = False) -> Any:
+    """Centres of the occupied voxels.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    with_log_odds : bool
+        Give their log-odds too.
+
+    Returns
+    -------
+    (n, dim) float64, or that and (n,) float32
+        In the grid's frame [m], in the order of :func:`occupied_voxels`.
+    """
+    voxels, values = occupied_voxels(grid)
+    points = (voxels[:, : grid.dim] + 0.5) * grid.voxel_size
+    return (points, (values * STEP).astype(np.float32)) if with_log_odds else points
+
+
+def binned_cloud(grid: EvidenceGrid, level: int, *, minimum: int = 1) -> BinnedCloud:
+    """Occupied voxels gathered in cells of ``2**level`` voxels a side: the thinned cloud that submaps are matched with.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    level : int
+        0 gives every voxel by itself. Cells are those of the octree: the lattice of cells contains the origin.
+    minimum : int
+        Cells with fewer occupied voxels are left out.
+
+    Raises
+    ------
+    GridError
+        Another level than 0 … the height of the tree.
+    """
+    height = int(grid.pool.half).bit_length()
+    if not (isinstance(level, (int, np.integer)) and 0 <= level <= height):
+        raise GridError("impossible level of a binned cloud", got=level, wanted=f"0 … {height}")
+    voxels, _ = occupied_voxels(grid)
+    cells = (voxels.astype(np.int64) >> int(level)) + grid.pool.half
+    keys = (cells[:, 2] << 40) | (cells[:, 1] << 20) | cells[:, 0]
+    _, first, inverse, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    # offsets from the cell's corner are small whole numbers, so their sums are exact in any order
+    offsets = voxels - ((voxels >> int(level)) << int(level))
+    sums = np.stack([np.bincount(inverse, offsets[:, i], len(counts)) for i in range(grid.dim)], axis=1)
+    corner = ((voxels[first, : grid.dim] >> int(level)) << int(level)).astype(np.float64)
+    points = (corner + sums / counts[:, None] + 0.5) * grid.voxel_size
+    keep = counts >= minimum
+    return BinnedCloud(points[keep], counts[keep].astype(np.int64))
+
+
+def value_counts(grid: EvidenceGrid) -> Ints:
+    """Number of voxels of each value, ``(65536,)``, row v + 32768; row 0, of the unknown, is set to 0.
+
+    A brick that stands in many places of a compacted map is looked at once.
+    """
+    pool = grid.pool
+    counts = np.zeros(65536, np.int64)
+    with pool.lock:
+        if grid.root == 0:
+            return counts
+        n, b = int(pool.counters[0]), int(pool.counters[2])  # ids beyond were never used
+        times = np.zeros(b, np.int64)
+        bricks = np.empty(b, np.int64)
+        found = walk_once(
+            np.array([grid.root], np.int64), pool.levels, pool.children, np.zeros(n, np.int64), times,
+            np.empty(n, np.int64), bricks, np.empty(pool.levels + 1, np.int64),
+        )  # fmt: skip
+        count_values(bricks[:found], times, pool.bricks, counts)
+    counts[0] = 0
+    return counts
+
+
+def voxel_counts(grid: EvidenceGrid) -> VoxelCounts:
+    """Numbers of occupied and free voxels."""
+    counts = value_counts(grid)
+    row = grid.model.threshold_step + 32768
+    return VoxelCounts(int(counts[row:].sum()), int(counts[:row].sum()))
+
+
+def known_volume(grid: EvidenceGrid) -> float:
+    """Volume of the voxels that were observed [m³], in 2-D their area [m²]."""
+    return float(value_counts(grid).sum()) * grid.voxel_size**grid.dim
+
+
+def entropy(grid: EvidenceGrid) -> float:
+    """Entropy of the map (SegSLAM eq. 20–22): observed voxels only, times the volume of a voxel [nat m³; 2-D: nat m²].
+
+    ``H = Σ γ (-ρ log ρ - (1 - ρ) log(1 - ρ))``. Voxels are counted by value first, so that the sum is the same whatever
+    the order of the bricks.
+    """
+    return float(np.sum(value_counts(grid) * _entropies())) * grid.voxel_size**grid.dim
+
+
+@lru_cache(maxsize=1)
+def _entropies() -> Array:
+    """Entropy of a voxel of each value [nat] (eq. 21); even in the log-odds, so by the smaller probability."""
+    q = 1.0 / (1.0 + np.exp(np.abs(np.arange(-32768, 32768)) * STEP))
+    return -q * np.log(q) - (1.0 - q) * np.log1p(-q)

@@ -1,0 +1,204 @@
+"""How well a scan fits an evidence grid: the weights of particles.
+
+Two likelihoods. By *end points*: how occupied the map is where beams ended; flat, cheap, forgiving. By *casting*:
+whether each beam is as long as the map expects; sharp, and so it needs far stronger tempering. Beams of one scan are
+not independent (neighbours meet the same wall, with the same error of the map), so the sum of their logarithms must be
+scaled down by an exponent, and there is no default for it: what matters is the *effective* number of beams, exponent
+times beams, that a step adds before resampling; some tens for end points and a few for casting keep half of the
+particles effective.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.evidence.cast_kernels import HIT, INSIDE, UNKNOWN_SPACE, UNUSABLE
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.queries import cast_grids, endpoint_probability
+from graphslam.evidence.scan import scan_rows
+
+
+@dataclass(frozen=True, slots=True)
+class EndpointLikelihood:
+    """Log-likelihood ``log(floor + (1 - floor) p)`` of a beam that ended where the map is occupied with probability p.
+
+    Beams that met nothing within the maximum range say nothing here.
+
+    Parameters
+    ----------
+    exponent : float
+        Scale of the sum over beams; exponent × beams is the effective number of beams.
+    floor : float
+        Probability that a beam has nothing to do with the map.
+    interpolation : {"trilinear", "nearest"}
+    unknown : float
+        Probability of occupancy where the map knows nothing.
+
+    Raises
+    ------
+    ConfigError
+    """
+
+    exponent: float
+    floor: float = 0.05
+    interpolation: str = "trilinear"
+    unknown: float = 0.5
+
+    def __post_init__(self) -> None:
+        _positive("exponent", self.exponent)
+        if not 0.0 < self.floor < 1.0:
+            raise ConfigError(f"end-point likelihood: floor is {self.floor}; wanted inside (0, 1)")
+        if not 0.0 <= self.unknown <= 1.0:
+            raise ConfigError(f"end-point likelihood: unknown is {self.unknown}; wanted 0 … 1")
+        if self.interpolation not in ("nearest", "trilinear"):
+            raise ConfigError(f"interpolation {self.interpolation!r}; wanted 'nearest' or 'trilinear'")
+
+    def beams(self, probability: Any) -> Array:
+        """Log-likelihood of each beam; NaN, of points that are not finite, gives 0."""
+        p = np.asarray(probability, dtype=np.float64)
+        return np.nan_to_num(np.log(self.floor + (1.0 - self.floor) * p), nan=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class CastLikelihood:
+    """Log-likelihood ``-½ min(z², clip²)``, ``z = (measured - expected range) / sigma``, of each beam.
+
+    The constant of the Gaussian is the same for all particles and left out, so 0 is perfect agreement. Where the map
+    expects nothing within the maximum range and the beam met nothing, they agree; where only one of them met
+    something, the other stands at the maximum range.
+
+    Parameters
+    ----------
+    exponent : float
+        Scale of the sum over beams; exponent × beams is the effective number of beams.
+    sigma : float
+        Standard deviation of measured from expected ranges [m]: of sensor, voxels, pose and map together.
+    clip : float
+        Standard deviations beyond which a beam is no worse: things move, and maps have holes.
+    ignore_unknown : bool
+        Look through voxels never observed; else a beam that comes to one before anything occupied tells nothing and
+        counts as ``unknown`` standard deviations off, unless it was measured to end nearer than that.
+    unknown : float, optional
+        See there; default ``clip``, so that a map is not rewarded for knowing nothing.
+
+    Raises
+    ------
+    ConfigError
+    """
+
+    exponent: float
+    sigma: float = 0.2
+    clip: float = 3.0
+    ignore_unknown: bool = True
+    unknown: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("exponent", "sigma", "clip"):
+            _positive(name, getattr(self, name))
+        if self.unknown is not None and not 0.0 <= self.unknown <= self.clip:
+            raise ConfigError(f"cast likelihood: unknown is {self.unknown}; wanted 0 … clip ({self.clip})")
+
+    def beams(self, expected: Any, status: Any, measured: Any, max_range: float) -> Array:
+        """Log-likelihood of each beam.
+
+        Parameters
+        ----------
+        expected, status : (..., n)
+            Of a `Cast`.
+        measured : (n,)
+            Ranges [m]; `max_range` or more where a beam met nothing, NaN for beams to leave out, which give 0.
+        max_range : float
+        """
+        status = np.asarray(status)
+        m = np.minimum(np.asarray(measured, dtype=np.float64), max_range)
+        met = (status == HIT) | (status == INSIDE)
+        r = np.where(met, np.asarray(expected, dtype=np.float64), max_range)
+        z = np.minimum(np.abs(m - r) / self.sigma, self.clip)
+        if not self.ignore_unknown:
+            # known free space as far as the unknown: a beam that ended in it contradicts the map, others do not
+            short = np.minimum(np.maximum(np.asarray(expected) - m, 0.0) / self.sigma, self.clip)
+            z = np.where(status == UNKNOWN_SPACE, np.maximum(short, self._unknown), z)
+        z = np.where(status == UNUSABLE, self.clip, z)
+        return np.where(np.isnan(m), 0.0, -0.5 * z * z)
+
+    @property
+    def _unknown(self) -> float:
+        return self.clip if self.unknown is None else self.unknown
+
+
+def log_weights(
+    grids: Sequence[EvidenceGrid],
+    poses: Any,
+    points: Any,
+    likelihood: EndpointLikelihood | CastLikelihood,
+    *,
+    origin: Any = None,
+    max_range: float | None = None,
+    returns: Any = None,
+    threads: int = 1,
+) -> Array:
+    """Logarithms of the likelihood of one scan in many grids, each at a pose of its own.
+
+    Parameters
+    ----------
+    grids, poses, threads
+        As in `cast_grids`.
+    points, origin, max_range, returns
+        The scan, as in `update_grids`. Beams that are not finite, and of no length, tell nothing. Casting needs the
+        maximum range.
+    likelihood : EndpointLikelihood or CastLikelihood
+
+    Returns
+    -------
+    (P,) float64
+        Sums over the beams, times the exponent; the same for any number of threads.
+
+    Raises
+    ------
+    GridError, GeometryError, ConfigError
+    """
+    if not len(grids):
+        return np.zeros(0)
+    first = grids[0]
+    p, o, r, limit = scan_rows(points, origin, returns, max_range, first.dim, first.voxel_size)
+    rays = (p - o)[:, : first.dim]
+    with np.errstate(invalid="ignore", over="ignore"):
+        measured = np.linalg.norm(rays, axis=1)
+    if len(r):
+        measured[(r == 0) & np.isfinite(measured)] = np.inf
+    measured[~np.isfinite(rays).all(axis=1) | (measured == 0.0)] = np.nan
+    if isinstance(likelihood, EndpointLikelihood):
+        ends = measured <= limit
+        found = endpoint_probability(
+            grids,
+            poses,
+            p[ends, : first.dim],
+            interpolation=likelihood.interpolation,
+            unknown=likelihood.unknown,
+            threads=threads,
+        )
+        return likelihood.exponent * likelihood.beams(found).sum(axis=1)
+    if math.isinf(limit):
+        raise ConfigError("weighting by casting needs the maximum range: beams that met nothing are compared with it")
+    c = cast_grids(
+        grids,
+        poses,
+        o[:, : first.dim],
+        rays,
+        limit,
+        ignore_unknown=likelihood.ignore_unknown,
+        threads=threads,
+    )
+    return likelihood.exponent * likelihood.beams(c.ranges, c.status, measured, limit).sum(axis=1)
+
+
+def _positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"likelihood: {name} is {value}; wanted a finite number above 0")

@@ -1,0 +1,93 @@
+"""How much memory evidence grids take, and how much of it they share with others."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.errors import GridError
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
+from graphslam.evidence.query_kernels import count_private, walk_once
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Memory of one grid or of a set of grids; what they share among themselves counts once.
+
+    Parameters
+    ----------
+    nodes, bricks : int
+        That the grids reach.
+    private_nodes, private_bricks : int
+        Of these, what would be freed if exactly these grids were released; grids outside the set hold the rest too.
+    """
+
+    nodes: int
+    bricks: int
+    private_nodes: int
+    private_bricks: int
+
+    @property
+    def total(self) -> int:
+        """All the grids reach [bytes]."""
+        return self.nodes * NODE_BYTES + self.bricks * BRICK_BYTES
+
+    @property
+    def private(self) -> int:
+        """What releasing exactly these grids would free [bytes]."""
+        return self.private_nodes * NODE_BYTES + self.private_bricks * BRICK_BYTES
+
+    @property
+    def shared(self) -> int:
+        """What others hold too [bytes]."""
+        return self.total - self.private
+
+
+def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
+    """Memory of a grid or of a set of grids of one pool, by one walk over what they reach.
+
+    Parameters
+    ----------
+    grids : EvidenceGrid, or several of one pool
+
+    Returns
+    -------
+    Memory
+
+    Raises
+    ------
+    GridError
+        Grids of different pools.
+    """
+    several = [grids] if isinstance(grids, EvidenceGrid) else list(grids)
+    if not several:
+        return Memory(0, 0, 0, 0)
+    pool = several[0].pool
+    if any(g.pool is not pool for g in several):
+        raise GridError("the memory of grids of different pools cannot be counted together", wanted="one pool")
+    with pool.lock:
+        pool.collect()
+        distinct = list({id(g): g for g in several}.values())
+        mine = Counter(g.root for g in distinct if g.root)
+        free: dict[int, bool] = {}
+        for g in distinct:
+            if g.root:
+                # handles that were copied from each other hold one box: Python counts them, and the argument itself
+                free[g.root] = sys.getrefcount(g._box) - 1 == mine[g.root]
+        roots = np.array(list(free), np.int64)
+        n, b = int(pool.counters[0]), int(pool.counters[2])  # ids beyond were never used
+        nodes, bricks = np.empty(n, np.int64), np.empty(b, np.int64)
+        begins = np.empty(pool.levels + 1, np.int64)
+        found = walk_once(
+            roots, pool.levels, pool.children, np.zeros(n, np.int64), np.zeros(b, np.int64), nodes, bricks, begins
+        )  # fmt: skip
+        private = count_private(
+            nodes, begins, np.array(list(free.values()), np.bool_), pool.levels, pool.children, pool.node_ref,
+            pool.brick_ref, np.zeros(n, np.int32), np.zeros(b, np.int32),
+        )  # fmt: skip
+    return Memory(int(begins[-1]), found, int(private[0]), int(private[1]))

@@ -1,0 +1,368 @@
+"""What a sensor would see in evidence grids: expected ranges, and the voxels that end points fall in.
+
+Both work on many grids in one call, each at a pose of its own, since that is what weighting particles is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, GridError
+from graphslam.core.geometry import Array
+from graphslam.evidence.batch import _in_threads
+from graphslam.evidence.cast_kernels import (
+    HIT,
+    INSIDE,
+    LEFT,
+    MAX_RANGE,
+    UNKNOWN_SPACE,
+    UNUSABLE,
+    cast_rays,
+    unit_directions,
+)
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import STEP
+from graphslam.evidence.query_kernels import look_up
+from graphslam.evidence.scan import check_number, point_rows, pose_row, pose_rows
+
+__all__ = [
+    "HIT",
+    "INSIDE",
+    "LEFT",
+    "MAX_RANGE",
+    "UNKNOWN_SPACE",
+    "UNUSABLE",
+    "Cast",
+    "cast",
+    "cast_grids",
+    "endpoint_log_odds",
+    "endpoint_probability",
+    "known_at",
+    "log_odds_at",
+    "occupied_at",
+]
+
+_NO_VOXELS = np.empty((0, 0, 0), np.int32)
+
+
+@dataclass(frozen=True, slots=True)
+class Cast:
+    """Expected ranges of beams, for one grid ``(n,)`` or for P of them ``(P, n)``.
+
+    Parameters
+    ----------
+    ranges : (..., n)
+        For a hit, from the origin to the middle of the beam's chord in the first occupied voxel, but no more than the
+        maximum range [m]. A beam that measured this voxel ended anywhere on that chord, so its middle is the range
+        without bias; the entry would be short by half a chord. For other beams, where they ended; NaN for unusable
+        ones.
+    status : (..., n) int8
+        `MAX_RANGE` 0: went to the maximum range; `HIT` 1; `INSIDE` 2: began in an occupied voxel, range 0; `LEFT` 3:
+        left the addressable cube; `UNUSABLE` 4: direction zero or not finite, or origin not finite or outside the
+        cube; `UNKNOWN_SPACE` 5: came to an unknown voxel, if it was to stop there.
+    voxels : (..., n, 3) int32 or None
+        Signed coordinates of the voxel a beam ended in, if asked for; for hits it is the occupied one, for the others
+        that of the end point to rounding. Undefined for unusable beams.
+    """
+
+    ranges: Array
+    status: npt.NDArray[np.int8]
+    voxels: npt.NDArray[np.int32] | None = None
+
+    @property
+    def hit(self) -> npt.NDArray[np.bool_]:
+        """Beams that met an occupied voxel, the one they began in included."""
+        return (self.status == HIT) | (self.status == INSIDE)
+
+
+def cast(
+    grid: EvidenceGrid,
+    origins: Any,
+    directions: Any,
+    max_range: float,
+    *,
+    pose: Any = None,
+    ignore_unknown: bool = True,
+    voxels: bool = False,
+) -> Cast:
+    """First occupied voxel along each beam in one grid.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    origins : (3,) or (n, 3), (2,) or (n, 2) in 2-D, or None for 0
+        In the frame of the scan [m].
+    directions : (n, 3) or (n, 2)
+        In the frame of the scan, of any length.
+    max_range : float
+        A voxel entered beyond it is not met [m]; infinite: to the faces of the addressable cube.
+    pose : (7,), (4, 4), or (3,) in 2-D
+        ``T_grid_scan``; default identity.
+    ignore_unknown : bool
+        Look through voxels that were never observed, as OctoMap's ``castRay`` may; else stop there.
+    voxels : bool
+        Give the voxels too.
+
+    Returns
+    -------
+    Cast
+        Arrays ``(n, …)``.
+
+    Raises
+    ------
+    GridError, GeometryError
+        Impossible shapes, pose or maximum range.
+    """
+    rows = pose_row(pose, grid.dim)[None]
+    found = _cast([grid], rows, origins, directions, max_range, ignore_unknown, voxels, 1)
+    return Cast(found.ranges[0], found.status[0], None if found.voxels is None else found.voxels[0])
+
+
+def cast_grids(
+    grids: Sequence[EvidenceGrid],
+    poses: Any,
+    origins: Any,
+    directions: Any,
+    max_range: float,
+    *,
+    ignore_unknown: bool = True,
+    voxels: bool = False,
+    threads: int = 1,
+) -> Cast:
+    """As :func:`cast` for one scan in many grids, each at a pose of its own.
+
+    Parameters
+    ----------
+    grids : sequence of EvidenceGrid
+        P of them, of one pool, voxel size and threshold; one may stand there several times.
+    poses : (P, 7), (P, 4, 4), or (P, 3) in 2-D
+        ``T_grid_scan`` of each.
+    threads : int
+        The result is the same for any number.
+
+    Returns
+    -------
+    Cast
+        Arrays ``(P, n, …)``.
+
+    Raises
+    ------
+    GridError, GeometryError, ConfigError
+        As :func:`cast`; grids that do not belong together; fewer threads than one.
+    """
+    if not len(grids):
+        n = len(np.asarray(directions))
+        return Cast(np.zeros((0, n)), np.zeros((0, n), np.int8), np.zeros((0, n, 3), np.int32) if voxels else None)
+    rows = pose_rows(poses, grids[0].dim)
+    return _cast(grids, rows, origins, directions, max_range, ignore_unknown, voxels, threads)
+
+
+def _cast(
+    grids: Sequence[EvidenceGrid],
+    rows: Array,
+    origins: Any,
+    directions: Any,
+    max_range: float,
+    ignore_unknown: bool,
+    voxels: bool,
+    threads: int,
+) -> Cast:
+    first = check_together(grids, same_threshold=True)
+    check_number("poses", rows, len(grids))
+    limit = float(max_range)
+    if not limit > 0.0:
+        raise GridError("impossible maximum range", got=max_range, wanted="> 0 m")
+    # a direction has no height: only the origin lies half-way up the layer of a 2-D grid
+    d = point_rows(directions, first.dim, 0.0, "beam directions")
+    o = np.zeros(first.dim) if origins is None else np.asarray(origins, dtype=np.float64)
+    o = point_rows(o[None] if o.ndim == 1 else o, first.dim, first.voxel_size, "beam origins")
+    if len(o) not in (1, len(d)):
+        raise GridError("beam origins and directions differ in number", got=len(o), wanted=f"1 or {len(d)}")
+    shape = (len(grids), len(d))
+    units = np.empty(d.shape)
+    unit_directions(d, units)
+    ranges, status = np.empty(shape), np.empty(shape, np.int8)
+    ends = np.empty((*shape, 3), np.int32) if voxels else _NO_VOXELS
+    pool = first.pool
+    with pool.lock:
+        roots = np.array([g.root for g in grids], np.int64)
+
+        def run(begin: int, end: int) -> None:
+            cast_rays(
+                begin, end, roots, rows, o, units, limit, first.voxel_size, pool.half, pool.levels,
+                first.model.threshold_step, not ignore_unknown, pool.children, pool.node_occupied, pool.bricks,
+                pool.brick_lines, ranges, status, ends,
+            )  # fmt: skip
+
+        _share(run, len(grids), threads)
+    return Cast(ranges, status, ends if voxels else None)
+
+
+def endpoint_log_odds(
+    grids: Sequence[EvidenceGrid], poses: Any, points: Any, *, threads: int = 1
+) -> npt.NDArray[np.float32]:
+    """Log-odds of the voxels that points of one scan fall in, in many grids.
+
+    Parameters
+    ----------
+    grids : sequence of EvidenceGrid
+        P of them, of one pool and voxel size; one may stand there several times.
+    poses : (P, 7), (P, 4, 4), or (P, 3) in 2-D
+        ``T_grid_scan`` of each.
+    points : (n, 3) or (n, 2)
+        In the frame of the scan [m].
+    threads : int
+        The result is the same for any number.
+
+    Returns
+    -------
+    (P, n) float32
+        Exact; NaN where nothing is known, outside the cube, and for points that are not finite.
+
+    Raises
+    ------
+    GridError, GeometryError, ConfigError
+    """
+    return _look_up(grids, _rows(grids, poses), points, _log_odds_table(), False, threads)
+
+
+def endpoint_probability(
+    grids: Sequence[EvidenceGrid],
+    poses: Any,
+    points: Any,
+    *,
+    interpolation: str = "nearest",
+    unknown: float = 0.5,
+    threads: int = 1,
+) -> npt.NDArray[np.float32]:
+    """Probabilities of occupancy where the points of one scan fall, in many grids.
+
+    Parameters
+    ----------
+    grids, poses, points, threads
+        As in :func:`endpoint_log_odds`.
+    interpolation : {"nearest", "trilinear"}
+        The voxel a point lies in, or between the centres of the eight around it (of the four in 2-D), which is smooth
+        in the pose.
+    unknown : float
+        Probability of voxels that were never observed or lie outside the cube.
+
+    Returns
+    -------
+    (P, n) float32
+        NaN for points that are not finite.
+
+    Raises
+    ------
+    GridError, GeometryError, ConfigError
+    """
+    if interpolation not in ("nearest", "trilinear"):
+        raise ConfigError(f"interpolation {interpolation!r}; wanted 'nearest' or 'trilinear'")
+    if not 0.0 <= unknown <= 1.0:
+        raise ConfigError(f"probability of the unknown is {unknown}; wanted 0 … 1")
+    table = _probability_table(float(unknown))
+    return _look_up(grids, _rows(grids, poses), points, table, interpolation == "trilinear", threads)
+
+
+def log_odds_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.float32]:
+    """Log-odds ``(n,)`` of the voxels that points ``(n, dim)`` [m] of the grid's frame lie in; NaN where unknown."""
+    rows = pose_row(None, grid.dim)[None]
+    return _look_up([grid], rows, points, _log_odds_table(), False, 1)[0]
+
+
+def occupied_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.bool_]:
+    """Whether points ``(n, dim)`` [m] of the grid's frame lie in occupied voxels: known, at the threshold or above."""
+    return grid.values_at(points) >= grid.model.threshold_step
+
+
+def known_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.bool_]:
+    """Whether points ``(n, dim)`` [m] of the grid's frame lie in voxels that were observed."""
+    return ~np.isnan(log_odds_at(grid, points))
+
+
+def _rows(grids: Sequence[EvidenceGrid], poses: Any) -> Array:
+    return pose_rows(poses, grids[0].dim) if len(grids) else np.empty((0, 12))
+
+
+def _look_up(
+    grids: Sequence[EvidenceGrid],
+    rows: Array,
+    points: Any,
+    table: npt.NDArray[np.float32],
+    trilinear: bool,
+    threads: int,
+) -> npt.NDArray[np.float32]:
+    if not len(grids):
+        return np.zeros((0, len(np.asarray(points))), np.float32)
+    first = check_together(grids)
+    check_number("poses", rows, len(grids))
+    p = point_rows(points, first.dim, first.voxel_size)
+    out = np.empty((len(grids), len(p)), np.float32)
+    pool = first.pool
+    with pool.lock:
+        roots = np.array([g.root for g in grids], np.int64)
+
+        def run(begin: int, end: int) -> None:
+            look_up(
+                begin, end, roots, rows, p, 1.0 / first.voxel_size, pool.half, pool.levels, trilinear, table,
+                pool.children, pool.bricks, out,
+            )  # fmt: skip
+
+        _share(run, len(grids), threads)
+    return out
+
+
+def check_together(grids: Sequence[EvidenceGrid], *, same_threshold: bool = False) -> EvidenceGrid:
+    """Refuse grids that cannot be read in one call; returns the first.
+
+    Raises
+    ------
+    GridError
+        Different pools, voxel sizes or dimensions, or (``same_threshold``) rules of what is occupied.
+    """
+    first = grids[0]
+    for k, g in enumerate(grids):
+        if g.pool is not first.pool or g.voxel_size != first.voxel_size or g.dim != first.dim:
+            raise GridError(
+                f"grid {k} does not belong to the others", wanted="one pool, voxel size and dimension", got=repr(g)
+            )
+        if same_threshold and g.model.threshold_step != first.model.threshold_step:
+            raise GridError(
+                f"grid {k} has another threshold than the first", got=g.model.threshold, wanted=first.model.threshold
+            )
+    return first
+
+
+def _share(run: Callable[[int, int], None], n: int, threads: int) -> None:
+    """``run(begin, end)`` over n grids by threads."""
+    if threads < 1:
+        raise ConfigError(f"{threads} threads; wanted at least 1")
+    threads = min(threads, n)
+    if threads == 1:
+        run(0, n)
+        return
+    cuts = [n * i // threads for i in range(threads + 1)]
+    _in_threads(lambda i: run(cuts[i], cuts[i + 1]), threads)
+
+
+@lru_cache(maxsize=1)
+def _log_odds_table() -> npt.NDArray[np.float32]:
+    """Log-odds of each value, row v + 32768; NaN of the unknown."""
+    table = (np.arange(-32768, 32768) * STEP).astype(np.float32)  # exact: STEP is a power of two
+    table[0] = math.nan
+    return table
+
+
+@lru_cache(maxsize=8)
+def _probability_table(unknown: float) -> npt.NDArray[np.float32]:
+    """Probability of each value, row v + 32768."""
+    table = (1.0 / (1.0 + np.exp(-np.arange(-32768, 32768) * STEP))).astype(np.float32)
+    table[0] = unknown
+    return table
