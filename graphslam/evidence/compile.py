@@ -69,6 +69,11 @@ def _uses() -> list[tuple[str, Callable[[], object]]]:
         ("merges", lambda: grid.merge(other)),
         ("bricks", lambda: grid.write_bricks(grid.brick_coordinates(), grid.brick_values())),
         ("values", lambda: grid.values_at(point)),
+        ("casts", lambda: grid.cast(None, point, 5.0)),
+        ("points", lambda: grid.log_odds_at(point)),
+        ("boxes", lambda: (grid.box_query(-point, point), grid.bounding_box())),
+        ("clouds", grid.occupied_cloud),
+        ("sums", lambda: (grid.entropy(), grid.memory())),
         ("clean-up", folder.cleanup),
     ]
     return uses

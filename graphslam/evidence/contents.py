@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import STEP
 from graphslam.evidence.query_kernels import count_boxes, count_values, find_bounds, list_occupied, walk_once
 from graphslam.evidence.scan import point_rows
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
 
 Ints = npt.NDArray[np.int64]
 

@@ -14,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError, GridLockedError
+from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
+from graphslam.evidence.memory import Memory, memory
 from graphslam.evidence.merge import merge
 from graphslam.evidence.pool import GridPool, RootBox
 from graphslam.evidence.scan import UpdateReport, point_rows, pose_row, scan_rows
@@ -267,6 +269,67 @@ class EvidenceGrid:
                 self.pool.bricks, out,
             )  # fmt: skip
         return out
+
+    # --- queries ---------------------------------------------------------------------------------------------
+
+    def cast(
+        self,
+        origins: Any,
+        directions: Any,
+        max_range: float,
+        *,
+        pose: Any = None,
+        ignore_unknown: bool = True,
+        voxels: bool = False,
+    ) -> queries.Cast:
+        """Expected ranges of beams: `queries.cast`; for many grids at once, `queries.cast_grids`."""
+        return queries.cast(
+            self, origins, directions, max_range, pose=pose, ignore_unknown=ignore_unknown, voxels=voxels
+        )
+
+    def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]:
+        """Log-odds ``(n,)`` of the voxels that points ``(n, dim)`` [m] lie in, NaN where unknown."""
+        return queries.log_odds_at(self, points)
+
+    def occupied_at(self, points: Any) -> npt.NDArray[np.bool_]:
+        """Whether points ``(n, dim)`` [m] lie in occupied voxels."""
+        return queries.occupied_at(self, points)
+
+    def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
+        """Whether points ``(n, dim)`` [m] lie in voxels that were observed."""
+        return queries.known_at(self, points)
+
+    def box_query(self, lower: Any, upper: Any) -> contents.BoxCounts:
+        """Occupied, known and all voxels in boxes between corners ``(m, dim)`` [m]: `contents.box_query`."""
+        return contents.box_query(self, lower, upper)
+
+    def bounding_box(self) -> tuple[Array, Array] | None:
+        """Corners ``(dim,)`` of the smallest box that holds all known voxels [m]; None of an empty map."""
+        return contents.bounding_box(self)
+
+    def occupied_cloud(self, *, with_log_odds: bool = False) -> Any:
+        """Centres of the occupied voxels ``(n, dim)`` [m]; with their log-odds ``(n,)`` if asked for."""
+        return contents.occupied_cloud(self, with_log_odds=with_log_odds)
+
+    def binned_cloud(self, level: int, *, minimum: int = 1) -> contents.BinnedCloud:
+        """Occupied voxels gathered in cells of ``2**level`` voxels: `contents.binned_cloud`."""
+        return contents.binned_cloud(self, level, minimum=minimum)
+
+    def voxel_counts(self) -> contents.VoxelCounts:
+        """Numbers of occupied and free voxels."""
+        return contents.voxel_counts(self)
+
+    def known_volume(self) -> float:
+        """Volume of the voxels that were observed [m³], in 2-D their area [m²]."""
+        return contents.known_volume(self)
+
+    def entropy(self) -> float:
+        """Entropy of the observed voxels times their volume (SegSLAM eq. 20–22) [nat m³]: `contents.entropy`."""
+        return contents.entropy(self)
+
+    def memory(self) -> Memory:
+        """Memory of this grid, and what of it no other grid shares; for sets of grids, `memory.memory`."""
+        return memory(self)
 
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""

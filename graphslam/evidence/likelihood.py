@@ -13,16 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.evidence.cast_kernels import HIT, INSIDE, UNKNOWN_SPACE, UNUSABLE
-from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.queries import cast_grids, endpoint_probability
 from graphslam.evidence.scan import scan_rows
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,16 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graphslam.core.errors import GridError
-from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
 from graphslam.evidence.query_kernels import count_private, walk_once
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +67,7 @@ def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
     GridError
         Grids of different pools.
     """
-    several = [grids] if isinstance(grids, EvidenceGrid) else list(grids)
+    several = list(grids) if isinstance(grids, Sequence) else [grids]
     if not several:
         return Memory(0, 0, 0, 0)
     pool = several[0].pool

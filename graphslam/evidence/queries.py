@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,12 @@ from graphslam.evidence.cast_kernels import (
     cast_rays,
     unit_directions,
 )
-from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import STEP
 from graphslam.evidence.query_kernels import look_up
 from graphslam.evidence.scan import check_number, point_rows, pose_row, pose_rows
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
 
 __all__ = [
     "HIT",
