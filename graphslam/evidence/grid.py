@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError, GridLockedError
+from graphslam.core.geometry import Array
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
