@@ -1,0 +1,238 @@
+"""Compaction of evidence grids, and what is in them as a short list of pieces: the way out to files, and back in.
+
+Only a few per cent of the bricks of a map are of one value, so updates do not look for them; files and maps at rest do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError
+from graphslam.core.interrupt import deferred_interrupts
+from graphslam.evidence.batch import own_grids
+from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
+from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
+from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES, GridPool
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
+
+Ints = npt.NDArray[np.int64]
+
+VALUES = 1 << 16
+"""Distinct values of a voxel, UNKNOWN among them; a value v has the row v + 32768 of tables."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompactReport:
+    """What a compaction gave back to the pool.
+
+    Parameters
+    ----------
+    nodes, bricks : int
+        Freed.
+    """
+
+    nodes: int = 0
+    bricks: int = 0
+
+    @property
+    def freed_bytes(self) -> int:
+        """Memory for other grids [bytes]."""
+        return self.nodes * NODE_BYTES + self.bricks * BRICK_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """Tables of what is of one value below the roots of some grids of a pool (:mod:`cube_kernels`)."""
+
+    brick: npt.NDArray[np.int32]
+    node: npt.NDArray[np.int32]
+    brick_max: npt.NDArray[np.int16]
+    node_max: npt.NDArray[np.int16]
+
+
+def find_all_states(
+    grids: Sequence[EvidenceGrid], *, classes: bool = False, threshold: int = 0, maxima: bool = False
+) -> States:
+    """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
+    pool = grids[0].pool
+    b, n = int(pool.counters[2]), int(pool.counters[0])  # ids beyond were never used
+    states = States(
+        np.full(b, UNSEEN, np.int32),
+        np.full(n, UNSEEN, np.int32),
+        np.full(b if maxima else 0, UNKNOWN, np.int16),
+        np.full(n if maxima else 0, UNKNOWN, np.int16),
+    )
+    for g in grids:
+        if g.root and states.node[g.root] == UNSEEN:
+            find_states(
+                g.root, pool.levels, classes, threshold, pool.children, pool.bricks,
+                states.brick, states.node, states.brick_max, states.node_max,
+            )  # fmt: skip
+    return states
+
+
+def compact(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> CompactReport:
+    """Let all cubes of one value in some grids share one brick or node for each size and value, without loss.
+
+    Bricks and nodes that are of one value are kept once for each value, those entirely unknown not at all. What the
+    grids share with others stays shared; no value changes, so locked grids may be compacted too.
+
+    Parameters
+    ----------
+    grids : EvidenceGrid, or several of one pool
+
+    Returns
+    -------
+    CompactReport
+        What was saved.
+
+    Raises
+    ------
+    GridError
+        Grids of different pools.
+    """
+    several = list(grids) if isinstance(grids, Sequence) else [grids]
+    if not several:
+        return CompactReport()
+    pool = several[0].pool
+    if any(g.pool is not pool for g in several):
+        raise GridError("grids to be compacted together are of different pools", wanted="one pool")
+    with pool.lock, deferred_interrupts():
+        nodes, bricks = pool.used_nodes, pool.used_bricks
+        states = find_all_states(several)
+        # flags of occupied voxels depend on the threshold, so grids of different ones share nothing
+        for threshold in sorted({g.model.threshold_step for g in several}):
+            shared = np.zeros((pool.levels, VALUES), np.int32)
+            seen = np.zeros(len(states.node), np.uint8)
+            for g in several:
+                if g.root and g.model.threshold_step == threshold and not seen[g.root]:
+                    share_cubes(
+                        g.root, pool.levels, states.brick, states.node, seen, shared,
+                        pool.children, pool.node_ref, pool.brick_ref, *pool.store_arrays(),
+                    )  # fmt: skip
+        return CompactReport(nodes - pool.used_nodes, bricks - pool.used_bricks)
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """A map as bricks, and as cubes of one value where it can be. Ascending in (z, y, x); unknown space is not listed.
+
+    Parameters
+    ----------
+    bricks : (n, 3) int64
+        Signed coordinates; brick b holds voxels 8b … 8b + 7.
+    values : (n, 512) int16
+        Of the bricks, x fastest, in units of `layout.STEP`.
+    cubes : (m, 3) int64
+        Signed coordinates of the first brick of each cube.
+    sizes : (m,) int64
+        The cube's edge is ``8·4**size`` voxels.
+    cube_values : (m,) int64
+        Known values.
+    """
+
+    bricks: Ints
+    values: npt.NDArray[np.int16]
+    cubes: Ints
+    sizes: Ints
+    cube_values: Ints
+
+
+def pieces_of(grid: EvidenceGrid) -> Pieces:
+    """What a grid holds; equal maps give equal pieces, whatever happened to them before."""
+    pool = grid.pool
+    half = pool.half // BRICK_EDGE
+    with pool.lock:
+        mixed, cubes = list_grid(grid)
+        mixed = mixed[np.argsort(mixed[:, 0])]
+        cubes = cubes[np.argsort(cubes[:, 0])]
+        values = pool.bricks[mixed[:, 1]]
+    return Pieces(_unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, cubes[:, 1], cubes[:, 2])
+
+
+def list_grid(grid: EvidenceGrid) -> tuple[Ints, Ints]:
+    """Mixed bricks ``(n, 2)`` and cubes ``(m, 3)`` as `cube_kernels.list_pieces` gives them; hold the pool's lock."""
+    pool = grid.pool
+    states = find_all_states([grid])
+    found = np.zeros(2, np.int64)
+    mixed, cubes = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
+    if grid.root:
+        for _ in range(2):  # count, then list
+            mixed, cubes = np.empty((found[0], 2), np.int64), np.empty((found[1], 3), np.int64)
+            list_pieces(grid.root, pool.levels, pool.children, states.brick, states.node, mixed, cubes, found)
+    return mixed, cubes
+
+
+def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
+    """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`overlap`)."""
+    pool = grid.pool
+    half = pool.half // BRICK_EDGE
+    values = len(np.unique(pieces.cube_values))
+    nodes = 1 + values * int(pieces.sizes.max(initial=0))
+    for level in range(pool.levels - 1):  # nodes on the paths to what they hold
+        below = np.concatenate([pieces.bricks, pieces.cubes[pieces.sizes <= level]]) + half
+        nodes += len(np.unique(_pack(below >> 2 * (level + 1))))
+    cubes = np.stack([_pack(pieces.cubes + half), pieces.sizes, pieces.cube_values], axis=1)
+    uniform = np.zeros((pool.levels, VALUES), np.int32)
+    with pool.lock:
+        pool.collect()
+        pool.reserve(nodes, len(pieces.bricks) + values)
+        own_grids((grid,), pool)
+        build_tree(
+            grid.root, _pack(pieces.bricks + half), np.ascontiguousarray(pieces.values), cubes,
+            grid.model.threshold_step, pool.levels, uniform, *pool.tree_arrays(), *pool.store_arrays(),
+        )  # fmt: skip
+    return grid
+
+
+def overlap(pieces: Pieces) -> str | None:
+    """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
+    for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):
+        keys = _pack(rows + (1 << 18))
+        if np.any(np.diff(keys) <= 0):
+            return f"{name} are not in ascending order"
+    edges = FAN**pieces.sizes
+    if np.any(pieces.cubes % edges[:, None]):
+        return "a cube does not begin at a multiple of its edge"
+    for size in np.unique(pieces.sizes).tolist():
+        edge = FAN**size
+        taken = pieces.cubes[pieces.sizes == size] // edge
+        smaller = np.concatenate([pieces.bricks, pieces.cubes[pieces.sizes < size]]) // edge
+        if np.isin(_pack(smaller + (1 << 18)), _pack(taken + (1 << 18))).any():
+            return "a cube overlaps another piece"
+    return None
+
+
+def levels_for(reach: int) -> int | None:
+    """Fewest levels of a tree that holds voxels -reach … reach - 1; None if none does."""
+    for levels in range(2, MAX_LEVELS + 1):
+        if BRICK_EDGE * FAN**levels // 2 >= reach:
+            return levels
+    return None
+
+
+def check_reach(reach: int, pool: GridPool, where: str) -> None:
+    """Refuse a map that reaches beyond a pool's addressable cube."""
+    if reach > pool.half:
+        needed = levels_for(reach)
+        raise GridError(
+            f"map reaches {reach} voxels from the origin, beyond the addressable cube of {pool.levels} levels",
+            where=where,
+            got=f"levels={pool.levels}, ±{pool.half} voxels",
+            wanted=f"a pool with levels={needed}" if needed else f"at most ±{BRICK_EDGE * FAN**MAX_LEVELS // 2} voxels",
+        )
+
+
+def _pack(coordinates: Ints) -> Ints:
+    return (coordinates[:, 2] << 40) | (coordinates[:, 1] << 20) | coordinates[:, 0]
+
+
+def _unpack(keys: Ints) -> Ints:
+    return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1)

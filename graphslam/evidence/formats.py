@@ -1,0 +1,314 @@
+"""Evidence grids as dense arrays and as files, both without loss."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.atomic import read_npz, write_npz
+from graphslam.core.errors import ConfigError, FormatError, GridError
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.compact import Pieces, check_reach, grid_of, list_grid, overlap, pieces_of
+from graphslam.evidence.dense_kernels import dense_log_odds, dense_values
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, FAN, LIMIT, MAX_LEVELS, STEP, UNKNOWN, half_edge
+from graphslam.evidence.pool import GridPool
+
+FORMAT = "graphslam.evidence/1"
+
+DENSE_LIMIT = 1 << 34
+"""Largest dense array that is made [bytes]; a wish beyond it is a mistake in the bounds."""
+
+Ints = npt.NDArray[np.int64]
+
+
+# --- dense -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class DenseGrid:
+    """A box of voxels as an array.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz), in 2-D (nx, ny)
+        int16 in units of `layout.STEP` with `layout.UNKNOWN`, or float32 log-odds with NaN for unknown. As made by
+        :func:`to_dense`, x is the fastest axis in memory.
+    first_voxel : (dim,) int64
+        Signed coordinates of the first voxel: it covers ``[i v, (i + 1) v) × …``.
+    voxel_size : float
+        [m]
+    """
+
+    values: npt.NDArray[Any]
+    first_voxel: Ints
+    voxel_size: float
+
+    @property
+    def origin(self) -> npt.NDArray[np.float64]:
+        """Lower corner of the box ``(dim,)`` [m]."""
+        return self.first_voxel * self.voxel_size
+
+
+def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
+    """First known voxel and the one after the last, on each axis ``(3,)``; both 0 where nothing is known."""
+    pool = grid.pool
+    low, high = np.full(3, 2 * pool.half), np.zeros(3, np.int64)
+    with pool.lock:
+        mixed, cubes = list_grid(grid)
+        for axis in range(3):
+            shift, others = 20 * axis, tuple(a for a in (0, 1, 2, 3) if a != 3 - axis)  # axes are brick, z, y, x
+            first = ((cubes[:, 0] >> shift) & 0xFFFFF) * BRICK_EDGE
+            low[axis] = first.min(initial=low[axis])
+            high[axis] = (first + BRICK_EDGE * FAN ** cubes[:, 1]).max(initial=0)
+            at = (mixed[:, 0] >> shift) & 0xFFFFF
+            for edge in (at.min(initial=1 << 20), at.max(initial=-1)):  # only the outermost bricks matter
+                known = pool.bricks[mixed[at == edge, 1]].reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE) != UNKNOWN
+                where = edge * BRICK_EDGE + np.flatnonzero(known.any(axis=others))
+                low[axis] = where.min(initial=low[axis])
+                high[axis] = (where + 1).max(initial=high[axis])
+    if high[0] == 0:
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    return low - pool.half, high - pool.half
+
+
+def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: Any = np.int16) -> DenseGrid:
+    """A map, or a box of it, as an array. :func:`from_dense` gives the same map back, to the last bit.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    bounds : (2, dim) int, optional
+        First voxel and the one after the last; may reach beyond the map and its addressable cube. Default: the box of
+        the known voxels.
+    dtype : int16 or float32
+        Units of `layout.STEP`, or log-odds.
+
+    Raises
+    ------
+    GridError
+        Impossible bounds or type, or an array of more than `DENSE_LIMIT` bytes.
+    """
+    kind = np.dtype(dtype)
+    if kind not in (np.dtype(np.int16), np.dtype(np.float32)):
+        raise GridError("impossible type of a dense grid", got=kind, wanted="int16 or float32")
+    with grid.pool.lock:
+        if bounds is None:
+            low, high = known_bounds(grid)
+        else:
+            low, high = _checked_bounds(bounds, grid.dim)
+        shape = tuple((high - low).tolist())
+        size = kind.itemsize * shape[0] * shape[1] * shape[2]
+        if size > DENSE_LIMIT:
+            raise GridError(f"a dense grid of {shape} voxels takes {size / 1e9:.0f} GB", wanted="narrower bounds")
+        values = np.empty(shape[::-1], np.int16)
+        pool = grid.pool
+        dense_values(grid.root, low + pool.half, pool.levels, pool.children, pool.bricks, values)
+    if kind == np.float32:
+        floats = np.empty(values.shape, np.float32)
+        dense_log_odds(values.reshape(-1), floats.reshape(-1))
+        values = floats  # type: ignore[assignment]
+    out = values.transpose(2, 1, 0)
+    return DenseGrid(out if grid.dim == 3 else out[:, :, 0], low[: grid.dim], grid.voxel_size)
+
+
+def _checked_bounds(bounds: npt.ArrayLike, dim: int) -> tuple[Ints, Ints]:
+    box = np.asarray(bounds)
+    if box.shape != (2, dim) or box.dtype.kind not in "iu" or np.any(box[0] > box[1]):
+        raise GridError(
+            "impossible bounds of a dense grid",
+            got=np.array2string(box, threshold=8),
+            wanted=f"(2, {dim}) integers, [first voxel, the one after the last]",
+        )
+    # far beyond every tree there is nothing, and sums there may overflow
+    far = 1 << 40
+    box = (
+        np.clip(box.astype(np.float64), -far, far).astype(np.int64) if np.any(np.abs(box.astype(float)) > far) else box
+    )
+    layer = np.zeros((2, 3), np.int64)
+    layer[1, 2] = 1  # a 2-D grid is the layer k = 0
+    layer[:, :dim] = box
+    return layer[0], layer[1]
+
+
+def from_dense(dense: DenseGrid, *, model: BeamModel | None = None, pool: GridPool | None = None) -> EvidenceGrid:
+    """A grid of a dense array, 2-D or 3-D as the array is.
+
+    Parameters
+    ----------
+    dense : DenseGrid
+        float32 and float64 are log-odds, rounded to the nearest multiple of `layout.STEP`; int16 is taken as it is.
+    model : BeamModel, optional
+    pool : GridPool, optional
+
+    Raises
+    ------
+    GridError
+        Impossible shape or type, log-odds that are infinite or beyond ±16, voxels outside the addressable cube.
+    """
+    values = np.asarray(dense.values)
+    dim = values.ndim
+    first = np.asarray(dense.first_voxel)
+    if dim not in (2, 3) or first.shape != (dim,) or first.dtype.kind not in "iu":
+        raise GridError(
+            "impossible shape of a dense grid",
+            got=f"values {values.shape}, first voxel {first.shape} {first.dtype}",
+            wanted="(nx, ny) and (2,), or (nx, ny, nz) and (3,) integers",
+        )
+    steps = _steps_of(values).reshape(values.shape if dim == 3 else (*values.shape, 1)).transpose(2, 1, 0)
+    grid = EvidenceGrid(dense.voxel_size, model=model, pool=pool, dim=dim)
+    low = np.zeros(3, np.int64)
+    low[:dim] = first
+    high = low + np.array(steps.shape[::-1])
+    if steps.size == 0:
+        return grid
+    check_reach(int(max(-low.min(), high.max())), grid.pool, "dense grid")
+
+    first_brick, end_brick = low // BRICK_EDGE, -(-high // BRICK_EDGE)
+    nbx, nby, nbz = (end_brick - first_brick).tolist()
+    for bz in range(nbz):  # a slab of bricks at a time, so that little memory is needed
+        slab = np.full((BRICK_EDGE, nby * BRICK_EDGE, nbx * BRICK_EDGE), UNKNOWN, np.int16)
+        z0 = int(first_brick[2] + bz) * BRICK_EDGE - int(low[2])  # row of the array at the slab's foot
+        z = slice(max(z0, 0), min(z0 + BRICK_EDGE, steps.shape[0]))
+        x, y = (int(low[a] - first_brick[a] * BRICK_EDGE) for a in (0, 1))
+        slab[z.start - z0 : z.stop - z0, y : y + steps.shape[1], x : x + steps.shape[2]] = steps[z]
+        parts = slab.reshape(BRICK_EDGE, nby, BRICK_EDGE, nbx, BRICK_EDGE)
+        by, bx = np.nonzero((parts != UNKNOWN).any(axis=(0, 2, 4)))
+        if len(by):
+            rows = parts.transpose(1, 3, 0, 2, 4)[by, bx].reshape(-1, BRICK_VOXELS)
+            grid.write_bricks(np.stack([bx, by, np.full(len(by), bz)], axis=1) + first_brick, rows)
+    return grid
+
+
+def _steps_of(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
+    """Values of an array in units of `layout.STEP`."""
+    if values.dtype == np.int16:
+        return values
+    if values.dtype not in (np.float32, np.float64):
+        raise GridError("impossible type of a dense grid", got=values.dtype, wanted="int16, float32 or float64")
+    with np.errstate(invalid="ignore"):
+        steps = np.rint(values * values.dtype.type(1 / STEP))
+        bad = np.abs(steps) > LIMIT  # NaN is not
+    if bad.any():
+        at = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise GridError(f"log-odds of voxel {at} cannot be held", got=values[at], wanted=f"at most ±{LIMIT * STEP}")
+    out = np.full(values.shape, UNKNOWN, np.int16)
+    known = ~np.isnan(values)
+    out[known] = steps[known].astype(np.int16)
+    return out
+
+
+# --- npz ---------------------------------------------------------------------------------------------------------
+
+
+def save_npz(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
+    """Write a grid as an npz archive: whole or not at all, and the same map always as the same bytes.
+
+    The archive holds no unknown brick, and a cube of one value as its corner, size and value only (format
+    ``graphslam.evidence/1``: arrays ``voxel_size``, ``dim``, ``levels``, ``model`` (hit, miss, clamp low, clamp high,
+    threshold), and those of `compact.Pieces`).
+    """
+    pieces = pieces_of(grid)
+    m = grid.model
+    write_npz(
+        path,
+        {
+            "format": FORMAT,
+            "voxel_size": np.float64(grid.voxel_size),
+            "dim": np.int64(grid.dim),
+            "levels": np.int64(grid.pool.levels),
+            "model": np.array([m.hit, m.miss, *m.clamp, m.threshold], np.float64),
+            "bricks": pieces.bricks.astype(np.int32),
+            "values": pieces.values,
+            "cubes": pieces.cubes.astype(np.int32),
+            "cube_sizes": pieces.sizes.astype(np.uint8),
+            "cube_values": pieces.cube_values.astype(np.int16),
+        },
+    )
+
+
+def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> EvidenceGrid:
+    """Read what :func:`save_npz` wrote.
+
+    Parameters
+    ----------
+    path : path
+    pool : GridPool, optional
+        Storage to read into, whatever its number of levels, so long as the map fits; default a new one of as many
+        levels as the map was made with.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        No such file; truncated, corrupt or impossible in some field.
+    GridError
+        The map does not fit the pool.
+    """
+    where = str(path)
+    arrays = read_npz(path, fmt=FORMAT)
+    model, voxel_size, dim, levels = _read_head(arrays, where)
+    pieces = _read_pieces(arrays, where)
+    reach = 0
+    for corner, edge in ((pieces.bricks, 1), (pieces.cubes, FAN ** pieces.sizes[:, None])):
+        if len(corner):
+            reach = max(reach, BRICK_EDGE * int(max(-corner.min(), (corner + edge).max())))
+    if reach > half_edge(levels):
+        raise FormatError(f"voxels {reach} from the origin do not fit the {levels} levels named", where=where)
+    wrong = overlap(pieces)
+    if wrong:
+        raise FormatError(wrong, where=where)
+    if dim == 2 and (len(pieces.cubes) or np.any(pieces.bricks[:, 2]) or np.any(pieces.values[:, 64:] != UNKNOWN)):
+        raise FormatError("a 2-D grid has voxels beside the layer k = 0", where=where)
+    pool = GridPool(levels) if pool is None else pool
+    check_reach(reach, pool, where)
+    return grid_of(EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim), pieces)
+
+
+def _field(arrays: dict[str, npt.NDArray[Any]], name: str, dtype: Any, shape: tuple[int, ...], where: str) -> Any:
+    """An array of a file, checked; -1 in a shape stands for any number."""
+    if name not in arrays:
+        raise FormatError(f"array {name!r} is missing", where=where)
+    a = arrays[name]
+    fits = a.ndim == len(shape) and all(w in (-1, n) for n, w in zip(a.shape, shape))
+    if not fits or a.dtype != np.dtype(dtype):
+        raise FormatError(
+            f"array {name!r} has the wrong shape or type",
+            where=where,
+            got=f"{a.shape} {a.dtype}",
+            wanted=f"{shape} {np.dtype(dtype)}",
+        )
+    return a
+
+
+def _read_head(arrays: dict[str, npt.NDArray[Any]], where: str) -> tuple[BeamModel, float, int, int]:
+    hit, miss, low, high, threshold = _field(arrays, "model", np.float64, (5,), where).tolist()
+    try:
+        model = BeamModel(hit, miss, (low, high), threshold)
+    except ConfigError as error:
+        raise FormatError(f"array 'model' is impossible ({error})", where=where) from None
+    voxel_size = float(_field(arrays, "voxel_size", np.float64, (), where))
+    dim, levels = (int(_field(arrays, name, np.int64, (), where)) for name in ("dim", "levels"))
+    if not (np.isfinite(voxel_size) and voxel_size > 0):
+        raise FormatError("voxel size is impossible", where=where, got=voxel_size, wanted="> 0 m")
+    if dim not in (2, 3):
+        raise FormatError("dimension is impossible", where=where, got=dim, wanted="2 or 3")
+    if not 2 <= levels <= MAX_LEVELS:
+        raise FormatError("number of levels is impossible", where=where, got=levels, wanted=f"2 … {MAX_LEVELS}")
+    return model, voxel_size, dim, levels
+
+
+def _read_pieces(arrays: dict[str, npt.NDArray[Any]], where: str) -> Pieces:
+    bricks = _field(arrays, "bricks", np.int32, (-1, 3), where).astype(np.int64)
+    values = _field(arrays, "values", np.int16, (len(bricks), BRICK_VOXELS), where)
+    cubes = _field(arrays, "cubes", np.int32, (-1, 3), where).astype(np.int64)
+    sizes = _field(arrays, "cube_sizes", np.uint8, (len(cubes),), where).astype(np.int64)
+    cube_values = _field(arrays, "cube_values", np.int16, (len(cubes),), where).astype(np.int64)
+    if sizes.max(initial=0) >= MAX_LEVELS:
+        raise FormatError("size of a cube is impossible", where=where, got=sizes.max(), wanted=f"< {MAX_LEVELS}")
+    if np.any(cube_values == UNKNOWN) or not (values != UNKNOWN).any(axis=1).all():
+        raise FormatError("a cube or brick of unknown voxels is listed", where=where)
+    return Pieces(bricks, values, cubes, sizes, cube_values)
