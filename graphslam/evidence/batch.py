@@ -16,28 +16,31 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
-from graphslam.evidence.batch_kernels import apply_grids, mark_grids, resolve_grids
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
 from graphslam.evidence.update_kernels import (
     BRICKS,
     CUT,
-    NEED_BRICKS,
-    NEED_NODES,
     NEED_SLOTS,
     NOT_FINITE,
     OUTSIDE,
+    PENDING,
     RAYS,
+    TALLY,
     ZERO_LENGTH,
+    apply_grids,
     drop_sources,
+    mark_grids,
+    resolve_grids,
 )
-from graphslam.evidence.update_kernels import update_grids as update_kernel
 
 if TYPE_CHECKING:
     from graphslam.evidence.grid import EvidenceGrid
 
 BATCH = 64
 """Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
+SERIAL_BATCH = 4
+"""The same on one thread: so few marks are still in the cache when they are applied."""
 
 Scan = tuple[Array, Array, npt.NDArray[np.uint8], float]
 
@@ -114,14 +117,12 @@ def report_of(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
 def insert(grids: Sequence[EvidenceGrid], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
     """Write a checked scan; hold the pool's lock. ``poses (P, 12)``."""
     pool = grids[0].pool
+    tally = np.zeros(TALLY, np.int64)
     roots = own_grids(grids, pool)
-    tally = np.zeros(9, np.int64)
-    if threads > 1 and len(grids) > 1:
-        for begin in range(0, len(grids), BATCH):
-            end = min(begin + BATCH, len(grids))
-            _insert_threads(grids[0], roots[begin:end], poses[begin:end], scan, min(threads, end - begin), tally)
-        return tally
-    _insert_serial(grids[0], roots, poses, scan, tally)
+    n = len(roots)
+    work, size = (_insert_serial, SERIAL_BATCH) if threads == 1 or n == 1 else (_insert_threads, BATCH)
+    for begin in range(0, n, size):
+        work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, threads, tally)
     return tally
 
 
@@ -139,48 +140,50 @@ def own_grids(grids: Sequence[EvidenceGrid], pool: GridPool) -> npt.NDArray[np.i
 
 
 def _insert_serial(
-    grid: EvidenceGrid, roots: npt.NDArray[np.int64], poses: Array, scan: Scan, tally: npt.NDArray[np.int64]
+    grid: EvidenceGrid,
+    roots: npt.NDArray[np.int64],
+    poses: Array,
+    scan: Scan,
+    threads: int,
+    tally: npt.NDArray[np.int64],
 ) -> None:
-    pool, scratch = grid.pool, grid.pool.scratch(0)
-    points, origins, returns, limit = scan
-    done = 0
-    while True:
-        done = update_kernel(
-            done,
-            roots,
-            poses,
-            points,
-            origins,
-            returns,
-            limit,
-            1.0 / grid.voxel_size,
-            pool.half,
-            pool.levels,
-            grid.model.steps,
-            pool.children,
-            pool.node_ref,
-            pool.node_occupied,
-            pool.bricks,
-            pool.brick_ref,
-            pool.brick_lines,
-            pool.node_free,
-            pool.brick_free,
-            pool.counters,
-            scratch.window,
-            scratch.slot_key,
-            scratch.slot_next,
-            scratch.marks,
-            scratch.marks64,
-            scratch.work,
-            tally,
-        )
-        if done == len(roots):
-            return
-        if tally[NEED_SLOTS]:
-            scratch.resize(int(tally[NEED_SLOTS]))
-        else:
-            pool.reserve(int(tally[NEED_NODES]), int(tally[NEED_BRICKS]))
-        tally[NEED_SLOTS : NEED_BRICKS + 1] = 0
+    """As :func:`_insert_threads` in this thread; for a planar scan every microsecond spent here shows."""
+    pool = grid.pool
+    s = pool.scratch(0)
+    n, levels = len(roots), pool.levels
+    ends = np.empty(n, np.int64)
+    count = np.zeros(TALLY, np.int64)
+    scale = 1.0 / grid.voxel_size
+    slots = 0
+
+    def finish() -> None:
+        apply_grids(
+            0, n, roots, ends, levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work, pool.children,
+            pool.node_occupied, pool.bricks, pool.brick_lines,
+        )  # fmt: skip
+        drop_sources(slots, s.work, pool.brick_ref, pool.brick_free, pool.counters)
+
+    try:
+        while not mark_grids(
+            0, n, poses, *scan, scale, pool.half, ends, s.window, s.slot_key, s.slot_next, s.marks, count
+        ):
+            s.resize(int(count[NEED_SLOTS]))  # and once more from the start: the marks are thrown away
+            count[:] = 0
+        slots = int(ends[-1])
+        # every touched brick may need itself and a path of its own; the root is there
+        pool.reserve(slots * (levels - 1), slots)
+        resolve_grids(
+            0, n, roots, ends, levels, s.slot_key, s.work, pool.children, pool.node_ref, pool.node_occupied,
+            pool.brick_ref, pool.node_free, pool.brick_free, pool.counters,
+        )  # fmt: skip
+        finish()
+    except BaseException:  # Ctrl-C may fall between any two calls
+        if pool.counters[PENDING]:
+            finish()
+        s.reset()
+        raise
+    tally += count
+    tally[BRICKS] += slots
 
 
 def _insert_threads(
@@ -191,70 +194,50 @@ def _insert_threads(
     threads: int,
     tally: npt.NDArray[np.int64],
 ) -> None:
+    """Mark in parallel, resolve in one thread (it allocates), apply in parallel; Ctrl-C waits outside."""
     pool = grid.pool
+    threads = min(threads, len(roots))
     scale = 1.0 / grid.voxel_size
-    cuts = np.linspace(0, len(roots), threads + 1).astype(np.int64).tolist()
-    parts = [(pool.scratch(i), cuts[i], cuts[i + 1], np.zeros(9, np.int64)) for i in range(threads)]
-    ends = np.zeros(len(roots), np.int64)
+    n = len(roots)
+    ends = np.zeros(n, np.int64)
+    cuts = [i * n // threads for i in range(threads + 1)]
+    scratches = [pool.scratch(i) for i in range(threads)]
+    counts = [np.zeros(TALLY, np.int64) for _ in range(threads)]
 
     def mark(i: int) -> None:
-        scratch, begin, end, count = parts[i]
-        while True:
-            arrays = scratch.window, scratch.slot_key, scratch.slot_next, scratch.marks
-            reached = mark_grids(begin, end, poses, *scan, scale, pool.half, ends, *arrays, count)
-            if reached == end:
-                return
-            scratch.resize(int(count[NEED_SLOTS]))  # and once more from the start: the marks were thrown away
-            count[:] = 0
+        s = scratches[i]
+        while not mark_grids(
+            cuts[i], cuts[i + 1], poses, *scan, scale, pool.half, ends, s.window, s.slot_key, s.slot_next, s.marks,
+            counts[i],
+        ):  # fmt: skip
+            s.resize(int(counts[i][NEED_SLOTS]))  # and once more from the start: the marks are thrown away
+            counts[i][:] = 0
 
     def apply(i: int) -> None:
-        scratch, begin, end, _ = parts[i]
+        s = scratches[i]
         apply_grids(
-            begin,
-            end,
-            roots,
-            ends,
-            pool.levels,
-            grid.model.steps,
-            scratch.slot_key,
-            scratch.marks,
-            scratch.marks64,
-            scratch.work,
-            pool.children,
-            pool.node_occupied,
-            pool.bricks,
-            pool.brick_lines,
-        )
+            cuts[i], cuts[i + 1], roots, ends, pool.levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work,
+            pool.children, pool.node_occupied, pool.bricks, pool.brick_lines,
+        )  # fmt: skip
 
     try:
         _in_threads(mark, threads)
-        slots = [int(ends[end - 1]) for _, _, end, _ in parts]
+        slots = [int(ends[cuts[i + 1] - 1]) for i in range(threads)]
+        # every touched brick may need itself and a path of its own; the root is there
         pool.reserve(sum(slots) * (pool.levels - 1), sum(slots))
     except BaseException:
-        for scratch, *_ in parts:
-            scratch.resize(len(scratch))  # marks of a scan that will not be applied
+        for s in scratches:
+            s.reset()
         raise
-    for scratch, begin, end, _ in parts:
+    for i, s in enumerate(scratches):
         resolve_grids(
-            begin,
-            end,
-            roots,
-            ends,
-            pool.levels,
-            scratch.slot_key,
-            scratch.work,
-            pool.children,
-            pool.node_ref,
-            pool.node_occupied,
-            pool.brick_ref,
-            pool.node_free,
-            pool.brick_free,
-            pool.counters,
-        )
+            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, pool.children, pool.node_ref,
+            pool.node_occupied, pool.brick_ref, pool.node_free, pool.brick_free, pool.counters,
+        )  # fmt: skip
     _in_threads(apply, threads)
-    for (scratch, *_), n in zip(parts, slots):
-        drop_sources(n, scratch.work, pool.brick_ref, pool.brick_free, pool.counters)
-    for _, _, _, count in parts:
+    for s, used in zip(scratches, slots):
+        drop_sources(used, s.work, pool.brick_ref, pool.brick_free, pool.counters)
+    for count in counts:
         tally += count
     tally[BRICKS] += sum(slots)
 
@@ -265,7 +248,7 @@ _threads: dict[int, ThreadPoolExecutor] = {}
 def _in_threads(work: Any, n: int) -> None:
     """Call ``work(0) … work(n-1)``, the first of them here; wait for all; the first error is raised."""
     if n not in _threads:
-        _threads[n] = ThreadPoolExecutor(n - 1 or 1, thread_name_prefix="evidence")
+        _threads[n] = ThreadPoolExecutor(n - 1, thread_name_prefix="evidence")
     others = [_threads[n].submit(work, i) for i in range(1, n)]
     try:
         work(0)

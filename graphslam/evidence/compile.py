@@ -15,7 +15,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from graphslam.evidence.update_kernels import update_grids
+from graphslam.evidence.update_kernels import mark_grids
 
 _state = {"checked": False}
 
@@ -35,7 +35,7 @@ def announce_compilation() -> None:
     if _state["checked"]:
         return
     _state["checked"] = True
-    if is_compiled(update_grids):
+    if is_compiled(mark_grids):
         return
     compile_kernels()
 

@@ -70,7 +70,8 @@ class GridPool:
         self.levels = levels
         self.half = half_edge(levels)
         self.lock = threading.RLock()
-        self.counters = np.array([1, 0, 1, 0], np.int64)  # node 0 and brick 0 are "absent"
+        # node 0 and brick 0 are "absent"; the last one is up while an update is between its phases
+        self.counters = np.array([1, 0, 1, 0, 0], np.int64)
         self.children = np.zeros((64, CHILDREN), np.int32)
         self.node_ref = np.zeros(64, np.int32)
         self.node_occupied = np.zeros(64, np.uint64)

@@ -21,9 +21,14 @@ class Scratch:
         marks = np.zeros((slots, BRICK_VOXELS), np.uint8)  # first: it alone can fail for want of memory
         self.slot_key = np.zeros(slots, np.int64)
         self.slot_next = np.zeros(slots, np.int32)
-        self.work = np.zeros((slots, 4), np.int32)
+        self.work = np.zeros((slots, 5), np.int32)
         self.marks = marks
         self.marks64 = marks.view(np.uint64)
+
+    def reset(self) -> None:
+        """Forget marks that will not be applied."""
+        self.window[:] = -1
+        self.marks[:] = 0
 
     def __len__(self) -> int:
         return len(self.slot_key)

@@ -2,10 +2,10 @@
 
 Arrays of the tree, always in this order: ``children (N, 64) int32``, ``node_ref (N,) int32``, ``node_occupied (N,)
 uint64``, ``bricks (B, 512) int16``, ``brick_ref (B,) int32``, ``brick_lines (B,) uint16`` (:mod:`layout`). Free
-nodes and bricks lie on the stacks ``node_free (N,)``, ``brick_free (B,)`` int32; ``counters (4,) int64`` holds [first
-node never used, free nodes on the stack, first brick never used, free bricks on the stack]. Nothing here checks
-capacity: callers reserve first, so that a tree is never left half-changed. Node 0 and brick 0 stand for "absent";
-brick 0 is all unknown, so that reading it as a source is right.
+nodes and bricks lie on the stacks ``node_free (N,)``, ``brick_free (B,)`` int32; ``counters (5,) int64`` holds [first
+node never used, free nodes on the stack, first brick never used, free bricks on the stack, whether an update is between
+its phases]. Nothing here checks capacity: callers reserve first, so that a tree is never left half-changed. Node 0 and
+brick 0 stand for "absent"; brick 0 is all unknown, so that reading it as a source is right.
 """
 
 from __future__ import annotations
