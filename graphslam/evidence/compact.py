@@ -18,6 +18,7 @@ from graphslam.evidence.batch import own_grids
 from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
 from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES, GridPool
+from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 
 if TYPE_CHECKING:
     from graphslam.evidence.grid import EvidenceGrid
@@ -62,7 +63,7 @@ def find_all_states(
 ) -> States:
     """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
     pool = grids[0].pool
-    b, n = int(pool.counters[2]), int(pool.counters[0])  # ids beyond were never used
+    b, n = int(pool.counters[BRICKS_USED]), int(pool.counters[NODES_USED])  # ids beyond were never used
     states = States(
         np.full(b, UNSEEN, np.int32),
         np.full(n, UNSEEN, np.int32),
@@ -132,8 +133,8 @@ class Pieces:
         Of the bricks, x fastest, in units of `layout.STEP`.
     cubes : (m, 3) int64
         Signed coordinates of the first brick of each cube.
-    sizes : (m,) int64
-        The cube's edge is ``8·4**size`` voxels.
+    log_edges : (m,) int64
+        The cube's edge is ``2**log_edge`` ≥ 8 voxels.
     cube_values : (m,) int64
         Known values.
     """
@@ -141,7 +142,7 @@ class Pieces:
     bricks: Ints
     values: npt.NDArray[np.int16]
     cubes: Ints
-    sizes: Ints
+    log_edges: Ints
     cube_values: Ints
 
 
@@ -154,7 +155,7 @@ def pieces_of(grid: EvidenceGrid) -> Pieces:
         mixed = mixed[np.argsort(mixed[:, 0])]
         cubes = cubes[np.argsort(cubes[:, 0])]
         values = pool.bricks[mixed[:, 1]]
-    return Pieces(_unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, cubes[:, 1], cubes[:, 2])
+    return Pieces(_unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, 3 + 2 * cubes[:, 1], cubes[:, 2])
 
 
 def list_grid(grid: EvidenceGrid) -> tuple[Ints, Ints]:
@@ -174,20 +175,21 @@ def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
     """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`overlap`)."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
+    sizes = (pieces.log_edges - 3) // 2  # a cube is one child, or eight, of a node of this level
     values = len(np.unique(pieces.cube_values))
-    nodes = 1 + values * int(pieces.sizes.max(initial=0))
+    nodes = 1 + values * int(sizes.max(initial=0))
     for level in range(pool.levels - 1):  # nodes on the paths to what they hold
-        below = np.concatenate([pieces.bricks, pieces.cubes[pieces.sizes <= level]]) + half
+        below = np.concatenate([pieces.bricks, pieces.cubes[sizes <= level]]) + half
         nodes += len(np.unique(_pack(below >> 2 * (level + 1))))
-    cubes = np.stack([_pack(pieces.cubes + half), pieces.sizes, pieces.cube_values], axis=1)
+    cubes = np.column_stack([pieces.cubes + half, pieces.log_edges, pieces.cube_values])
     uniform = np.zeros((pool.levels, VALUES), np.int32)
     with pool.lock:
         pool.collect()
         pool.reserve(nodes, len(pieces.bricks) + values)
         own_grids((grid,), pool)
         build_tree(
-            grid.root, _pack(pieces.bricks + half), np.ascontiguousarray(pieces.values), cubes,
-            grid.model.threshold_step, pool.levels, uniform, *pool.tree_arrays(), *pool.store_arrays(),
+            grid.root, pieces.bricks + half, pieces.values, cubes, grid.model.threshold_step, pool.levels, uniform,
+            *pool.tree_arrays(), *pool.store_arrays(),
         )  # fmt: skip
     return grid
 
@@ -195,16 +197,14 @@ def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
 def overlap(pieces: Pieces) -> str | None:
     """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
     for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):
-        keys = _pack(rows + (1 << 18))
-        if np.any(np.diff(keys) <= 0):
+        if np.any(np.diff(_pack(rows + (1 << 18))) <= 0):
             return f"{name} are not in ascending order"
-    edges = FAN**pieces.sizes
-    if np.any(pieces.cubes % edges[:, None]):
+    shifts = pieces.log_edges - 3
+    if np.any(pieces.cubes & ((1 << shifts) - 1)[:, None]):
         return "a cube does not begin at a multiple of its edge"
-    for size in np.unique(pieces.sizes).tolist():
-        edge = FAN**size
-        taken = pieces.cubes[pieces.sizes == size] // edge
-        smaller = np.concatenate([pieces.bricks, pieces.cubes[pieces.sizes < size]]) // edge
+    for shift in np.unique(shifts).tolist():
+        taken = pieces.cubes[shifts == shift] >> shift
+        smaller = np.concatenate([pieces.bricks, pieces.cubes[shifts < shift]]) >> shift
         if np.isin(_pack(smaller + (1 << 18)), _pack(taken + (1 << 18))).any():
             return "a cube overlaps another piece"
     return None

@@ -224,10 +224,10 @@ def uniform_cube(
 
 @numba.njit(cache=True, nogil=True)
 def fill_cube(
-    root, x, y, z, log_edge, value, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
+    root, bx, by, bz, log_edge, value, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
     brick_lines, node_free, brick_free, counters,
 ):  # fmt: skip
-    """Give a cube of ``2**log_edge`` (≥ 8) voxels one value; its first voxel has the offset coordinates x, y, z.
+    """Give a cube of ``2**log_edge`` (≥ 8) voxels one value; bx, by, bz are the offset coordinates of its first brick.
 
     A cube of an even ``log_edge`` is eight children of a node, one of an odd ``log_edge`` is one child.
     """
@@ -241,9 +241,9 @@ def fill_cube(
     for iz in range(parts):
         for iy in range(parts):
             for ix in range(parts):
-                bx, by, bz = (x >> 3) + (ix << shift), (y >> 3) + (iy << shift), (z >> 3) + (iz << shift)
-                node = make_path(root, bx, by, bz, size, levels, children, node_ref, node_occupied, node_free, counters)
-                c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
+                x, y, z = bx + (ix << shift), by + (iy << shift), bz + (iz << shift)
+                node = make_path(root, x, y, z, size, levels, children, node_ref, node_occupied, node_free, counters)
+                c = (((z >> shift) & 3) << 4) | (((y >> shift) & 3) << 2) | ((x >> shift) & 3)
                 children[node, c] = child
                 if size == 0:
                     brick_ref[child] += 1
@@ -256,7 +256,8 @@ def add_brick(
     root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, brick_free, counters
 ):  # fmt: skip
     """A brick of one's own at a place that is empty; its voxels are whatever they were."""
-    node = make_path(root, bx, by, bz, 0, levels, children, node_ref, node_occupied, node_free, counters)
+    lowest = levels - levels  # 0, but no literal, for which make_path would be compiled once more
+    node = make_path(root, bx, by, bz, lowest, levels, children, node_ref, node_occupied, node_free, counters)
     b = take_brick(brick_ref, brick_free, counters)
     children[node, ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)] = b
     return b
@@ -296,23 +297,22 @@ def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, 
 
 @numba.njit(cache=True, nogil=True)
 def build_tree(
-    root, keys, values, cubes, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
+    root, corners, values, cubes, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
     brick_lines, node_free, brick_free, counters,
 ):  # fmt: skip
-    """Fill an empty grid with bricks (packed offset coordinates ``keys (n,)``, ``values (n, 512) int16``) and cubes
-    ``(m, 3)`` [packed offset coordinates, size, value]; none overlaps another."""
-    for k in range(keys.shape[0]):
+    """Fill an empty grid with bricks (offset coordinates ``corners (n, 3) int64``, ``values (n, 512) int16``) and cubes
+    ``(m, 5) int64`` [offset coordinates of the first brick, log2 of the edge in voxels, value]; none overlaps another.
+    """
+    for k in range(corners.shape[0]):
         b = add_brick(
-            root, keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40, levels, children, node_ref,
-            node_occupied, brick_ref, node_free, brick_free, counters,
+            root, corners[k, 0], corners[k, 1], corners[k, 2], levels, children, node_ref, node_occupied, brick_ref,
+            node_free, brick_free, counters,
         )  # fmt: skip
         for j in range(512):
             bricks[b, j] = values[k, j]
     for k in range(cubes.shape[0]):
-        key = cubes[k, 0]
         fill_cube(
-            root, (key & 0xFFFFF) << 3, ((key >> 20) & 0xFFFFF) << 3, (key >> 40) << 3, 3 + 2 * cubes[k, 1],
-            cubes[k, 2], threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
-            brick_lines, node_free, brick_free, counters,
+            root, cubes[k, 0], cubes[k, 1], cubes[k, 2], cubes[k, 3], cubes[k, 4], threshold, levels, uniform,
+            children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free, brick_free, counters,
         )  # fmt: skip
     settle_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines)

@@ -51,7 +51,7 @@ class DenseGrid:
     @property
     def origin(self) -> npt.NDArray[np.float64]:
         """Lower corner of the box ``(dim,)`` [m]."""
-        return self.first_voxel * self.voxel_size
+        return np.asarray(self.first_voxel * self.voxel_size)
 
 
 def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
@@ -150,7 +150,7 @@ def from_dense(dense: DenseGrid, *, model: BeamModel | None = None, pool: GridPo
     GridError
         Impossible shape or type, log-odds that are infinite or beyond ±16, voxels outside the addressable cube.
     """
-    values = np.asarray(dense.values)
+    values: npt.NDArray[Any] = np.asarray(dense.values)
     dim = values.ndim
     first = np.asarray(dense.first_voxel)
     if dim not in (2, 3) or first.shape != (dim,) or first.dtype.kind not in "iu":
@@ -159,7 +159,9 @@ def from_dense(dense: DenseGrid, *, model: BeamModel | None = None, pool: GridPo
             got=f"values {values.shape}, first voxel {first.shape} {first.dtype}",
             wanted="(nx, ny) and (2,), or (nx, ny, nz) and (3,) integers",
         )
-    steps = _steps_of(values).reshape(values.shape if dim == 3 else (*values.shape, 1)).transpose(2, 1, 0)
+    steps: npt.NDArray[np.int16] = (
+        _steps_of(values).reshape(values.shape if dim == 3 else (*values.shape, 1)).transpose(2, 1, 0)
+    )
     grid = EvidenceGrid(dense.voxel_size, model=model, pool=pool, dim=dim)
     low = np.zeros(3, np.int64)
     low[:dim] = first
@@ -225,7 +227,7 @@ def save_npz(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
             "bricks": pieces.bricks.astype(np.int32),
             "values": pieces.values,
             "cubes": pieces.cubes.astype(np.int32),
-            "cube_sizes": pieces.sizes.astype(np.uint8),
+            "cube_log_edges": pieces.log_edges.astype(np.uint8),
             "cube_values": pieces.cube_values.astype(np.int16),
         },
     )
@@ -253,7 +255,7 @@ def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> E
     model, voxel_size, dim, levels = _read_head(arrays, where)
     pieces = _read_pieces(arrays, where)
     reach = 0
-    for corner, edge in ((pieces.bricks, 1), (pieces.cubes, FAN ** pieces.sizes[:, None])):
+    for corner, edge in ((pieces.bricks, 1), (pieces.cubes, 1 << pieces.log_edges[:, None] - 3)):
         if len(corner):
             reach = max(reach, BRICK_EDGE * int(max(-corner.min(), (corner + edge).max())))
     if reach > half_edge(levels):
@@ -305,10 +307,12 @@ def _read_pieces(arrays: dict[str, npt.NDArray[Any]], where: str) -> Pieces:
     bricks = _field(arrays, "bricks", np.int32, (-1, 3), where).astype(np.int64)
     values = _field(arrays, "values", np.int16, (len(bricks), BRICK_VOXELS), where)
     cubes = _field(arrays, "cubes", np.int32, (-1, 3), where).astype(np.int64)
-    sizes = _field(arrays, "cube_sizes", np.uint8, (len(cubes),), where).astype(np.int64)
+    edges = _field(arrays, "cube_log_edges", np.uint8, (len(cubes),), where).astype(np.int64)
     cube_values = _field(arrays, "cube_values", np.int16, (len(cubes),), where).astype(np.int64)
-    if sizes.max(initial=0) >= MAX_LEVELS:
-        raise FormatError("size of a cube is impossible", where=where, got=sizes.max(), wanted=f"< {MAX_LEVELS}")
+    if edges.max(initial=3) > 2 * MAX_LEVELS + 2 or edges.min(initial=3) < 3:
+        raise FormatError(
+            "edge of a cube is impossible", where=where, got=f"2^{edges.min()} … 2^{edges.max()}", wanted="2^3 … 2^16"
+        )
     if np.any(cube_values == UNKNOWN) or not (values != UNKNOWN).any(axis=1).all():
         raise FormatError("a cube or brick of unknown voxels is listed", where=where)
-    return Pieces(bricks, values, cubes, sizes, cube_values)
+    return Pieces(bricks, values, cubes, edges, cube_values)

@@ -1,0 +1,288 @@
+"""Evidence grids from and to OctoMap's files: ``.ot`` (log-odds) and ``.bt`` (occupied or free).
+
+What is written is what OctoMap itself would write of the same map: pruned, inner nodes of a ``.ot`` holding the largest
+value below them. The lattice is OctoMap's own, so voxels are the same ones.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.atomic import atomic_open
+from graphslam.core.errors import FormatError, GridError, MissingDataError
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.compact import Pieces, check_reach, find_all_states, grid_of, levels_for
+from graphslam.evidence.cube_kernels import UNSEEN
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import BRICK_VOXELS, DEFAULT_LEVELS, LIMIT, STEP, UNKNOWN
+from graphslam.evidence.octomap_kernels import (
+    BRICKS,
+    CHILDLESS,
+    CUBES,
+    ERROR,
+    NODES,
+    REACH,
+    RECORD,
+    TOO_DEEP,
+    TRUNCATED,
+    read_tree,
+    write_tree,
+)
+from graphslam.evidence.pool import GridPool
+
+log = logging.getLogger(__name__)
+
+BINARY_MAGIC, FULL_MAGIC = b"# Octomap OcTree binary file", b"# Octomap OcTree file"
+HEADER_LIMIT = 1 << 16
+"""Bytes a header may take; its comments are free."""
+OCTOMAP_HALF = 1 << 15
+"""Voxels from the centre of OctoMap's cube to its faces."""
+GUESS = {True: 74, False: 400}
+"""Records a brick takes: no more than this in a ``.bt``, nodes above the bricks apart, seldom more in a ``.ot``."""
+FULL_RECORD = np.dtype([("value", "<f4"), ("code", "u1")])
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    binary: bool
+    nodes: int
+    resolution: float
+    start: int  # byte the records begin at
+
+
+@dataclass(frozen=True, slots=True)
+class _Records:
+    codes: npt.NDArray[np.uint16]
+    values: npt.NDArray[np.int16]
+    width: int  # bytes of one
+
+
+def read_octomap(
+    path: str | os.PathLike[str], *, model: BeamModel | None = None, pool: GridPool | None = None
+) -> EvidenceGrid:
+    """Read a ``.bt`` or ``.ot`` file of an OctoMap ``OcTree``; which of them, the file says.
+
+    Parameters
+    ----------
+    path : path
+    model : BeamModel, optional
+        The files name none. Leaves of a ``.bt`` get its clamping values, as in OctoMap.
+    pool : GridPool, optional
+        Default a new one, of as many levels as the map needs but no less than usual.
+
+    Returns
+    -------
+    EvidenceGrid
+        Log-odds of a ``.ot`` are rounded to the nearest multiple of `layout.STEP` and cut at ±16.
+
+    Raises
+    ------
+    MissingDataError
+        No such file.
+    FormatError
+        Not an ``OcTree``, truncated, corrupt; names the byte.
+    GridError
+        The map reaches beyond the pool's addressable cube.
+    """
+    where = str(path)
+    try:
+        data = Path(path).read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise MissingDataError("no such file", where=where) from None
+    head = _read_header(data, where)
+    if head.nodes == 0 and len(data) == head.start:
+        return EvidenceGrid(head.resolution, model=model, pool=pool)
+    records = _read_records(data, head, where)
+    model = BeamModel() if model is None else model
+    pieces, reach = _pieces_of(records, head, model, where)
+    levels = levels_for(reach)
+    assert levels is not None  # OctoMap's cube is smaller than the largest of ours
+    pool = GridPool(max(levels, DEFAULT_LEVELS)) if pool is None else pool
+    check_reach(reach, pool, where)
+    return grid_of(EvidenceGrid(head.resolution, model=model, pool=pool), pieces)
+
+
+def _read_header(data: bytes, where: str) -> _Header:
+    """The text before the records (octomap/AbstractOcTree.cpp, readHeader)."""
+    first = data[:HEADER_LIMIT].split(b"\n", 1)[0]
+    if first.startswith(BINARY_MAGIC):
+        binary = True
+    elif first.startswith(FULL_MAGIC):
+        binary = False
+    else:
+        raise FormatError(
+            "not an OctoMap file",
+            where=f"{where}, byte 0",
+            got=repr(first[:40]),
+            wanted=f"{BINARY_MAGIC.decode()!r} or {FULL_MAGIC.decode()!r}",
+        )
+    fields: dict[str, tuple[str, int]] = {}
+    at = 0
+    while True:
+        end = data.find(b"\n", at, HEADER_LIMIT)
+        if end < 0:
+            raise FormatError("header is truncated", where=f"{where}, byte {min(len(data), HEADER_LIMIT)}")
+        words = data[at:end].decode("latin-1").split()
+        if words and words[0] == "data":
+            start = end + 1
+            break
+        if words and not words[0].startswith("#"):
+            fields[words[0]] = (words[1] if len(words) > 1 else "", at)
+        at = end + 1
+    for name in ("id", "size", "res"):
+        if name not in fields:
+            raise FormatError(f"header has no {name!r}", where=f"{where}, byte {start}")
+    kind, at = fields["id"]
+    if kind not in ("OcTree", "1"):  # 1: what the first versions called it
+        raise FormatError("another type of OctoMap tree", where=f"{where}, byte {at}", got=kind, wanted="OcTree")
+    size, at = fields["size"]
+    if not (size.isascii() and size.isdigit()):
+        raise FormatError("number of nodes is impossible", where=f"{where}, byte {at}", got=repr(size))
+    text, at = fields["res"]
+    try:
+        resolution = float(text)
+    except ValueError:
+        resolution = math.nan
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise FormatError("resolution is impossible", where=f"{where}, byte {at}", got=repr(text), wanted="> 0 m")
+    return _Header(binary, int(size), resolution, start)
+
+
+def _read_records(data: bytes, head: _Header, where: str) -> _Records:
+    """The bytes after the header as arrays; their structure is not looked at yet."""
+    width = 2 if head.binary else FULL_RECORD.itemsize
+    number, rest = divmod(len(data) - head.start, width)
+    if rest:
+        raise FormatError(
+            "file ends within a record", where=f"{where}, byte {len(data)}", got=f"{rest} bytes", wanted=f"{width}"
+        )
+    if head.binary:
+        codes = np.frombuffer(data, "<u2", number, head.start)
+        return _Records(codes.astype(np.uint16), np.zeros(0, np.int16), width)
+    rows = np.frombuffer(data, FULL_RECORD, number, head.start)
+    floats = np.ascontiguousarray(rows["value"])
+    bad = np.flatnonzero(~np.isfinite(floats))
+    if len(bad):
+        raise FormatError(
+            "log-odds of a node is not finite",
+            where=f"{where}, byte {head.start + width * int(bad[0])}",
+            got=float(floats[bad[0]]),
+        )
+    leaf = rows["code"] == 0
+    cut = int(np.count_nonzero(np.abs(floats[leaf]) > LIMIT * STEP))
+    if cut:
+        log.warning("%s: log-odds of %d leaves cut at ±%g", where, cut, LIMIT * STEP)
+    values = np.clip(np.rint(floats * np.float32(1 / STEP)), -LIMIT, LIMIT).astype(np.int16)
+    return _Records(rows["code"].astype(np.uint16), values, width)
+
+
+def _pieces_of(records: _Records, head: _Header, model: BeamModel, where: str) -> tuple[Pieces, int]:
+    """What the records say, and how far it reaches [voxels]; their structure is checked before room is made."""
+    stack, tally = np.zeros((8 * 17, 5), np.int64), np.zeros(6, np.int64)
+    bricks, cubes = np.zeros((0, 3), np.int64), np.zeros((0, 5), np.int64)
+    values = np.zeros((0, BRICK_VOXELS), np.int16)
+    low, high = model.clamp_steps
+    read_tree(records.codes, records.values, low, high, stack, bricks, values, cubes, tally)
+    _check_tree(records, head, tally, where)
+    bricks, cubes = np.empty((tally[BRICKS], 3), np.int64), np.empty((tally[CUBES], 5), np.int64)
+    values = np.full((len(bricks), BRICK_VOXELS), UNKNOWN, np.int16)
+    read_tree(records.codes, records.values, low, high, stack, bricks, values, cubes, tally)
+    return Pieces(bricks, values, cubes[:, :3], cubes[:, 3], cubes[:, 4]), int(tally[REACH])
+
+
+def _check_tree(records: _Records, head: _Header, tally: Ints, where: str) -> None:
+    record = int(tally[RECORD])
+    place = f"{where}, byte {head.start + records.width * record}"
+    if tally[ERROR] == TRUNCATED:
+        raise FormatError("tree is truncated", where=place, got=f"{record} records", wanted="more")
+    if tally[ERROR] == TOO_DEEP:
+        raise FormatError("a node lies deeper than 16 levels", where=place)
+    if tally[ERROR] == CHILDLESS:
+        raise FormatError("an inner node has no children", where=place)
+    if record < len(records.codes):
+        left = (len(records.codes) - record) * records.width
+        raise FormatError("bytes are left over behind the tree", where=place, got=f"{left} bytes")
+    if tally[NODES] != head.nodes:
+        raise FormatError(
+            "number of nodes is not that of the header", where=place, got=int(tally[NODES]), wanted=head.nodes
+        )
+
+
+def write_octomap(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
+    """Write a grid as an OctoMap ``OcTree``, whole or not at all.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        A 2-D grid is written as the layer of voxels it is.
+    path : path
+        Ending in ``.ot``: log-odds, exact. Ending in ``.bt``: known voxels are occupied or free by the model's
+        threshold (maximum likelihood), and nothing more is kept of them.
+
+    Raises
+    ------
+    FormatError
+        Another ending.
+    GridError
+        Known voxels outside OctoMap's ±32,768.
+    """
+    suffix = Path(path).suffix
+    if suffix not in (".bt", ".ot"):
+        raise FormatError("unknown ending of an OctoMap file", where=str(path), got=suffix, wanted=".bt or .ot")
+    binary = suffix == ".bt"
+    codes, values, nodes = _records_of(grid, binary, str(path))
+    magic = BINARY_MAGIC if binary else FULL_MAGIC
+    with atomic_open(path) as stream:
+        stream.write(magic + b"\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n")
+        stream.write(f"id OcTree\nsize {nodes}\nres {grid.voxel_size!r}\ndata\n".encode("ascii"))
+        if binary:
+            stream.write(codes.astype("<u2").tobytes())
+        else:
+            rows = np.empty(len(codes), FULL_RECORD)
+            rows["value"], rows["code"] = values * np.float32(STEP), codes
+            stream.write(rows.tobytes())
+
+
+def _records_of(
+    grid: EvidenceGrid, binary: bool, where: str
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int16], int]:
+    pool = grid.pool
+    codes, values = np.zeros(0, np.uint16), np.zeros(0, np.int16)
+    tally = np.zeros(6, np.int64)
+    with pool.lock:
+        if grid.root == 0:
+            return codes, values, 0
+        threshold = grid.model.threshold_step
+        states = find_all_states([grid], classes=binary, threshold=threshold, maxima=not binary)
+        if pool.half > OCTOMAP_HALF:
+            _check_middle(grid, states.node, where)
+        tally[RECORD] = GUESS[binary] * np.count_nonzero(states.brick != UNSEEN)
+        while tally[RECORD] > len(codes):  # once, or twice where the guess was short
+            codes = np.empty(int(tally[RECORD]), np.uint16)
+            values = np.empty(0 if binary else len(codes), np.int16)
+            write_tree(
+                grid.root, pool.levels, binary, threshold, pool.children, pool.bricks, states.brick, states.node,
+                states.brick_max, states.node_max, np.zeros((8 * 17, 5), np.int64), codes, values, tally,
+            )  # fmt: skip
+    return codes[: tally[RECORD]], values[: tally[RECORD]], int(tally[NODES])
+
+
+def _check_middle(grid: EvidenceGrid, states: npt.NDArray[np.int32], where: str) -> None:
+    """Refuse a grid of 7 levels that holds anything outside the middle eight of its root's children."""
+    children = grid.pool.children[grid.root]
+    inner = np.zeros((4, 4, 4), bool)
+    inner[1:3, 1:3, 1:3] = True
+    outer = children[(children != 0) & ~inner.ravel()]
+    if np.any(states[outer] != UNKNOWN):
+        raise GridError(
+            "known voxels lie outside OctoMap's cube", where=where, wanted=f"±{OCTOMAP_HALF} voxels of the origin"
+        )

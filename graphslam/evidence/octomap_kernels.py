@@ -1,0 +1,218 @@
+"""Compiled reading and writing of OctoMap's trees (Hornung et al. 2013; octomap/OcTreeBaseImpl.hxx).
+
+An OctoMap tree has 16 levels over a cube of 2¹⁶ voxels a side, the key of a voxel being its signed coordinate + 2¹⁵.
+Child i of a node lies at the upper side of x, y, z where bits 0, 1, 2 of i are set; nodes are written depth first, a
+node before its children. Here m = 16 - depth is the level of a node above the voxels: its edge is 2^m voxels.
+
+A *record* is what the file holds of a node: in a ``.bt`` two bits for each child of a node that has children, in a
+``.ot`` the log-odds of any node and one bit for each child.
+"""
+
+from __future__ import annotations
+
+import numba
+
+from graphslam.evidence.cube_kernels import voxel_state
+
+# what reading found, and where it stands in a tally
+TRUNCATED, TOO_DEEP, CHILDLESS = 1, 2, 3
+ERROR, RECORD, NODES, REACH, BRICKS, CUBES = 0, 1, 2, 3, 4, 5
+
+
+@numba.njit(cache=True, nogil=True)
+def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tally):
+    """Go through a file's records; list its bricks and its leaves of at least a brick's size.
+
+    codes : (r,) uint16 bits of the children; values : (r,) int16 log-odds of a ``.ot``, (0,) of a ``.bt``.
+    low, high : values of the free and occupied leaves of a ``.bt``.
+    stack : (n, 5) int64 scratch, at least 8·17 rows.
+    bricks : (b, 3) int64 out, signed coordinates; brick_values : (b, 512) int16 out, all unknown before.
+    cubes : (c, 5) int64 out, signed coordinates of the first brick, m, value.
+    tally : (6,) int64 out: error, records read, nodes, voxels from the centre to the farthest face, bricks, cubes; the
+    last two also where the arrays are too short.
+    """
+    binary = values.shape[0] == 0
+    record, nodes, reach, found, large = 0, 0, 0, 0, 0
+    # level, corner, and what the parent said: 1 free, 2 occupied, 3 see the next record
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3], stack[0, 4] = 16, 0, 0, 0, 3
+    n = 1
+    while n > 0:
+        n -= 1
+        m, x, y, z, kind = stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4]
+        nodes += 1
+        value, code = low, 0
+        if kind == 3:
+            tally[RECORD] = record
+            if record == codes.shape[0]:
+                tally[ERROR] = TRUNCATED
+                return
+            code = int(codes[record])
+            if not binary:
+                value = int(values[record])
+            elif code == 0:
+                tally[ERROR] = CHILDLESS
+                return
+            record += 1
+        elif kind == 2:
+            value = high
+        edge = 1 << m
+        if code != 0:
+            if m == 0:
+                tally[ERROR] = TOO_DEEP
+                return
+            if m == 3:
+                if found < bricks.shape[0]:
+                    bricks[found, 0], bricks[found, 1], bricks[found, 2] = (
+                        (x >> 3) - 4096,
+                        (y >> 3) - 4096,
+                        (z >> 3) - 4096,
+                    )
+                found += 1
+            half = edge >> 1
+            for k in range(8):
+                i = 7 - k  # the first comes off the stack first
+                what = (code >> (2 * i)) & 3 if binary else 3 * ((code >> i) & 1)
+                if what != 0:
+                    stack[n, 0] = m - 1
+                    stack[n, 1] = x + half * (i & 1)
+                    stack[n, 2] = y + half * ((i >> 1) & 1)
+                    stack[n, 3] = z + half * (i >> 2)
+                    stack[n, 4] = what
+                    n += 1
+            continue
+        # a leaf
+        near, far = min(x, y, z), max(x, y, z)
+        reach = max(reach, 32768 - near, far + edge - 32768)
+        if m >= 3:
+            if large < cubes.shape[0]:
+                cubes[large, 0], cubes[large, 1], cubes[large, 2] = (x >> 3) - 4096, (y >> 3) - 4096, (z >> 3) - 4096
+                cubes[large, 3], cubes[large, 4] = m, value
+            large += 1
+        elif found <= brick_values.shape[0]:
+            j = ((z & 7) << 6) | ((y & 7) << 3) | (x & 7)
+            for dz in range(edge):
+                for dy in range(edge):
+                    for dx in range(edge):
+                        brick_values[found - 1, j + (dz << 6) + (dy << 3) + dx] = value
+    tally[RECORD], tally[NODES], tally[REACH], tally[BRICKS], tally[CUBES] = record, nodes, reach, found, large
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+#
+# A node of the octree is (m, id, part) in our tree. Ours has four children a side, so a node of even m ≥ 4 is an octant
+# of one of ours, one of odd m ≥ 5 all of it, m = 3 a brick, m < 3 a part of one. Above the root's octants (m = top =
+# 2·levels + 2) there are nodes with one octant of the root each, since ours are centred on a corner of OctoMap's.
+
+
+@numba.njit(cache=True, nogil=True)
+def child_of(m, node, part, i, levels, children):
+    """Child i of a node of the octree as (id, part)."""
+    ix, iy, iz = i & 1, (i >> 1) & 1, i >> 2
+    top = 2 * levels + 2
+    if m > top:
+        if m == 16:
+            return node, i
+        return (node, part) if i == 7 - part else (0, 0)
+    if m == 16:  # of 7 levels: OctoMap's cube is the middle of ours
+        return int(children[node, ((1 + iz) << 4) | ((1 + iy) << 2) | (1 + ix)]), 0
+    if m < 4:
+        h = m - 1
+        return node, part | (iz << (6 + h)) | (iy << (3 + h)) | (ix << h)
+    if m & 1:
+        return node, i
+    z, y, x = 2 * (part >> 2) + iz, 2 * ((part >> 1) & 1) + iy, 2 * (part & 1) + ix
+    return int(children[node, (z << 4) | (y << 2) | x]), 0
+
+
+@numba.njit(cache=True, nogil=True)
+def look_at(
+    m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
+):  # fmt: skip
+    """State of a node of the octree, and its largest known value where ``brick_max`` is not empty."""
+    if node == 0:
+        return -32768, -32768
+    want_max = brick_max.shape[0] > 0
+    if m == 3:
+        return int(brick_state[node]), (int(brick_max[node]) if want_max else 0)
+    if m == 16 or (m > 3 and m & 1 == 1 and m < 2 * levels + 2):
+        return int(node_state[node]), (int(node_max[node]) if want_max else 0)
+    state, largest = 1 << 21, -32768
+    if m < 3:
+        edge = 1 << m
+        for z in range(edge):
+            for y in range(edge):
+                for x in range(edge):
+                    v = int(bricks[node, part + (z << 6) + (y << 3) + x])
+                    largest = max(largest, v)
+                    s = voxel_state(v, classes, threshold)
+                    state = s if state == 1 << 21 or state == s else 1 << 20
+                if state == 1 << 20 and not want_max:
+                    return state, 0
+        return state, largest
+    level = min(m, 2 * levels + 2)
+    for i in range(8):
+        child, _ = child_of(level, node, part, i, levels, children)
+        s, v = -32768, -32768
+        if child != 0:
+            if level == 4:
+                s, v = int(brick_state[child]), (int(brick_max[child]) if want_max else 0)
+            else:
+                s, v = int(node_state[child]), (int(node_max[child]) if want_max else 0)
+        largest = max(largest, v)
+        state = s if state == 1 << 21 or state == s else 1 << 20
+    if m > level and state != -32768:
+        state = 1 << 20  # seven eighths of it lie outside our cube
+    return state, largest
+
+
+@numba.njit(cache=True, nogil=True)
+def write_tree(
+    root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max, stack, codes,
+    values, tally,
+):  # fmt: skip
+    """Records of a grid's tree with all that is of one value (``classes``: of one class, a ``.bt``) pruned.
+
+    codes : (r,) uint16 out; values : (r,) int16 out, not used with ``classes``. tally : (6,) int64 out, numbers of
+    records and nodes, also where the arrays are too short.
+    """
+    # by way of the stack: for literals look_at would be compiled once more
+    stack[0, 0], stack[0, 1], stack[0, 2] = 16, root, 0
+    m, node, part = stack[0, 0], stack[0, 1], stack[0, 2]
+    state, largest = look_at(
+        m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
+    )  # fmt: skip
+    record, nodes, n = 0, 0, 0
+    room = codes.shape[0]
+    if state != -32768:
+        stack[0, 3], stack[0, 4] = state, largest
+        n = 1
+    while n > 0:
+        n -= 1
+        m, node, part, state, largest = stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4]
+        nodes += 1
+        leaf = state != 1 << 20
+        if classes and leaf and m < 16:  # a .bt has no record of a leaf; its root has no parent to speak for it
+            continue
+        code = 0
+        if classes or not leaf:
+            for k in range(8):
+                i = 7 - k
+                child, where = child_of(m, node, part, i, levels, children)
+                s, v = look_at(
+                    m - 1, child, where, levels, classes, threshold, children, bricks, brick_state, node_state,
+                    brick_max, node_max,
+                )  # fmt: skip
+                if s == -32768:
+                    continue
+                if classes:
+                    code |= (3 if s == 1 << 20 else (2 if s == 1 else 1)) << (2 * i)
+                else:
+                    code |= 1 << i
+                stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4] = m - 1, child, where, s, v
+                n += 1
+        if record < room:
+            codes[record] = code
+            if not classes:
+                values[record] = largest
+        record += 1
+    tally[RECORD], tally[NODES] = record, nodes
