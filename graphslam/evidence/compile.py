@@ -11,11 +11,14 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from graphslam.evidence.update_kernels import mark_grids
+
+if TYPE_CHECKING:
+    from graphslam.evidence.grid import EvidenceGrid
 
 _state = {"checked": False}
 
@@ -56,6 +59,8 @@ def _uses() -> list[tuple[str, Callable[[], object]]]:
     import numpy as np
 
     from graphslam.evidence.batch import update_grids as update_many
+    from graphslam.evidence.compact import compact
+    from graphslam.evidence.formats import to_dense
     from graphslam.evidence.grid import EvidenceGrid
 
     grid = EvidenceGrid(1.0)
@@ -74,6 +79,17 @@ def _uses() -> list[tuple[str, Callable[[], object]]]:
         ("boxes", lambda: (grid.box_query(-point, point), grid.bounding_box())),
         ("clouds", grid.occupied_cloud),
         ("sums", lambda: (grid.entropy(), grid.memory())),
+        ("dense", lambda: to_dense(grid, dtype=np.float32)),
+        ("compaction", lambda: compact([grid, other])),
+        ("files", lambda: _through_files(grid, Path(folder.name))),
         ("clean-up", folder.cleanup),
     ]
     return uses
+
+
+def _through_files(grid: EvidenceGrid, folder: Path) -> None:
+    from graphslam.evidence.octomap import read_octomap, write_octomap
+
+    for suffix in (".bt", ".ot"):
+        write_octomap(grid, folder / f"one{suffix}")
+        read_octomap(folder / f"one{suffix}")

@@ -17,6 +17,7 @@ from graphslam.evidence.dense_kernels import dense_log_odds, dense_values
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, FAN, LIMIT, MAX_LEVELS, STEP, UNKNOWN, half_edge
 from graphslam.evidence.pool import GridPool
+from graphslam.evidence.query_kernels import find_bounds
 
 FORMAT = "graphslam.evidence/1"
 
@@ -57,21 +58,16 @@ class DenseGrid:
 def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
     """First known voxel and the one after the last, on each axis ``(3,)``; both 0 where nothing is known."""
     pool = grid.pool
-    low, high = np.full(3, 2 * pool.half), np.zeros(3, np.int64)
+    bounds = np.empty(6, np.int64)
     with pool.lock:
-        mixed, cubes = list_grid(grid)
-        for axis in range(3):
-            shift, others = 20 * axis, tuple(a for a in (0, 1, 2, 3) if a != 3 - axis)  # axes are brick, z, y, x
-            first = ((cubes[:, 0] >> shift) & 0xFFFFF) * BRICK_EDGE
-            low[axis] = first.min(initial=low[axis])
-            high[axis] = (first + BRICK_EDGE * FAN ** cubes[:, 1]).max(initial=0)
-            at = (mixed[:, 0] >> shift) & 0xFFFFF
-            for edge in (at.min(initial=1 << 20), at.max(initial=-1)):  # only the outermost bricks matter
-                known = pool.bricks[mixed[at == edge, 1]].reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE) != UNKNOWN
-                where = edge * BRICK_EDGE + np.flatnonzero(known.any(axis=others))
-                low[axis] = where.min(initial=low[axis])
-                high[axis] = (where + 1).max(initial=high[axis])
-    if high[0] == 0:
+        mixed, cubes = list_grid(grid)  # not brick by brick: a cube may have millions of them
+        find_bounds(mixed, pool.bricks, bounds)
+    low, high = bounds[:3], bounds[3:] + 1
+    if len(cubes):
+        first = np.stack([cubes[:, 0] & 0xFFFFF, (cubes[:, 0] >> 20) & 0xFFFFF, cubes[:, 0] >> 40], axis=1) * BRICK_EDGE
+        low = np.minimum(low, first.min(axis=0))
+        high = np.maximum(high, (first + BRICK_EDGE * FAN ** cubes[:, 1:2]).max(axis=0))
+    if high[0] <= low[0]:
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     return low - pool.half, high - pool.half
 

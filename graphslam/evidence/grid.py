@@ -332,6 +332,22 @@ class EvidenceGrid:
         """Memory of this grid, and what of it no other grid shares; for sets of grids, `memory.memory`."""
         return memory(self)
 
+    def save(self, path: Any) -> None:
+        """Write an ``.npz`` that `formats.load_npz` reads, without loss; what is of one value is written once."""
+        from graphslam.evidence.formats import save_npz
+
+        save_npz(self, path)
+
+    def _repr_html_(self) -> str:
+        counts, box, m = self.voxel_counts(), self.bounding_box(), self.memory()
+        extent = "empty" if box is None else " × ".join(f"{d:.1f}" for d in box[1] - box[0]) + " m"
+        return (
+            f"<b>EvidenceGrid</b> {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
+            f"<table><tr><td>extent of what is known</td><td>{extent}</td></tr>"
+            f"<tr><td>voxels occupied / free</td><td>{counts.occupied:,} / {counts.free:,}</td></tr>"
+            f"<tr><td>memory, own / shared</td><td>{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB</td></tr></table>"
+        )
+
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""
         return f"EvidenceGrid({self.voxel_size:g} m, {self.dim}-D, {len(self.brick_coordinates())} bricks{state})"
