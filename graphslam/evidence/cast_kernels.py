@@ -168,7 +168,7 @@ def cast_rays(
             gy = (((by + uy) << 3) - oy) * iy
             gz = (((bz + uz) << 3) - oz) * iz
             t, axis = 0.0, 3  # where and by which axis the present brick was entered; 3: the ray began in it
-            cx, cy, cz = -1, -1, -1
+            cx, cy, cz = -9, -9, -9  # present block of bricks; a ray that leaves the cube comes to -1
             node, mask = 0, np.uint64(0)
             state, leave = MAX_RANGE, 0.0
             while t <= reach_voxels:
@@ -216,7 +216,7 @@ def cast_rays(
                         gx = (((bx + ux) << 3) - ox) * ix
                         gy = (((by + uy) << 3) - oy) * iy
                         gz = (((bz + uz) << 3) - oz) * iz
-                        cx = -1
+                        cx = -9
                         continue
                     mask = node_occupied[np.uint64(node)]
                 c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)

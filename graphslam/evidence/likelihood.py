@@ -173,9 +173,10 @@ def log_weights(
     rays = (p - o)[:, : first.dim]
     with np.errstate(invalid="ignore", over="ignore"):
         measured = np.linalg.norm(rays, axis=1)
+    no_beam = ~np.isfinite(rays).all(axis=1) | (measured == 0.0)
     if len(r):
-        measured[(r == 0) & np.isfinite(measured)] = np.inf
-    measured[~np.isfinite(rays).all(axis=1) | (measured == 0.0)] = np.nan
+        measured[r == 0] = np.inf
+    measured[no_beam] = np.nan
     if isinstance(likelihood, EndpointLikelihood):
         ends = measured <= limit
         found = endpoint_probability(
