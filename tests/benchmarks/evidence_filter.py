@@ -1,0 +1,211 @@
+"""Many grids at once: a particle filter's step, its memory over a long way, and the time to start.
+
+The filter of both measurements: each particle has a pose (the true one with a random walk of its own on top) and a
+grid; every scan it is moved, weighted, and its grid updated.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+from graphslam.core.se3 import se3_compose, se3_exp
+from graphslam.evidence.batch import update_grids
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
+from tests.benchmarks.evidence_scenes import FAN_RATE, Scene, tunnel
+
+WALK = np.repeat([3e-4, 3e-3], 3)  # σ of a particle's motion per scan: rotation [rad], translation [m]
+CASTING = CastLikelihood(exponent=0.02)  # 181 beams count as 3.6
+END_POINTS = EndpointLikelihood(exponent=0.02, interpolation="nearest")  # 10 scans of 181 beams count as 36
+
+
+@dataclass
+class Cloud:
+    """Particles: what they add to the true pose, their grids and log weights."""
+
+    number: int
+    seed: int
+    threads: int = 1
+    voxel_size: float = 0.1
+    grids: list[EvidenceGrid] = field(init=False)
+    resampled: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        self.rng = SeedTree(self.seed).child("particles").generator()
+        self.errors = np.tile([0.0, 0, 0, 0, 0, 0, 1], (self.number, 1))
+        first = EvidenceGrid(self.voxel_size)
+        self.grids = [first, *(first.empty() for _ in range(self.number - 1))]
+        self.log_weights = np.zeros(self.number)
+
+    def move(self, pose: Array) -> Array:
+        """A scan later: poses ``(P, 7)``."""
+        self.errors = se3_compose(self.errors, se3_exp(self.rng.normal(scale=WALK, size=(self.number, 6))))
+        return se3_compose(np.broadcast_to(pose, self.errors.shape), self.errors)
+
+    @property
+    def effective(self) -> float:
+        """1 / Σ w²."""
+        w = np.exp(self.log_weights - self.log_weights.max())
+        return float(w.sum() ** 2 / np.sum(w * w))
+
+    def resample(self) -> None:
+        """Systematic resampling; grids are copied, dead ones released."""
+        w = np.exp(self.log_weights - self.log_weights.max())
+        edges = np.cumsum(w) / w.sum()
+        index = np.searchsorted(edges, (self.rng.random() + np.arange(self.number)) / self.number)
+        index = np.minimum(index, self.number - 1)
+        self.grids = [self.grids[k].copy() for k in index]
+        self.errors = self.errors[index]
+        self.log_weights = np.zeros(self.number)
+        self.resampled += 1
+
+
+def filter_step(scans: int, *, particles: int = 40) -> float:
+    """Print the parts of a filter step, with one thread and with two; real time over the step's, with one.
+
+    Weight by ray casting, resample when N_eff falls below half, update; 181 beams in the tunnel at 0.1 m, after
+    the first quarter of the scans. One thread: process CPU time. Two: wall time, so it needs an idle machine.
+    """
+    print(f"filter step, {particles} particles, 181 beams, 0.1 m (ms a scan)")
+    scene = tunnel(scans)
+    ratio = 0.0
+    for threads in (1, 2):
+        parts, resampled = _run(
+            scene, Cloud(particles, 5, threads), time.process_time if threads == 1 else time.perf_counter
+        )
+        typical = np.median(parts, axis=0) * 1e3
+        mean = parts.mean(axis=0) * 1e3
+        speed = 1e3 / FAN_RATE / mean.sum()
+        ratio = speed if threads == 1 else ratio
+        clock = "CPU" if threads == 1 else "wall"
+        print(
+            f"  {threads} thread{'s' * (threads > 1)} ({clock}): move {mean[0]:.2f}, cast and weight {mean[1]:.2f}, "
+            f"resample {mean[2]:.3f} ({resampled} times), update {mean[3]:.2f}; total {mean.sum():.2f} mean, "
+            f"{typical.sum():.2f} median: {speed:.2f} × real time",
+            flush=True,
+        )
+    return ratio
+
+
+def _run(scene: Scene, cloud: Cloud, clock) -> tuple[Array, int]:  # type: ignore[no-untyped-def]
+    parts = np.zeros((len(scene), 4))
+    before = 0
+    for k, (pose, points, _) in enumerate(scene):
+        if k == len(scene) // 4:
+            before = cloud.resampled
+        t0 = clock()
+        poses = cloud.move(pose)
+        t1 = clock()
+        if k:
+            cloud.log_weights += log_weights(
+                cloud.grids, poses, points, CASTING, max_range=scene.max_range, threads=cloud.threads
+            )
+        t2 = clock()
+        if cloud.effective < cloud.number / 2:
+            cloud.resample()
+            poses = se3_compose(np.broadcast_to(pose, cloud.errors.shape), cloud.errors)
+        t3 = clock()
+        update_grids(cloud.grids, poses, points, max_range=scene.max_range, threads=cloud.threads)
+        parts[k] = t1 - t0, t2 - t1, t3 - t2, clock() - t3
+    return parts[len(scene) // 4 :], cloud.resampled - before
+
+
+def particle_memory(*, scans: int, particles: int, png: Path | None = None) -> tuple[float, float]:
+    """Memory of many particles over a long way, at its end and at its peak, over that of one map at the end.
+
+    End-point weights, systematic resampling every 10 scans; memory is that of living nodes and bricks, taken after
+    every update.
+    """
+    scene = tunnel(scans)
+    single = EvidenceGrid(0.1)
+    cloud = Cloud(particles, 6)
+    used, one, room = np.zeros(scans), np.zeros(scans), 0
+    for k, (pose, points, _) in enumerate(tqdm(scene, total=scans, desc=f"{particles} particles", leave=False)):
+        poses = cloud.move(pose)
+        if k:
+            cloud.log_weights += log_weights(cloud.grids, poses, points, END_POINTS, max_range=scene.max_range)
+        if k and k % 10 == 0:
+            cloud.resample()
+            poses = se3_compose(np.broadcast_to(pose, cloud.errors.shape), cloud.errors)
+        update_grids(cloud.grids, poses, points, max_range=scene.max_range)
+        single.insert_scan(points, pose=pose, max_range=scene.max_range)
+        used[k], one[k] = cloud.grids[0].pool.used_bytes, single.pool.used_bytes
+        room = max(room, cloud.grids[0].pool.nbytes)
+    end, peak = used[-1] / one[-1], used.max() / one[-1]
+    print(
+        f"memory of {particles} particles, {scans} scans: end {used[-1] / 1e6:.1f} MB ({end:.2f} ×), peak "
+        f"{used.max() / 1e6:.1f} MB ({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
+        flush=True,
+    )
+    if png is not None:
+        _draw(png, used / 1e6, one / 1e6, particles)
+    return float(end), float(peak)
+
+
+def _draw(png: Path, used: Array, one: Array, particles: int) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
+    metres = np.arange(len(used)) / FAN_RATE
+    axes.plot(metres, used, label=f"{particles} particles", lw=1)
+    axes.plot(metres, one, label="one map", lw=1)
+    axes.plot(metres, particles * one, label=f"{particles} maps that share nothing", lw=1, ls=":")
+    axes.set(xlabel="way [m]", ylabel="memory [MB]", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(png, dpi=150)
+
+
+_COMPILE = "from graphslam.evidence.compile import compile_kernels; compile_kernels(progress=False)"
+_START = """
+import numpy as np
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.queries import cast
+grid = EvidenceGrid(0.1)
+grid.insert_scan(np.array([[3.0, 0.0, 0.0], [3.0, 1.0, 0.0]]), max_range=30.0)
+assert abs(cast(grid, np.zeros(3), np.array([[1.0, 0.0, 0.0]]), 30.0).ranges[0] - 3.0) < 0.11
+"""
+
+
+def start_up(repetitions: int) -> tuple[float, float]:
+    """CPU seconds of compiling every kernel in a fresh process, and of import, first grid, first scan and first cast
+    in one that finds them compiled, over those of importing numpy; the least of the repetitions."""
+    with tempfile.TemporaryDirectory() as cache:
+        cold = _child(_COMPILE, cache) - _least(_numpy_and_numba, cache, repetitions)
+        warm = _least(_START, cache, repetitions + 2) - _least("import numpy", cache, repetitions + 2)
+        megabytes = sum(p.stat().st_size for p in Path(cache).rglob("*") if p.is_file()) / 1e6
+    print(
+        f"start: compiling everything {cold:.2f} s, {megabytes:.1f} MB kept; compiled before {warm:.2f} s", flush=True
+    )
+    return cold, warm
+
+
+_numpy_and_numba = "import numpy, numba"
+
+
+def _least(code: str, cache: str, repetitions: int) -> float:
+    return min(_child(code, cache) for _ in range(repetitions))
+
+
+def _child(code: str, cache: str) -> float:
+    """CPU seconds of a fresh process."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
