@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GridError, GridLockedError
 from graphslam.core.geometry import Array
+from graphslam.core.interrupt import deferred_interrupts
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
@@ -215,9 +216,9 @@ class EvidenceGrid:
         if len(np.unique(keys)) != len(keys):
             raise GridError("a brick stands twice in one write", wanted="each brick once")
         pool = self.pool
-        with pool.lock:
+        with pool.lock, deferred_interrupts():
+            own_grids((self,), pool)  # first: it may take a node itself
             pool.reserve(len(c) * (pool.levels - 1), len(c))
-            own_grids((self,), pool)
             write_bricks(
                 self.root,
                 keys,

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
+from graphslam.core.interrupt import deferred_interrupts
 from graphslam.evidence.batch import own_grids
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
 from graphslam.evidence.merge_kernels import add_bricks, sample_bricks
@@ -77,9 +78,9 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
         if known == 0:
             continue
         found += known
-        with pool.lock:
+        with pool.lock, deferred_interrupts():
+            own_grids((work,), pool)  # first: it may take a node itself
             pool.reserve(len(part) * (pool.levels - 1), len(part))
-            own_grids((work,), pool)
             add_bricks(
                 work.root, part, values, grid.model.steps, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
             )
