@@ -26,13 +26,20 @@ _VERBS = {
     "study": "graphslam.app.verbs",
     "open_study": "graphslam.app.verbs",
 }
+# types a notebook makes itself
+_TYPES = {
+    "EvidenceGrid": "graphslam.evidence.grid",
+    "GridPool": "graphslam.evidence.pool",
+    "BeamModel": "graphslam.evidence.beams",
+}
+_NAMES = {**_VERBS, **_TYPES}
 
-__all__ = ["__version__", *_VERBS]
+__all__ = ["__version__", *_NAMES]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _VERBS:
-        return getattr(importlib.import_module(_VERBS[name]), name)
+    if name in _NAMES:
+        return getattr(importlib.import_module(_NAMES[name]), name)
     raise AttributeError(f"module 'graphslam' has no attribute {name!r}")
 
 
