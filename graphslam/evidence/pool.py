@@ -44,7 +44,7 @@ class RootBox:
         self.dead = dead
 
     def __del__(self) -> None:
-        if self.root:
+        if getattr(self, "root", 0):  # none yet, if Ctrl-C fell into __init__
             self.dead.append(self.root)  # atomic; the pool takes it from there
 
 
@@ -168,21 +168,33 @@ class GridPool:
         if not foreign:
             return boxes
         self.reserve(len(foreign), 0)
-        roots = np.array([boxes[k].root for k in foreign], np.int64)
-        own_roots(
-            roots,
-            np.ones(len(foreign), np.uint8),
-            self.levels,
-            self.children,
-            self.node_ref,
-            self.node_occupied,
-            self.brick_ref,
-            self.node_free,
-            self.counters,
-        )
+        before = [boxes[k].root for k in foreign]
+        roots = np.array(before, np.int64)
+        fresh = [RootBox(0, self.dead) for _ in foreign]
+
+        def hand_over() -> None:
+            for box, old, new in zip(fresh, before, roots.tolist()):
+                box.root = new if new != old else 0
+
+        try:
+            own_roots(
+                roots,
+                np.ones(len(foreign), np.uint8),
+                self.levels,
+                self.children,
+                self.node_ref,
+                self.node_occupied,
+                self.brick_ref,
+                self.node_free,
+                self.counters,
+            )
+            hand_over()
+        except BaseException:  # Ctrl-C, after the roots were taken and before somebody owned them
+            hand_over()
+            raise
         owned = list(boxes)
-        for k, root in zip(foreign, roots.tolist()):
-            owned[k] = RootBox(root, self.dead)
+        for k, box in zip(foreign, fresh):
+            owned[k] = box
         return owned
 
     def __repr__(self) -> str:

@@ -18,19 +18,22 @@ from hypothesis.stateful import (
     rule,
 )
 
-from graphslam.core.errors import GridLockedError
+from graphslam.core.errors import GridError, GridLockedError
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.compact import compact
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_pool import assert_same, check_pool
-from tests.reference.evidence_twin import EvidenceTwin
+from tests.reference.evidence_twin import EvidenceTwin, pose_matrix
 
 VOXEL = 0.25
 MODELS = (BeamModel(), BeamModel(hit=0.9, miss=0.3, clamp=(0.02, 0.98), threshold=0.7))
 SEEDS = st.integers(0, 2**32 - 1)
 EDGE = 64
 """Half the cube of a pool of two levels, in voxels: small, so that rays leave it and trees share much."""
+
+STATUS = {"max": 0, "hit": 1, "inside": 2, "left": 3, "outside": 4, "unknown": 5}
 
 
 def random_pose(rng: np.random.Generator, dim: int = 3) -> np.ndarray:
@@ -151,6 +154,76 @@ class GridMachine(RuleBasedStateMachine):
             return
         pair.grid.write_bricks(where, what)
         pair.twin.write_bricks(where, what)
+
+    @rule(into=pairs, what=pairs, seed=SEEDS, whole=st.booleans())
+    def merge(self, into: Pair, what: Pair, seed: int, whole: bool) -> None:
+        rng = np.random.default_rng(seed)
+        if whole:  # whole voxels and a quarter turn: every voxel has an image on the lattice
+            k, s = rng.integers(0, 4), VOXEL * rng.integers(-9, 10, 3)
+            half_angle = k * np.pi / 4
+            pose = np.array([*s, 0, 0, np.sin(half_angle), np.cos(half_angle)])
+            pose = pose if self.dim == 3 else np.array([s[0], s[1], 2 * half_angle])
+        else:
+            pose = random_pose(rng, self.dim)
+        if into.grid.locked:
+            with pytest.raises(GridLockedError):
+                into.grid.merge(what.grid, pose)
+            return
+        try:
+            into.grid.merge(what.grid, pose)
+        except GridError:
+            # refused whole, and with reason: a brick of the other map comes within its own diagonal of a face
+            T = pose_matrix(pose, self.dim)
+            centres = 8 * VOXEL * (what.grid.brick_coordinates() + 0.5) @ T[:3, :3].T + T[:3, 3]
+            assert np.abs(centres[:, : self.dim]).max() > VOXEL * (EDGE - 4 * np.sqrt(3))
+            return
+        into.twin.merge(what.twin, pose)
+
+    @rule(seed=SEEDS)
+    def compact(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        before = self.pool.used_nodes, self.pool.used_bricks
+        report = compact([p.grid for p in self.living if rng.random() < 0.7])
+        assert (self.pool.used_nodes, self.pool.used_bricks) == (before[0] - report.nodes, before[1] - report.bricks)
+        assert min(report.nodes, report.bricks) >= 0
+
+    @rule(pair=pairs, seed=SEEDS)
+    def look(self, pair: Pair, seed: int) -> None:
+        """What a grid says of itself is what its twin says."""
+        rng = np.random.default_rng(seed)
+        grid, twin, pose = pair.grid, pair.twin, random_pose(rng, self.dim)
+        points = rng.uniform(-3, 3, (20, self.dim))
+        expected = [twin.value_at(p) for p in points]
+        assert grid.values_at(points).tolist() == [-32768 if v is None else v for v in expected]
+        o, d = rng.uniform(-0.5, 0.5, self.dim), rng.normal(size=(6, self.dim))
+        blind, reach = bool(rng.integers(2)), float(rng.choice([1.0, 3.0, 12.0]))
+        found = grid.cast(o, d, reach, pose=pose, ignore_unknown=blind, voxels=True)
+        for k in range(len(d)):
+            what, length, voxel = twin.cast(o, d[k], reach, pose=pose, ignore_unknown=blind)
+            assert STATUS[what] == found.status[k], (what, found.status[k])
+            np.testing.assert_allclose(found.ranges[k], length, atol=1e-9)
+            if what in ("hit", "inside"):
+                assert tuple(found.voxels[k].tolist()) == voxel
+        assert grid.entropy() == pytest.approx(twin.entropy(), rel=1e-12, abs=1e-300)
+        np.testing.assert_allclose(sorted(map(tuple, grid.occupied_cloud())), sorted(map(tuple, twin.occupied_cloud())))
+        cells = twin.binned_cloud(2, minimum=2)
+        binned = grid.binned_cloud(2, minimum=2)
+        assert binned.counts.tolist() == [cells[c][1] for c in sorted(cells, key=lambda c: c[::-1])]
+        if cells:
+            np.testing.assert_allclose(binned.points, [cells[c][0] for c in sorted(cells, key=lambda c: c[::-1])])
+        low = rng.integers(-9, 3, 3)
+        high = low + rng.integers(1, 9, 3)
+        if self.dim == 2:
+            low[2], high[2] = 0, 1
+        box = twin.box(tuple(low.tolist()), tuple(high.tolist()))
+        # VOXEL is a power of two, so these corners lie on the lattice exactly
+        got = grid.box_query(low[None, : self.dim] * VOXEL, high[None, : self.dim] * VOXEL)
+        assert (got.occupied[0], got.known[0], got.voxels[0]) == (box["occupied"], box["known"], box["all"])
+        bounds = twin.bounds()
+        if bounds is None:
+            assert grid.bounding_box() is None
+        else:
+            np.testing.assert_array_equal(grid.bounding_box(), np.array(bounds)[:, : self.dim] * VOXEL)
 
     @rule(pair=pairs)
     def lock(self, pair: Pair) -> None:

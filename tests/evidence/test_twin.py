@@ -90,7 +90,8 @@ def test_dropped_beams_are_counted(twin: EvidenceTwin) -> None:
 
 def test_cast_by_hand(twin: EvidenceTwin) -> None:
     twin.insert_scan([[1.2, 0.25, 0.25]], (0.25, 0.25, 0.25))
-    assert twin.cast((0.25, 0.25, 0.25), (3, 0, 0), 5.0) == ("hit", pytest.approx(0.75), (2, 0, 0))
+    assert twin.cast((0.25, 0.25, 0.25), (3, 0, 0), 5.0) == ("hit", pytest.approx(1.0), (2, 0, 0))
+    assert twin.cast((0.25, 0.25, 0.25), (3, 0, 0), 0.8) == ("hit", 0.8, (2, 0, 0))
     assert twin.cast((0.25, 0.25, 0.25), (3, 0, 0), 0.7) == ("max", 0.7, None)
     assert twin.cast((1.25, 0.25, 0.25), (0, 1, 0), 5.0) == ("inside", 0.0, (2, 0, 0))
     assert twin.cast((0.25, 0.25, 0.25), (-1, 0, 0), 5.0, ignore_unknown=False)[0] == "unknown"

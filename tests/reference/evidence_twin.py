@@ -202,9 +202,10 @@ class EvidenceTwin:
         """
         T = pose_matrix(pose, self.dim)
         back = np.linalg.inv(T)
+        source_values = dict(other.values)  # the other may be this very map
         candidates: set[Voxel] = set()
         reach = np.ones(3) if self.dim == 3 else np.array([1.0, 1.0, 0.0])
-        for voxel in other.values:
+        for voxel in source_values:
             corners = np.array(list(itertools.product(*((i, i + 1) for i in voxel)))) * other.voxel_size
             image = (corners @ T[:3, :3].T + T[:3, 3]) / self.voxel_size
             if self.dim == 2:
@@ -219,7 +220,7 @@ class EvidenceTwin:
             source = (back[:3, :3] @ centre + back[:3, 3]) / other.voxel_size
             if self.dim == 2:
                 source[2] = 0.5
-            value = other.values.get(_floor3(source))
+            value = source_values.get(_floor3(source))
             if value is not None:
                 self.values[voxel] = self.clamp(self.values.get(voxel, 0) + value)
 
@@ -250,14 +251,15 @@ class EvidenceTwin:
     def cast(
         self, origin: Any, direction: Any, max_range: float, *, pose: Any = None, ignore_unknown: bool = True
     ) -> tuple[str, float, Voxel | None]:
-        """(what, range [m] at which the ray enters the voxel, the voxel), of the first occupied voxel along a ray.
+        """(what, range [m], voxel) of the first occupied voxel along a ray.
 
-        ``what`` is "hit", "inside" (origin in an occupied voxel), "unknown" (stopped there), "left" (the cube), "max".
+        ``what`` is "hit" (range to the middle of the chord in that voxel, at most the maximum), "inside" (origin in an
+        occupied voxel), "unknown" (stopped there), "left" (the cube), "max" or "outside" (origin not in the cube).
         """
         o = np.asarray(self.lift([origin])[0], float)
         d = np.asarray(self.lift([direction])[0], float)
-        e = o + d / np.linalg.norm(d) * max_range
-        a, b = self.to_voxels([o, e], pose)
+        d /= np.linalg.norm(d)
+        a, b = self.to_voxels([o, o + d * max_range], pose)
         if not self.inside(a):
             return "outside", math.nan, None
         if self.occupied(_floor3(a)):
@@ -266,7 +268,10 @@ class EvidenceTwin:
             if not self.inside(voxel):
                 return "left", float(t) * max_range, None
             if self.occupied(voxel):
-                return "hit", float(t) * max_range, voxel
+                ways_out = [
+                    (v + (y > x) - x) / (y - x) for x, y, v in zip(a.tolist(), b.tolist(), voxel) if x != y
+                ]  # parameters at which the ray passes the far face on each axis, also beyond its end
+                return "hit", min(max_range, 0.5 * (float(t) + min(ways_out)) * max_range), voxel
             if voxel not in self.values and not ignore_unknown:
                 return "unknown", float(t) * max_range, voxel
         return "max", max_range, None
