@@ -181,7 +181,7 @@ def _read_records(data: bytes, head: _Header, where: str) -> _Records:
     cut = int(np.count_nonzero(np.abs(floats[leaf]) > LIMIT * STEP))
     if cut:
         log.warning("%s: log-odds of %d leaves cut at ±%g", where, cut, LIMIT * STEP)
-    values = np.clip(np.rint(floats * np.float32(1 / STEP)), -LIMIT, LIMIT).astype(np.int16)
+    values = np.rint(np.clip(floats, -LIMIT * STEP, LIMIT * STEP) * np.float32(1 / STEP)).astype(np.int16)
     return _Records(rows["code"].astype(np.uint16), values, width)
 
 

@@ -191,10 +191,10 @@ def write_tree(
         m, node, part, state, largest = stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4]
         nodes += 1
         leaf = state != 1 << 20
-        if classes and leaf and m < 16:  # a .bt has no record of a leaf; its root has no parent to speak for it
+        if classes and leaf:  # a .bt has no record of a leaf; the root is none, our own being larger or elsewhere
             continue
         code = 0
-        if classes or not leaf:
+        if not leaf:
             for k in range(8):
                 i = 7 - k
                 child, where = child_of(m, node, part, i, levels, children)
