@@ -65,7 +65,7 @@ def read_npz(path: str | os.PathLike[str], *, fmt: str) -> dict[str, np.ndarray]
             arrays = {name: archive[name] for name in archive.files}
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError, NotImplementedError) as error:
         raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None
-    except AttributeError:  # np.load gives a bare array for a .npy
+    except (AttributeError, TypeError):  # np.load gives a bare array for a .npy, and that is no archive
         raise FormatError("not an npz archive", where=where) from None
     check_format(str(arrays.get("format", "none")), fmt, where=where)
     return arrays

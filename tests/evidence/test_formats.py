@@ -1,0 +1,441 @@
+"""Dense arrays and npz: to the last bit there and back, and clear words for what is damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphslam.core.errors import FormatError, GridError, MissingDataError
+from graphslam.core.submap import Submap
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.formats import DenseGrid, from_dense, known_bounds, load_npz, save_npz, to_dense
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import STEP, UNKNOWN
+from graphslam.evidence.map_server import save_map_server
+from graphslam.evidence.pool import GridPool
+from tests.reference.evidence_maps import Map, cube, grid_of_map, map_of_grid, random_map, scanned_grid
+from tests.reference.evidence_pool import check_pool
+
+
+def near(rng: np.random.Generator) -> Map:
+    """A random map that fits an array."""
+    return random_map(rng, 90)
+
+
+# --- dense -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_dense_array_holds_every_voxel(rng: np.random.Generator, dtype: Any) -> None:
+    voxels = near(rng)
+    grid = grid_of_map(voxels)
+    dense = to_dense(grid, dtype=dtype)
+    assert dense.values.dtype == dtype
+    assert dense.voxel_size == 0.1
+    keys = np.array(list(voxels))
+    assert dense.first_voxel.tolist() == keys.min(axis=0).tolist()
+    assert dense.values.shape == tuple(keys.max(axis=0) + 1 - keys.min(axis=0))
+    wanted = np.full(dense.values.shape, UNKNOWN)
+    wanted[tuple((keys - dense.first_voxel).T)] = list(voxels.values())
+    if dtype == np.float32:
+        assert np.array_equal(dense.values, np.where(wanted == UNKNOWN, np.nan, wanted * STEP), equal_nan=True)
+    else:
+        assert np.array_equal(dense.values, wanted)
+    back = from_dense(dense)
+    check_pool(back.pool, [back])
+    assert map_of_grid(back) == voxels
+
+
+def test_dense_of_any_box(rng: np.random.Generator) -> None:
+    """Boxes inside, across and outside the map, and beyond the addressable cube (±64 voxels)."""
+    grid = grid_of_map({v: x for v, x in near(rng).items() if max(v) < 64 and min(v) >= -64}, levels=2)
+    voxels = map_of_grid(grid)
+    for _ in range(40):
+        low = rng.integers(-80, 70, 3)
+        high = low + rng.integers(0, 30, 3)
+        dense = to_dense(grid, bounds=[low, high])
+        assert dense.values.shape == tuple(high - low)
+        for at, value in np.ndenumerate(dense.values):
+            assert value == voxels.get(tuple((low + at).tolist()), UNKNOWN)
+    for low in ([1 << 40, 0, 0], [-(1 << 62), 5, 5]):
+        dense = to_dense(grid, bounds=[low, [a + 9 for a in low]])
+        assert (dense.values == UNKNOWN).all()
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_scanned_grid_comes_back_to_the_last_bit(rng: np.random.Generator, dim: int, dtype: Any) -> None:
+    grid = scanned_grid(rng, dim=dim)
+    dense = to_dense(grid, dtype=dtype)
+    assert dense.values.ndim == dim
+    assert dense.first_voxel.shape == dense.origin.shape == (dim,)
+    back = from_dense(dense, model=grid.model, pool=grid.pool)
+    assert back.dim == dim
+    assert map_of_grid(back) == map_of_grid(grid)
+    check_pool(grid.pool, [grid, back])
+    again = to_dense(back, dtype=dtype)
+    assert np.array_equal(again.values, dense.values, equal_nan=dtype == np.float32)
+
+
+def test_dense_of_nothing() -> None:
+    for dim in (2, 3):
+        dense = to_dense(EvidenceGrid(0.5, dim=dim))
+        assert dense.values.shape == (0,) * dim
+        assert map_of_grid(from_dense(dense)) == {}
+
+
+def test_bounds_of_a_cube_are_found_without_its_bricks() -> None:
+    grid = grid_of_map(cube((-16, 0, 8), 16, 5) | {(40, -3, 2): 7})
+    assert [b.tolist() for b in known_bounds(grid)] == [[-16, -3, 2], [41, 16, 24]]
+
+
+def test_impossible_dense_wishes_are_refused(rng: np.random.Generator) -> None:
+    grid = scanned_grid(rng)
+    for bounds in ([[0, 0, 0]], [[0, 0], [1, 1]], [[0.5, 0, 0], [1, 1, 1]], [[2, 0, 0], [1, 1, 1]]):
+        with pytest.raises(GridError, match="impossible bounds"):
+            to_dense(grid, bounds=bounds)
+    with pytest.raises(GridError, match=r"takes \d+ GB; wanted narrower bounds"):
+        to_dense(grid, bounds=[[-4000] * 3, [4000] * 3])
+    with pytest.raises(GridError, match="impossible type"):
+        to_dense(grid, dtype=np.int32)
+    at0 = np.zeros(3, np.int64)
+    for values, first, message in (
+        (np.zeros(3, np.int16), at0[:1], "impossible shape"),
+        (np.zeros((2, 2, 2), np.int16), at0[:2], "impossible shape"),
+        (np.zeros((2, 2, 2), np.int16), np.zeros(3), "impossible shape"),
+        (np.zeros((2, 2, 2), np.int64), at0, "impossible type"),
+        (np.full((2, 2, 2), np.inf), at0, r"voxel \(0, 0, 0\) cannot be held; got inf"),
+        (np.full((1, 1, 1), -16.0), at0, "cannot be held"),
+        (np.zeros((2, 2, 2), np.int16), at0 + 4095, "levels=6"),
+    ):
+        with pytest.raises(GridError, match=message):
+            from_dense(DenseGrid(values, first, 0.1), pool=GridPool(5))
+    with pytest.raises(GridError, match="voxel size"):
+        from_dense(DenseGrid(np.zeros((1, 1, 1), np.int16), at0, -0.1))
+
+
+def test_log_odds_are_rounded_to_the_nearest_step() -> None:
+    values = np.array([[[0.3, -0.3, 15.9995, np.nan, -0.0002]]])
+    grid = from_dense(DenseGrid(values, np.zeros(3, np.int64), 0.1))
+    assert map_of_grid(grid) == {(0, 0, 0): 614, (0, 0, 1): -614, (0, 0, 2): 32767, (0, 0, 4): 0}
+
+
+# --- npz ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", [2, 5, 7])
+def test_npz_gives_the_same_map(rng: np.random.Generator, tmp_path: Path, levels: int) -> None:
+    model = BeamModel(hit=0.8, miss=0.3, clamp=(0.1, 0.9), threshold=0.7)
+    voxels = random_map(rng, 4 * 4**levels)
+    grid = grid_of_map(voxels, voxel_size=1 / 3, levels=levels, model=model)
+    path = tmp_path / "map.npz"
+    grid.save(path)
+    back = load_npz(path)
+    check_pool(back.pool, [back])
+    assert map_of_grid(back) == voxels
+    assert (back.voxel_size, back.model, back.dim, back.pool.levels) == (1 / 3, model, 3, levels)
+    # into a pool that holds something already, of other levels
+    pool = GridPool(7)
+    first = grid_of_map({(1, 2, 3): 4}, pool=pool)
+    second = load_npz(path, pool=pool)
+    check_pool(pool, [first, second])
+    assert map_of_grid(second) == voxels
+    assert map_of_grid(first) == {(1, 2, 3): 4}
+    if levels > 2:
+        small = GridPool(2)
+        with pytest.raises(GridError, match=rf"map\.npz.*levels={levels}"):
+            load_npz(path, pool=small)
+        assert small.used_nodes == 0
+
+
+def test_npz_of_a_scanned_2d_grid(rng: np.random.Generator, tmp_path: Path) -> None:
+    grid = scanned_grid(rng, dim=2)
+    save_npz(grid, tmp_path / "flat.npz")
+    back = load_npz(tmp_path / "flat.npz")
+    assert back.dim == 2
+    assert map_of_grid(back) == map_of_grid(grid)
+    save_npz(EvidenceGrid(0.1), tmp_path / "empty.npz")
+    assert map_of_grid(load_npz(tmp_path / "empty.npz")) == {}
+
+
+def test_equal_maps_give_equal_bytes(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Whatever happened to them: other pools, copies, bricks cleared again, compaction by a round trip."""
+    voxels = random_map(rng, 300)
+    one = grid_of_map(voxels)
+    pool = GridPool()
+    other = grid_of_map({(100, 100, 100): 3, (-9, 0, 0): 4}, pool=pool)
+    held = other.copy()
+    for b in other.brick_coordinates():
+        other.write_bricks(b[None], np.full((1, 512), UNKNOWN, np.int16))
+    two = other.copy()
+    order = rng.permutation(len(one.brick_coordinates()))
+    two.write_bricks(one.brick_coordinates()[order], one.brick_values()[order])
+    for name, grid in (("a", one), ("b", two), ("c", load_npz_of(one, tmp_path))):
+        save_npz(grid, tmp_path / name)
+    data = (tmp_path / "a").read_bytes()
+    assert data == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
+    del voxels[next(iter(voxels))]
+    save_npz(grid_of_map(voxels), tmp_path / "d")
+    assert data != (tmp_path / "d").read_bytes()
+    assert len(map_of_grid(held)) == 2
+
+
+def load_npz_of(grid: EvidenceGrid, folder: Path) -> EvidenceGrid:
+    save_npz(grid, folder / "through.npz")
+    return load_npz(folder / "through.npz")
+
+
+def test_cubes_are_written_once(tmp_path: Path) -> None:
+    """64³ equal voxels are one entry, not 512 bricks."""
+    save_npz(grid_of_map(cube((0, 0, 0), 32, 9) | {(-1, 0, 0): 2}), tmp_path / "cube.npz")
+    with np.load(tmp_path / "cube.npz") as archive:
+        assert archive["cubes"].tolist() == [[0, 0, 0]]
+        assert archive["cube_log_edges"].tolist() == [5]
+        assert archive["cube_values"].tolist() == [9]
+        assert archive["bricks"].tolist() == [[-1, 0, 0]]
+    back = load_npz(tmp_path / "cube.npz")
+    assert back.pool.used_bricks == 2
+    assert len(map_of_grid(back)) == 32**3 + 1
+
+
+def test_a_submap_takes_a_grid_as_payload(rng: np.random.Generator, tmp_path: Path) -> None:
+    grid = scanned_grid(rng)
+    submap = Submap(key=1, interval=(0.0, 1.0), exit_pose=np.zeros(3), exit_covariance=np.eye(3), grid=grid)
+    assert submap.grid is not None
+    submap.grid.save(tmp_path / "payload.npz")
+    assert map_of_grid(load_npz(tmp_path / "payload.npz")) == map_of_grid(grid)
+
+
+def test_a_failed_write_leaves_the_old_file(rng: np.random.Generator, tmp_path: Path, monkeypatch: Any) -> None:
+    path = tmp_path / "map.npz"
+    grid = scanned_grid(rng)
+    save_npz(grid, path)
+    before = path.read_bytes()
+
+    def fail(*_: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="no space"):
+        save_npz(grid.empty(), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["map.npz"]
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a good file: a brick, a cube of 32³ and one of 8³."""
+    save_npz(grid_of_map(cube((0, 0, 0), 32, 9) | cube((40, 40, 40), 8, -3) | {(-1, 0, 0): 2}), tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as good:
+        return {name: good[name] for name in good.files}
+
+
+def i32(*rows: Any) -> np.ndarray:
+    return np.array(rows, np.int32)
+
+
+CHANGES: dict[str, tuple[dict[str, Any], str]] = {
+    "another format": ({"format": "graphslam.evidence/2"}, r"unknown format; got 'graphslam.evidence/2'"),
+    "no model": ({"model": None}, "array 'model' is missing"),
+    "no values": ({"values": None}, "array 'values' is missing"),
+    "model of four": ({"model": np.ones(4)}, r"'model' has the wrong shape or type; got \(4,\) float64; wanted \(5,\)"),
+    "model NaN": ({"model": np.full(5, np.nan)}, "array 'model' is impossible"),
+    "model of hits that free": ({"model": np.array([0.4, 0.4, 0.1, 0.9, 0.5])}, "array 'model' is impossible"),
+    "voxel size 0": ({"voxel_size": np.float64(0)}, "voxel size is impossible; got 0.0"),
+    "voxel size inf": ({"voxel_size": np.float64(np.inf)}, "voxel size is impossible"),
+    "voxel size text": ({"voxel_size": "0.1"}, "'voxel_size' has the wrong shape or type"),
+    "dimension 4": ({"dim": np.int64(4)}, "dimension is impossible; got 4"),
+    "dimension 2": ({"dim": np.int64(2)}, "2-D grid has voxels beside the layer"),
+    "levels 9": ({"levels": np.int64(9)}, "number of levels is impossible; got 9"),
+    "levels too few": (
+        {"levels": np.int64(2), "bricks": i32([-9, 0, 0])},
+        "72 from the origin do not fit the 2 levels",
+    ),
+    "levels negative": ({"levels": np.int64(-1)}, "number of levels is impossible"),
+    "bricks flat": ({"bricks": i32(1, 2, 3)}, "'bricks' has the wrong shape"),
+    "bricks float": ({"bricks": np.zeros((1, 3))}, r"'bricks' .* got \(1, 3\) float64"),
+    "bricks more than values": ({"bricks": i32([0, 0, 9], [1, 0, 9])}, r"'values' .* wanted \(2, 512\) int16"),
+    "brick far": ({"bricks": i32([2**31 - 1, 0, 0])}, "do not fit"),
+    "brick far below": ({"bricks": i32([0, -(2**31), 0])}, "do not fit"),
+    "brick unknown": ({"values": np.full((1, 512), UNKNOWN, np.int16)}, "unknown voxels is listed"),
+    "brick in a cube": ({"bricks": i32([3, 3, 3])}, "a cube overlaps another piece"),
+    "brick twice": ({"bricks": i32([9, 0, 0], [9, 0, 0]), "values": np.ones((2, 512), np.int16)}, "not in ascending"),
+    "cubes unordered": ({"cubes": i32([5, 5, 5], [0, 0, 0])}, "cubes are not in ascending order"),
+    "cube in a cube": ({"cubes": i32([0, 0, 0], [1, 1, 1])}, "a cube overlaps another piece"),
+    "cube askew": ({"cubes": i32([0, 0, 1], [5, 5, 5])}, "does not begin at a multiple of its edge"),
+    "cube too small": ({"cube_log_edges": np.array([2, 3], np.uint8)}, "edge of a cube is impossible"),
+    "cube too large": ({"cube_log_edges": np.array([255, 3], np.uint8)}, "edge of a cube is impossible"),
+    "cube beyond": ({"cube_log_edges": np.array([13, 3], np.uint8)}, "8192 from the origin do not fit the 5 levels"),
+    "cube unknown": ({"cube_values": np.array([5, UNKNOWN], np.int16)}, "unknown voxels is listed"),
+    "cube values short": ({"cube_values": np.array([5], np.int16)}, r"'cube_values' .* wanted \(2,\) int16"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_field_is_checked(archive: dict[str, np.ndarray], tmp_path: Path, name: str) -> None:
+    change, message = CHANGES[name]
+    path = tmp_path / "bad.npz"
+    np.savez_compressed(path, **{k: v for k, v in {**archive, **change}.items() if v is not None})
+    pool = GridPool()
+    with pytest.raises(FormatError, match=message) as caught:
+        load_npz(path, pool=pool)
+    assert str(path) in str(caught.value)
+    assert pool.used_nodes == pool.used_bricks == 0
+    np.savez_compressed(path, **archive)  # and without the change it is read
+    assert len(map_of_grid(load_npz(path, pool=pool))) == 32**3 + 512 + 1
+
+
+def test_truncated_and_damaged_archives_are_refused(rng: np.random.Generator, tmp_path: Path) -> None:
+    path = tmp_path / "bad.npz"
+    save_npz(grid_of_map({(0, 0, 0): 1}), path)
+    data = path.read_bytes()
+    for n in range(0, len(data), 37):
+        path.write_bytes(data[:n])
+        with pytest.raises(FormatError):
+            load_npz(path)
+    for _ in range(100):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with contextlib.suppress(FormatError):
+            assert map_of_grid(load_npz(path)) == {(0, 0, 0): 1}  # a date or a comment of the archive
+    with pytest.raises(MissingDataError):
+        load_npz(tmp_path / "none.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(FormatError):
+        load_npz(tmp_path / "array.npy")
+
+
+def npy(header: str, body: bytes) -> bytes:
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("{'descr': '<i2', 'fortran_order': False, 'shape': (99999999999, 512), }", r"values\.npy has the shape"),
+        ("{'descr': '<i2', 'fortran_order': False, 'shape': (-1, 512), }", "corrupt"),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1, 512), }", "corrupt"),
+        ("__import__('os').abort()", "corrupt"),
+    ],
+)
+def test_headers_that_lie_cost_nothing(
+    archive: dict[str, np.ndarray], tmp_path: Path, header: str, message: str
+) -> None:
+    path = tmp_path / "bad.npz"
+    with zipfile.ZipFile(path, "w") as out:
+        for name, value in archive.items():
+            stream = io.BytesIO()
+            np.save(stream, value)
+            out.writestr(f"{name}.npy", stream.getvalue() if name != "values" else npy(header, b"\0" * 1024))
+    with pytest.raises(FormatError, match=message):
+        load_npz(path)
+
+
+def test_an_archive_that_claims_more_than_it_can_hold_is_refused(
+    archive: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.npz"
+    np.savez_compressed(path, **archive)
+    data = bytearray(path.read_bytes())
+    entries = [k for k in range(len(data)) if data[k : k + 4] == b"PK\1\2"]  # of the central directory
+    at = next(k for k in entries if data[k + 46 : k + 56] == b"values.npy")
+    data[at + 24 : at + 28] = (2**32 - 2).to_bytes(4, "little")  # uncompressed size
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="claims 4294967294 bytes"):
+        load_npz(path)
+
+
+# --- map server --------------------------------------------------------------------------------------------------
+
+
+def test_map_server_pair_says_what_the_grid_says(rng: np.random.Generator, tmp_path: Path) -> None:
+    grid = scanned_grid(rng, dim=2)
+    yaml, image = save_map_server(grid, tmp_path / "floor's plan.yaml")
+    said = dict(line.split(": ", 1) for line in yaml.read_text().splitlines())
+    assert said["image"] == "'floor''s plan.pgm'"
+    assert image.name == "floor's plan.pgm"
+    assert said["mode"] == "trinary"
+    magic, size, depth, pixels = image.read_bytes().split(b"\n", 3)
+    width, height = map(int, size.split())
+    assert (magic, depth) == (b"P5", b"255")
+    grey = np.frombuffer(pixels, np.uint8).reshape(height, width)
+    # map_server's own rule: p = (255 - grey) / 255
+    p = (255 - grey.astype(float)) / 255
+    cell = np.where(p > float(said["occupied_thresh"]), 100, np.where(p < float(said["free_thresh"]), 0, -1))
+    x0, y0, yaw = (float(w) for w in said["origin"].strip("[]").split(","))
+    resolution = float(said["resolution"])
+    seen = set()
+    for row in range(height):
+        for column in range(width):
+            point = [x0 + (column + 0.5) * resolution, y0 + (height - row - 0.5) * resolution]
+            value = int(grid.values_at([point])[0])
+            assert cell[row, column] == (-1 if value == UNKNOWN else 100 if value >= 0 else 0)
+            seen.add(int(cell[row, column]))
+    assert seen == {-1, 0, 100}
+    assert yaw == 0.0
+
+
+def test_map_server_refuses_what_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(GridError, match="only a 2-D grid"):
+        save_map_server(EvidenceGrid(0.1), tmp_path / "map.yaml")
+    with pytest.raises(GridError, match="nothing is known"):
+        save_map_server(EvidenceGrid(0.1, dim=2), tmp_path / "map.yaml")
+    with pytest.raises(FormatError, match=r"wanted \.yaml"):
+        save_map_server(EvidenceGrid(0.1, dim=2), tmp_path / "map.pgm")
+    assert not list(tmp_path.iterdir())
+
+
+# --- compiled or not ---------------------------------------------------------------------------------------------
+
+SCRIPT = """
+import sys
+import numpy as np
+from pathlib import Path
+from graphslam.evidence.compact import compact
+from graphslam.evidence.formats import load_npz, save_npz, to_dense
+from graphslam.evidence.octomap import read_octomap, write_octomap
+from graphslam.evidence.pool import GridPool
+from tests.reference.evidence_maps import cube, grid_of_map
+folder = Path(sys.argv[1])
+voxels = cube((0, 0, 0), 16, 7) | cube((16, 0, 0), 16, 7) | {(-30, 5, 8): -4, (63, -64, 0): 5}
+grid = grid_of_map(voxels, levels=2)
+freed = compact(grid)
+save_npz(grid, folder / "map.npz")
+for suffix in (".bt", ".ot"):
+    write_octomap(grid, folder / f"map{suffix}")
+    save_npz(read_octomap(folder / f"map{suffix}", pool=GridPool(2)), folder / f"back{suffix}")
+save_npz(load_npz(folder / "map.npz"), folder / "back.npz")
+np.save(folder / "dense.npy", to_dense(grid, dtype=np.float32).values)
+print(freed)
+"""
+
+
+def test_kernels_do_the_same_uncompiled(tmp_path: Path) -> None:
+    said = []
+    for flag in ("0", "1"):
+        folder = tmp_path / flag
+        folder.mkdir()
+        run = subprocess.run(
+            [sys.executable, "-c", SCRIPT, str(folder)],
+            env={**os.environ, "NUMBA_DISABLE_JIT": flag, "PYTHONPATH": str(Path(__file__).parents[2])},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stderr
+        assert "Warning" not in run.stderr
+        said.append((run.stdout, {p.name: p.read_bytes() for p in folder.iterdir()}))
+    assert said[0] == said[1]
+    assert len(said[0][1]) == 7
+    assert "bricks=15" in said[0][0]  # of sixteen equal ones
