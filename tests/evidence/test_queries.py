@@ -186,6 +186,9 @@ def test_clouds_and_sums(rng: np.random.Generator, dim: int) -> None:
 def test_empty_maps_hold_nothing() -> None:
     grid = EvidenceGrid(0.1)
     assert grid.bounding_box() is None
+    unseen = EvidenceGrid(0.1)
+    unseen.write_bricks([[0, 0, 0]], np.full((1, 512), UNKNOWN, np.int16))  # a brick nobody has seen a voxel of
+    assert unseen.bounding_box() is None
     assert grid.occupied_cloud().shape == (0, 3)
     assert grid.binned_cloud(2).points.shape == (0, 3)
     assert (grid.entropy(), grid.known_volume(), grid.voxel_counts().known) == (0.0, 0.0, 0)
