@@ -71,34 +71,26 @@ def check_pool(pool: Any, grids: Iterable[Any]) -> None:
     assert (children[0] == 0).all()
 
     # flags, from the voxels up; grids of one tree have one threshold
-    for root, threshold in thresholds.items():
-        seen: dict[int, bool] = {}
-        for n in reversed(_nodes_below(root, pool.levels, children)):
-            mask = 0
-            for c, child in enumerate(children[n].tolist()):
-                if not child:
-                    continue
-                if level_of[n] > 0:
-                    occupied = seen[child]
-                else:
-                    values = bricks[child].astype(int)
-                    lines = ((values != UNKNOWN) & (values >= threshold)).reshape(16, 32).any(1)
-                    wanted = sum(1 << i for i in np.flatnonzero(lines).tolist())
-                    assert int(brick_lines[child]) == wanted, f"brick {child}: wrong lines"
-                    occupied = wanted != 0
-                mask |= int(occupied) << c
-            assert int(node_occupied[n]) == mask, f"node {n} of level {level_of[n]}: wrong occupied children"
-            seen[n] = mask != 0
+    for threshold in sorted(set(thresholds.values())):
+        occupied: dict[int, bool] = {}  # of the nodes of the level below
+        layer = sorted(r for r, t in thresholds.items() if t == threshold)
+        layers = [layer]
+        for _ in range(pool.levels):
+            layer = np.setdiff1d(children[layer], 0).tolist()
+            layers.append(layer)
+        values = bricks[layers.pop()]
+        lines = ((values != UNKNOWN) & (values >= threshold)).reshape(-1, 16, 32).any(2)
+        for b, line in zip(layer, (lines @ (1 << np.arange(16))).tolist()):
+            assert int(brick_lines[b]) == line, f"brick {b}: wrong lines"
+            occupied[b] = line != 0
+        while layers:
+            above: dict[int, bool] = {}
+            for n in layers.pop():
+                mask = sum(1 << c for c, child in enumerate(children[n].tolist()) if child and occupied[child])
+                assert int(node_occupied[n]) == mask, f"node {n} of level {level_of[n]}: wrong occupied children"
+                above[n] = mask != 0
+            occupied = above
     check_scratch(pool)
-
-
-def _nodes_below(root: int, levels: int, children: np.ndarray) -> list[int]:
-    """Distinct nodes of a tree, parents before children."""
-    out, layer = [root], [root]
-    for _ in range(levels - 1):
-        layer = sorted({c for n in layer for c in children[n].tolist() if c})
-        out += layer
-    return out
 
 
 def check_scratch(pool: Any) -> None:
