@@ -140,7 +140,8 @@ def point_rows(points: Any, dim: int, voxel_size: float, what: str = "points") -
     if p.ndim != 2 or p.shape[1] != dim:
         raise GridError(f"{what} have the wrong shape", got=p.shape, wanted=f"(n, {dim})")
     if dim == 3:
-        return p
+        # to the compiler a read-only array is another type: every kernel would be compiled once more
+        return p if p.flags.writeable else p.copy()
     flat = np.empty((len(p), 3))
     flat[:, :2] = p
     flat[:, 2] = 0.5 * voxel_size
@@ -168,7 +169,7 @@ def scan_rows(
     if returns is None:
         r = _NO_RETURNS
     else:
-        r = np.ascontiguousarray(returns, dtype=np.uint8)
+        r = np.array(returns, dtype=np.uint8, order="C")
         if r.shape != (len(p),):
             raise GridError("returns and points differ in number", got=r.shape, wanted=f"({len(p)},)")
         if len(p) == 0:

@@ -12,6 +12,7 @@ from graphslam.evidence.cast_kernels import cast_rays, unit_directions
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.queries import HIT, INSIDE, LEFT, MAX_RANGE, UNKNOWN_SPACE, UNUSABLE, cast, cast_grids
+from graphslam.evidence.query_kernels import look_up
 from tests.reference.evidence_twin import EvidenceTwin
 from tests.reference.plain_cast import plain_cast
 
@@ -302,3 +303,18 @@ def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
         assert (compiled.status == status[0]).all()
         # compilers may fuse a multiplication and an addition
         np.testing.assert_allclose(compiled.ranges, ranges[0], rtol=0, atol=1e-12)
+
+
+def test_read_only_arrays_compile_nothing_anew(rng: np.random.Generator) -> None:
+    grid = scanned(rng)
+    points = rng.normal(0, 1, (10, 3))
+    kernels = [k for k in (cast_rays, unit_directions, look_up) if hasattr(k, "signatures")]
+    grid.cast(points, points, 3.0)
+    grid.log_odds_at(points)
+    before = [len(k.signatures) for k in kernels]
+    points.flags.writeable = False
+    grid.cast(points, points, 3.0)
+    grid.cast(points[0], points, 3, pose=np.eye(4), ignore_unknown=False, voxels=True)
+    grid.log_odds_at(points)
+    grid.insert_scan(points, returns=np.broadcast_to(True, 10))
+    assert [len(k.signatures) for k in kernels] == before
