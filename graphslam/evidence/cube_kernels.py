@@ -29,11 +29,20 @@ def voxel_state(value, classes, threshold):
 @numba.njit(cache=True, nogil=True)
 def voxels_state(row, classes, threshold):
     """State of the voxels of a brick ``(512,)``."""
-    s = voxel_state(row[0], classes, threshold)
-    for j in range(1, 512):
-        if voxel_state(row[j], classes, threshold) != s:
+    if classes:
+        s = voxel_state(row[0], classes, threshold)
+        for j in range(1, 512):
+            if voxel_state(row[j], classes, threshold) != s:
+                return 1 << 20
+        return s
+    first = row[0]
+    for line in range(16):
+        other = np.int16(0)
+        for j in range(32 * line, 32 * line + 32):
+            other |= np.int16(row[j] ^ first)  # int16 after each operation, or it is not vectorised
+        if other != 0:
             return 1 << 20
-    return s
+    return int(first)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -27,33 +27,84 @@ def row_of_bricks(root, bx, by, bz, levels, children, ids):
 
 
 @numba.njit(cache=True, nogil=True)
+def known_box(root, levels, children, bricks, box):
+    """First known voxel and the one after the last per axis, ``box (6,) int64`` [offset coordinates]; first > last
+    where none is.
+
+    What lies inside the box found so far is passed over, whole subtrees at a time, so that little of a map is read,
+    however large the cubes in it are.
+    """
+    for a in range(3):
+        box[a], box[a + 3] = 1 << 40, 0
+    if root == 0:
+        return
+    stack = np.empty((64 * 8, 5), np.int64)
+    stack[0, 0], stack[0, 1] = root, levels
+    stack[0, 2], stack[0, 3], stack[0, 4] = 0, 0, 0
+    n = 1
+    while n > 0:
+        n -= 1
+        node, size = stack[n, 0], stack[n, 1]  # size 0 is a brick
+        x, y, z = stack[n, 2], stack[n, 3], stack[n, 4]
+        edge = 8 << (2 * size)
+        if (
+            (x >= box[0] and y >= box[1] and z >= box[2])
+            and (x + edge <= box[3] and y + edge <= box[4] and z + edge <= box[5])
+        ):  # fmt: skip
+            continue
+        if size == 0:
+            for j in range(512):
+                if bricks[node, j] != -32768:
+                    vx, vy, vz = x + (j & 7), y + ((j >> 3) & 7), z + (j >> 6)
+                    box[0], box[1], box[2] = min(box[0], vx), min(box[1], vy), min(box[2], vz)
+                    box[3], box[4], box[5] = max(box[3], vx + 1), max(box[4], vy + 1), max(box[5], vz + 1)
+            continue
+        part = edge >> 2
+        for c in range(64):
+            child = children[node, c]
+            if child != 0:
+                stack[n, 0], stack[n, 1] = child, size - 1
+                stack[n, 2], stack[n, 3] = x + part * (c & 3), y + part * ((c >> 2) & 3)
+                stack[n, 4] = z + part * (c >> 4)
+                n += 1
+
+
+@numba.njit(cache=True, nogil=True)
 def dense_values(root, first, levels, children, bricks, out):
     """Fill ``out (nz, ny, nx) int16`` from the voxel of offset coordinates ``first (3,)`` on."""
     nz, ny, nx = out.shape
     x0, y0, z0 = first[0], first[1], first[2]
     if nx == 0 or ny == 0:
         return
+    source, target = bricks.reshape(-1), out.reshape(-1)
     bx = x0 >> 3
     ids = np.empty(((x0 + nx - 1) >> 3) - bx + 1, np.int64)
     last = ids.shape[0] - 1
     begin = x0 - 8 * bx  # voxels of the first brick that are not wanted
+    # unsigned: a signed index is looked at for being negative
+    u1, u2, u3, u4 = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    u5, u6, u7, u8 = np.uint64(5), np.uint64(6), np.uint64(7), np.uint64(8)
     for bz in range(z0 >> 3, ((z0 + nz - 1) >> 3) + 1):
         for by in range(y0 >> 3, ((y0 + ny - 1) >> 3) + 1):
             row_of_bricks(root, bx, by, bz, levels, children, ids)
             for z in range(max(8 * bz, z0), min(8 * bz + 8, z0 + nz)):
                 for y in range(max(8 * by, y0), min(8 * by + 8, y0 + ny)):
-                    row = out[z - z0, y - y0]
                     j = ((z & 7) << 6) | ((y & 7) << 3)
+                    row = ((z - z0) * ny + y - y0) * nx
                     for i in range(begin, min(8, begin + nx)):
-                        row[i - begin] = bricks[ids[0], j + i]
+                        target[row + i - begin] = source[512 * ids[0] + j + i]
+                    t = np.uint64(row + 8 - begin)
                     for k in range(1, last):
-                        brick = bricks[ids[k], j : j + 8]
-                        part = row[8 * k - begin : 8 * k - begin + 8]
-                        for i in range(8):
-                            part[i] = brick[i]
+                        s = np.uint64(512 * ids[k] + j)
+                        # all is read before any is written, or it does not become one load and one store
+                        v0, v1, v2, v3 = source[s], source[s + u1], source[s + u2], source[s + u3]
+                        v4, v5, v6, v7 = source[s + u4], source[s + u5], source[s + u6], source[s + u7]
+                        target[t], target[t + u1], target[t + u2], target[t + u3] = v0, v1, v2, v3
+                        target[t + u4], target[t + u5], target[t + u6], target[t + u7] = v4, v5, v6, v7
+                        t += u8
                     if last > 0:
                         for i in range(nx + begin - 8 * last):
-                            row[8 * last - begin + i] = bricks[ids[last], j + i]
+                            target[row + 8 * last - begin + i] = source[512 * ids[last] + j + i]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,12 +12,11 @@ import numpy.typing as npt
 from graphslam.core.atomic import read_npz, write_npz
 from graphslam.core.errors import ConfigError, FormatError, GridError
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import Pieces, check_reach, grid_of, list_grid, overlap, pieces_of
-from graphslam.evidence.dense_kernels import dense_log_odds, dense_values
+from graphslam.evidence.compact import Pieces, check_reach, grid_of, overlap, pieces_of
+from graphslam.evidence.dense_kernels import dense_log_odds, dense_values, known_box
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, FAN, LIMIT, MAX_LEVELS, STEP, UNKNOWN, half_edge
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, LIMIT, MAX_LEVELS, STEP, UNKNOWN, half_edge
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.query_kernels import find_bounds
 
 FORMAT = "graphslam.evidence/1"
 
@@ -58,18 +57,12 @@ class DenseGrid:
 def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
     """First known voxel and the one after the last, on each axis ``(3,)``; both 0 where nothing is known."""
     pool = grid.pool
-    bounds = np.empty(6, np.int64)
+    box = np.empty(6, np.int64)
     with pool.lock:
-        mixed, cubes = list_grid(grid)  # not brick by brick: a cube may have millions of them
-        find_bounds(mixed, pool.bricks, bounds)
-    low, high = bounds[:3], bounds[3:] + 1
-    if len(cubes):
-        first = np.stack([cubes[:, 0] & 0xFFFFF, (cubes[:, 0] >> 20) & 0xFFFFF, cubes[:, 0] >> 40], axis=1) * BRICK_EDGE
-        low = np.minimum(low, first.min(axis=0))
-        high = np.maximum(high, (first + BRICK_EDGE * FAN ** cubes[:, 1:2]).max(axis=0))
-    if high[0] <= low[0]:
+        known_box(grid.root, pool.levels, pool.children, pool.bricks, box)
+    if box[3] <= box[0]:
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
-    return low - pool.half, high - pool.half
+    return box[:3] - pool.half, box[3:] - pool.half
 
 
 def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: Any = np.int16) -> DenseGrid:
@@ -103,13 +96,16 @@ def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: 
         size = kind.itemsize * shape[0] * shape[1] * shape[2]
         if size > DENSE_LIMIT:
             raise GridError(f"a dense grid of {shape} voxels takes {size / 1e9:.0f} GB", wanted="narrower bounds")
-        values = np.empty(shape[::-1], np.int16)
-        pool = grid.pool
-        dense_values(grid.root, low + pool.half, pool.levels, pool.children, pool.bricks, values)
-    if kind == np.float32:
-        floats = np.empty(values.shape, np.float32)
-        dense_log_odds(values.reshape(-1), floats.reshape(-1))
-        values = floats  # type: ignore[assignment]
+        pool, first = grid.pool, low + grid.pool.half
+        values = np.empty(shape[::-1], kind)
+        if kind == np.int16:
+            dense_values(grid.root, first, pool.levels, pool.children, pool.bricks, values)
+        else:  # a few layers at a time, which the cache holds
+            layers = np.empty((BRICK_EDGE, *values.shape[1:]), np.int16)
+            for z in range(0, len(values), BRICK_EDGE):
+                part = layers[: len(values) - z]
+                dense_values(grid.root, first + [0, 0, z], pool.levels, pool.children, pool.bricks, part)
+                dense_log_odds(part.reshape(-1), values[z : z + BRICK_EDGE].reshape(-1))
     out = values.transpose(2, 1, 0)
     return DenseGrid(out if grid.dim == 3 else out[:, :, 0], low[: grid.dim], grid.voxel_size)
 

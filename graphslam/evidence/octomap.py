@@ -46,6 +46,10 @@ OCTOMAP_HALF = 1 << 15
 """Voxels from the centre of OctoMap's cube to its faces."""
 GUESS = {True: 74, False: 400}
 """Records a brick takes: no more than this in a ``.bt``, nodes above the bricks apart, seldom more in a ``.ot``."""
+ORDER = sum(
+    (np.arange(BRICK_VOXELS) >> 3 * level & 1 << axis) << 2 * axis + level for level in range(3) for axis in range(3)
+)
+"""Voxels of a brick in the order of the octree: bits 0, 1, 2 are x, y, z in a cube of 2³, the next of it in 4³."""
 FULL_RECORD = np.dtype([("value", "<f4"), ("code", "u1")])
 
 Ints = npt.NDArray[np.int64]
@@ -271,7 +275,7 @@ def _records_of(
             values = np.empty(0 if binary else len(codes), np.int16)
             write_tree(
                 grid.root, pool.levels, binary, threshold, pool.children, pool.bricks, states.brick, states.node,
-                states.brick_max, states.node_max, np.zeros((8 * 17, 5), np.int64), codes, values, tally,
+                states.brick_max, states.node_max, ORDER, np.zeros((8 * 17, 5), np.int64), codes, values, tally,
             )  # fmt: skip
     return codes[: tally[RECORD]], values[: tally[RECORD]], int(tally[NODES])
 

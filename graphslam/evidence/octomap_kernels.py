@@ -11,6 +11,7 @@ A *record* is what the file holds of a node: in a ``.bt`` two bits for each chil
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 from graphslam.evidence.cube_kernels import voxel_state
 
@@ -100,7 +101,7 @@ def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tall
 # --- writing -----------------------------------------------------------------------------------------------------
 #
 # A node of the octree is (m, id, part) in our tree. Ours has four children a side, so a node of even m ≥ 4 is an octant
-# of one of ours, one of odd m ≥ 5 all of it, m = 3 a brick, m < 3 a part of one. Above the root's octants (m = top =
+# of one of ours, one of odd m ≥ 5 all of it, m = 3 a brick. Above the root's octants (m = top =
 # 2·levels + 2) there are nodes with one octant of the root each, since ours are centred on a corner of OctoMap's.
 
 
@@ -115,9 +116,6 @@ def child_of(m, node, part, i, levels, children):
         return (node, part) if i == 7 - part else (0, 0)
     if m == 16:  # of 7 levels: OctoMap's cube is the middle of ours
         return int(children[node, ((1 + iz) << 4) | ((1 + iy) << 2) | (1 + ix)]), 0
-    if m < 4:
-        h = m - 1
-        return node, part | (iz << (6 + h)) | (iy << (3 + h)) | (ix << h)
     if m & 1:
         return node, i
     z, y, x = 2 * (part >> 2) + iz, 2 * ((part >> 1) & 1) + iy, 2 * (part & 1) + ix
@@ -134,21 +132,9 @@ def look_at(
     want_max = brick_max.shape[0] > 0
     if m == 3:
         return int(brick_state[node]), (int(brick_max[node]) if want_max else 0)
-    if m == 16 or (m > 3 and m & 1 == 1 and m < 2 * levels + 2):
+    if m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
         return int(node_state[node]), (int(node_max[node]) if want_max else 0)
     state, largest = 1 << 21, -32768
-    if m < 3:
-        edge = 1 << m
-        for z in range(edge):
-            for y in range(edge):
-                for x in range(edge):
-                    v = int(bricks[node, part + (z << 6) + (y << 3) + x])
-                    largest = max(largest, v)
-                    s = voxel_state(v, classes, threshold)
-                    state = s if state == 1 << 21 or state == s else 1 << 20
-                if state == 1 << 20 and not want_max:
-                    return state, 0
-        return state, largest
     level = min(m, 2 * levels + 2)
     for i in range(8):
         child, _ = child_of(level, node, part, i, levels, children)
@@ -166,14 +152,70 @@ def look_at(
 
 
 @numba.njit(cache=True, nogil=True)
+def write_brick(row, order, classes, threshold, states, maxima, codes, values, record, tally):
+    """Records of a brick ``row (512,)`` that is not of one value, from ``record`` on; returns the end of them.
+
+    order : (512,) int64, the brick's voxels as the octree has them, so that eight in a row are a cube of 2³ and 64 one
+    of 4³. states, maxima : (73,) int64 scratch: the 64 of the former, the 8 of the latter, the brick.
+    """
+    for q in range(73):
+        state, largest = 1 << 21, -32768
+        for c in range(8):
+            if q < 64:
+                v = int(row[order[8 * q + c]])
+                s = voxel_state(v, classes, threshold)
+            else:
+                v, s = maxima[8 * (q - 64) + c], states[8 * (q - 64) + c]
+            largest = max(largest, v)
+            state = s if state == 1 << 21 or state == s else 1 << 20
+        states[q], maxima[q] = state, largest
+    room = codes.shape[0]
+    nodes = 0
+    for k in range(73):  # depth first: the brick, then each cube of 4³ (k = 1, 10, …) before its cubes of 2³
+        q = 72 if k == 0 else (64 + (k - 1) // 9 if (k - 1) % 9 == 0 else k - 2 - (k - 1) // 9)
+        state = states[q]
+        if state == -32768 or (q < 64 and states[64 + (q >> 3)] != 1 << 20):
+            continue
+        nodes += 1
+        code = 0
+        if state == 1 << 20:
+            for c in range(8):
+                if q < 64:
+                    s = voxel_state(row[order[8 * q + c]], classes, threshold)
+                else:
+                    s = states[8 * (q - 64) + c]
+                if s != -32768:
+                    code |= ((3 if s == 1 << 20 else (2 if s == 1 else 1)) << (2 * c)) if classes else (1 << c)
+        elif classes:
+            continue
+        if record < room:
+            codes[record] = code
+            if not classes:
+                values[record] = maxima[q]
+        record += 1
+        if q >= 64 or state != 1 << 20:
+            continue
+        for c in range(8):
+            v = row[order[8 * q + c]]
+            if v != -32768:
+                nodes += 1
+                if not classes:
+                    if record < room:
+                        codes[record], values[record] = 0, v
+                    record += 1
+    tally[NODES] += nodes
+    return record
+
+
+@numba.njit(cache=True, nogil=True)
 def write_tree(
-    root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max, stack, codes,
-    values, tally,
+    root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max, order, stack,
+    codes, values, tally,
 ):  # fmt: skip
     """Records of a grid's tree with all that is of one value (``classes``: of one class, a ``.bt``) pruned.
 
-    codes : (r,) uint16 out; values : (r,) int16 out, not used with ``classes``. tally : (6,) int64 out, numbers of
-    records and nodes, also where the arrays are too short.
+    order : see :func:`write_brick`. codes : (r,) uint16 out; values : (r,) int16 out, not used with ``classes``.
+    tally : (6,) int64 out, numbers of records and nodes, also where the arrays are too short.
     """
     # by way of the stack: for literals look_at would be compiled once more
     stack[0, 0], stack[0, 1], stack[0, 2] = 16, root, 0
@@ -181,15 +223,20 @@ def write_tree(
     state, largest = look_at(
         m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
     )  # fmt: skip
-    record, nodes, n = 0, 0, 0
+    record, n = 0, 0
     room = codes.shape[0]
+    states, maxima = np.empty(73, np.int64), np.empty(73, np.int64)
+    tally[NODES] = 0
     if state != -32768:
         stack[0, 3], stack[0, 4] = state, largest
         n = 1
     while n > 0:
         n -= 1
         m, node, part, state, largest = stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4]
-        nodes += 1
+        if m == 3 and state == 1 << 20:
+            record = write_brick(bricks[node], order, classes, threshold, states, maxima, codes, values, record, tally)
+            continue
+        tally[NODES] += 1
         leaf = state != 1 << 20
         if classes and leaf:  # a .bt has no record of a leaf; the root is none, our own being larger or elsewhere
             continue
@@ -215,4 +262,4 @@ def write_tree(
             if not classes:
                 values[record] = largest
         record += 1
-    tally[RECORD], tally[NODES] = record, nodes
+    tally[RECORD] = record
