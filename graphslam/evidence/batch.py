@@ -16,23 +16,20 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
-from graphslam.evidence.pool import GridPool
-from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
-from graphslam.evidence.update_kernels import (
+from graphslam.evidence.mark_kernels import (
     BRICKS,
     CUT,
     NEED_SLOTS,
     NOT_FINITE,
     OUTSIDE,
-    PENDING,
     RAYS,
     TALLY,
     ZERO_LENGTH,
-    apply_grids,
-    drop_sources,
     mark_grids,
-    resolve_grids,
 )
+from graphslam.evidence.pool import GridPool
+from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
+from graphslam.evidence.update_kernels import PENDING, apply_grids, drop_sources, resolve_grids
 
 if TYPE_CHECKING:
     from graphslam.evidence.grid import EvidenceGrid

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from graphslam.evidence.update_kernels import mark_grids
+from graphslam.evidence.mark_kernels import mark_grids
 
 if TYPE_CHECKING:
     from graphslam.evidence.grid import EvidenceGrid

@@ -106,11 +106,15 @@ class GridPool:
         more_bricks = bricks - (len(self.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
         if more_nodes > 0:
             n = len(self.node_ref) + max(int(more_nodes), len(self.node_ref) // 2)
-            grown = tuple(_longer(a, n) for a in (self.children, self.node_ref, self.node_occupied, self.node_free))
+            grown = tuple(
+                _longer(a, n, c[NODES_USED]) for a in (self.children, self.node_ref, self.node_occupied, self.node_free)
+            )
             self.children, self.node_ref, self.node_occupied, self.node_free = grown
         if more_bricks > 0:
             n = len(self.brick_ref) + max(int(more_bricks), len(self.brick_ref) // 2)
-            grown = tuple(_longer(a, n) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free))
+            grown = tuple(
+                _longer(a, n, c[BRICKS_USED]) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free)
+            )
             self.bricks, self.brick_ref, self.brick_lines, self.brick_free = grown
 
     @property
@@ -204,7 +208,8 @@ class GridPool:
         )
 
 
-def _longer(a: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+def _longer(a: npt.NDArray[Any], n: int, used: int) -> npt.NDArray[Any]:
+    """A copy with room for n rows. Rows that were never used are not touched, so they take no memory yet."""
     grown = np.empty((n, *a.shape[1:]), a.dtype)
-    grown[: len(a)] = a
+    grown[:used] = a[:used]
     return grown

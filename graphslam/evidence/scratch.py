@@ -10,10 +10,13 @@ WINDOW = 64**3
 
 
 class Scratch:
-    """Window, slots and marks; between scans the window is all -1 and the marks are all 0."""
+    """Window, slots and marks; between scans the window is all -1 and the marks are all 0.
 
-    def __init__(self, slots: int = 512) -> None:
-        self.window = np.full(WINDOW, -1, np.int32)
+    What no scan has touched yet is not in the machine's memory.
+    """
+
+    def __init__(self, slots: int = 16384) -> None:
+        self.window = np.full((WINDOW, 2), -1, np.int64)
         self.resize(slots)
 
     def resize(self, slots: int) -> None:

@@ -1,0 +1,277 @@
+"""First phase of inserting a scan, compiled: *mark* the voxels that beams cross; no map is needed for it.
+
+A byte a voxel is written into scratch bricks that a small table around the sensor finds (64³ entries by the low bits of
+a brick's coordinates; bricks that fall on the same entry are chained, so that a scan may be of any extent).
+
+Sixteen beams are stepped side by side, without a branch: which axis comes next is as good as random along one beam,
+and mispredicted branches were most of the time. So that a step is the same few operations on every lane, a voxel is one
+integer in which the bits of each coordinate lie apart (low 9 bits: voxel in the brick; next 18: entry of the window;
+then the rest), and the parameters of the next crossings are fixed-point integers.
+
+Scratch arrays: ``window (64³, 2) int64`` [key, 512 × slot] of the last brick on an entry or -1, ``slot_key (S,) int64``
+brick coordinates, ``slot_next (S,) int32`` next slot of the entry or -1, ``marks (S, 512) uint8`` (``marks64 (S, 64)
+uint64`` is the same memory), ``work (S, 5) int32``; between scans the window is all -1 and the marks are all 0. Scans
+are ``points (n, 3)``, ``origins (n, 3) or (1, 3)``, ``returns (n,) or (0,) uint8``; poses ``(P, 12)`` are R row by row,
+then t [m].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+# what a tally counts, per call
+RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS = 0, 1, 2, 3, 4, 5, 6
+TALLY = 7
+
+LANES = 16  # the literal stands in the loops: a known number of turns is what lets them be vectorised
+# bits of the three coordinates in the integer of a voxel; those of a brick lie 9 lower
+MASK_X = 0b111 | (0x3F << 9) | (0x1FF << 27)
+MASK_Y = (0b111 << 3) | (0x3F << 15) | (0x1FF << 36)
+MASK_Z = (0b111 << 6) | (0x3F << 21) | (0x1FF << 45)
+ONE = 2.0**58  # parameter of a beam's end in fixed point
+NEVER = 2**61
+
+
+@numba.njit(cache=True, nogil=True)
+def voxel_code(x, y, z):
+    """Integer of a voxel: the bits of its offset coordinates, each field apart."""
+    return (
+        (x & 7)
+        | (((x >> 3) & 0x3F) << 9)
+        | ((x >> 9) << 27)
+        | ((y & 7) << 3)
+        | (((y >> 3) & 0x3F) << 15)
+        | ((y >> 9) << 36)
+        | ((z & 7) << 6)
+        | (((z >> 3) & 0x3F) << 21)
+        | ((z >> 9) << 45)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def brick_key(code):
+    """Packed brick coordinates (20 bits each) of a brick's code."""
+    bx = (code & 0x3F) | (((code >> 18) & 0x1FF) << 6)
+    by = ((code >> 6) & 0x3F) | (((code >> 27) & 0x1FF) << 6)
+    bz = ((code >> 12) & 0x3F) | (((code >> 36) & 0x1FF) << 6)
+    return (bz << 40) | (by << 20) | bx
+
+
+@numba.njit(cache=True, nogil=True)
+def find_slot(code, n, limit, window, slot_key, slot_next):
+    """Slot of a brick that is not the last one on its entry; n where it was made there, -1 where there is no room,
+    -2 where the brick lies outside the cube (an end on the cube's own face, passed by a rounding)."""
+    w = code & 0x3FFFF
+    s = window[w, 1] >> 9
+    while s >= 0 and slot_key[s] != code:
+        s = np.int64(slot_next[s])
+    if s >= 0:
+        return s
+    key = brick_key(code)
+    if max(key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40) >= limit:
+        return -2
+    if n == slot_key.shape[0]:
+        return -1
+    slot_key[n] = code
+    slot_next[n] = window[w, 1] >> 9
+    window[w, 0] = code
+    window[w, 1] = n << 9
+    return n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fixed(parameter):
+    """Parameter along a beam in fixed point, far beyond its end where it is no number we can hold."""
+    f = parameter * ONE
+    return np.int64(f) if f < 2.0**61 else np.int64(NEVER)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def mark_grids(
+    begin,
+    end,
+    poses,
+    points,
+    origins,
+    returns,
+    max_range,
+    scale,
+    half,
+    ends,
+    window,
+    slot_key,
+    slot_next,
+    marks,
+    tally,
+):
+    """Mark what a scan crosses in grids ``begin … end-1``, whose slots follow each other from 0 on.
+
+    ``ends (P,)`` becomes the end of each grid's slots. Returns whether the slots sufficed; if not, ``tally`` says how
+    many to have, and the scratch must be made anew.
+
+    Amanatides & Woo's traversal in voxel coordinates (``scale`` = 1 / voxel size), from the voxel of the origin up to
+    but not including the voxel of the end, which is marked as hit if the beam returned and was not cut.
+    """
+    n = 0
+    total = points.shape[0]
+    single = origins.shape[0] == 1
+    all_return = returns.shape[0] == 0
+    edge = 2 * half
+    limit = edge >> 3
+    flat = marks.reshape(marks.size)
+    hits = np.empty(total, np.int64)
+    left = np.zeros(16, np.int64)  # steps a lane has to go
+    # rows of 16 lanes: next crossings in x, y, z (0, 16, 32), from one to the next (48, 64, 80), coordinates (96, 112,
+    # 128), bits filled in before a step so that it carries over the gaps (144, 160, 176), steps (192, 208, 224). One
+    # flat array with constant offsets: only so can the compiler see that the rows do not overlap.
+    L = np.zeros(240, np.int64)
+    full = False
+    for g in range(begin, end):
+        first, active, b, n_hits = n, 0, 0, 0
+        while True:
+            while active < 16 and b < total:  # fill the lanes that are free
+                o = 0 if single else b
+                lx, ly, lz = origins[o, 0], origins[o, 1], origins[o, 2]
+                dx, dy, dz = points[b, 0] - lx, points[b, 1] - ly, points[b, 2] - lz
+                hit = all_return or returns[b] != 0
+                b += 1
+                length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                if not length < np.inf:  # neither of two infinities nor of a NaN
+                    tally[NOT_FINITE] += 1
+                    continue
+                if length == 0.0:
+                    tally[ZERO_LENGTH] += 1
+                    continue
+                cut = 1.0
+                if length > max_range:
+                    cut = max_range / length
+                    hit = False
+                # voxel coordinates, shifted so that they are not negative in the addressable cube
+                ox = (poses[g, 0] * lx + poses[g, 1] * ly + poses[g, 2] * lz + poses[g, 9]) * scale + half
+                oy = (poses[g, 3] * lx + poses[g, 4] * ly + poses[g, 5] * lz + poses[g, 10]) * scale + half
+                oz = (poses[g, 6] * lx + poses[g, 7] * ly + poses[g, 8] * lz + poses[g, 11]) * scale + half
+                f = cut * scale
+                vx = (poses[g, 0] * dx + poses[g, 1] * dy + poses[g, 2] * dz) * f
+                vy = (poses[g, 3] * dx + poses[g, 4] * dy + poses[g, 5] * dz) * f
+                vz = (poses[g, 6] * dx + poses[g, 7] * dy + poses[g, 8] * dz) * f
+                px, py, pz = ox + vx, oy + vy, oz + vz
+                inside = (
+                    min(ox, px) >= 0.0
+                    and min(oy, py) >= 0.0
+                    and min(oz, pz) >= 0.0
+                    and max(ox, px) < edge
+                    and max(oy, py) < edge
+                    and max(oz, pz) < edge
+                )
+                if not inside:
+                    tally[OUTSIDE] += 1
+                    continue
+                tally[RAYS] += 1
+                if cut < 1.0:
+                    tally[CUT] += 1
+                x, y, z = int(ox), int(oy), int(oz)
+                ex, ey, ez = int(px), int(py), int(pz)
+                if hit:
+                    p = voxel_code(ex, ey, ez)
+                    code = p >> 9
+                    slot = window[code & 0x3FFFF, 1] >> 9
+                    if window[code & 0x3FFFF, 0] != code:
+                        slot = find_slot(code, n, limit, window, slot_key, slot_next)
+                        if slot < 0:
+                            full = True
+                            break
+                        if slot == n:
+                            n += 1
+                    hits[n_hits] = (slot << 9) | (p & 511)
+                    n_hits += 1
+                steps = abs(ex - x) + abs(ey - y) + abs(ez - z)
+                if steps == 0:
+                    continue
+                a = active
+                active += 1
+                left[a] = steps
+                # an axis on which the ends share a voxel is never stepped, also where the origin lies on a plane and
+                # the beam leaves it by a rounding
+                ix = 1.0 / abs(vx) if ex != x else 0.0
+                iy = 1.0 / abs(vy) if ey != y else 0.0
+                iz = 1.0 / abs(vz) if ez != z else 0.0
+                L[a] = fixed((x + 1 - ox if ex > x else ox - x) * ix) if ex != x else NEVER
+                L[16 + a] = fixed((y + 1 - oy if ey > y else oy - y) * iy) if ey != y else NEVER
+                L[32 + a] = fixed((z + 1 - oz if ez > z else oz - z) * iz) if ez != z else NEVER
+                L[48 + a] = fixed(ix)
+                L[64 + a] = fixed(iy)
+                L[80 + a] = fixed(iz)
+                p = voxel_code(x, y, z)
+                L[96 + a], L[112 + a], L[128 + a] = p & MASK_X, p & MASK_Y, p & MASK_Z
+                L[144 + a] = ~MASK_X if ex > x else 0
+                L[160 + a] = ~MASK_Y if ey > y else 0
+                L[176 + a] = ~MASK_Z if ez > z else 0
+                L[192 + a] = 1 if ex > x else -1
+                L[208 + a] = 8 if ey > y else -8
+                L[224 + a] = 64 if ez > z else -64
+            if full or active == 0:
+                break
+            run = left[0]
+            for l in range(1, active):
+                run = min(run, left[l])
+            for l in range(active):
+                left[l] -= run
+            for _ in range(run):  # no lane ends before the last of these
+                for l in range(active):
+                    p = L[96 + l] | L[112 + l] | L[128 + l]
+                    code = p >> 9
+                    w = code & 0x3FFFF
+                    place = window[w, 1]
+                    if window[w, 0] != code:
+                        slot = find_slot(code, n, limit, window, slot_key, slot_next)
+                        if slot == -2:
+                            continue
+                        if slot < 0:
+                            full = True
+                            break
+                        if slot == n:
+                            n += 1
+                        place = slot << 9
+                    # a plain store: reading first would make neighbours that meet in a voxel wait for each other
+                    flat[np.uint64(place | (p & 511))] = 1
+                if full:
+                    break
+                for l in range(16):
+                    tx, ty, tz = L[l], L[16 + l], L[32 + l]
+                    mx = -(np.int64(tx < ty) & np.int64(tx < tz))  # all bits of the axis that comes next
+                    my = -np.int64(ty < tz) & ~mx
+                    mz = ~(mx | my)
+                    L[l] = tx + (L[48 + l] & mx)
+                    L[16 + l] = ty + (L[64 + l] & my)
+                    L[32 + l] = tz + (L[80 + l] & mz)
+                    L[96 + l] = ((L[96 + l] | (L[144 + l] & mx)) + (L[192 + l] & mx)) & MASK_X
+                    L[112 + l] = ((L[112 + l] | (L[160 + l] & my)) + (L[208 + l] & my)) & MASK_Y
+                    L[128 + l] = ((L[128 + l] | (L[176 + l] & mz)) + (L[224 + l] & mz)) & MASK_Z
+            if full:
+                break
+            l = 0
+            while l < active:  # the last lane takes the place of one that ended
+                if left[l] > 0:
+                    l += 1
+                    continue
+                active -= 1
+                left[l] = left[active]
+                for k in range(0, 240, 16):
+                    L[k + l] = L[k + active]
+                for k in range(48, 96, 16):
+                    L[k + active] = 0  # an idle lane stays where it is
+        for k in range(n_hits):
+            flat[np.uint64(hits[k])] |= 2
+        for s in range(first, n):  # empty the entries of this grid's slots, and name the bricks as the tree does
+            w = slot_key[s] & 0x3FFFF
+            window[w, 0] = -1
+            window[w, 1] = -1
+            slot_key[s] = brick_key(slot_key[s])
+        if full:
+            tally[NEED_SLOTS] = 4 * slot_key.shape[0]
+            return False
+        ends[g] = n
+    return True
