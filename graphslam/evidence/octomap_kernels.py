@@ -223,10 +223,11 @@ def write_tree(
     state, largest = look_at(
         m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
     )  # fmt: skip
-    record, n = 0, 0
     room = codes.shape[0]
     states, maxima = np.empty(73, np.int64), np.empty(73, np.int64)
-    tally[NODES] = 0
+    tally[RECORD], tally[NODES] = 0, 0
+    record = tally[RECORD]  # no literal either
+    n = 0
     if state != -32768:
         stack[0, 3], stack[0, 4] = state, largest
         n = 1

@@ -217,7 +217,8 @@ def list_bricks(root, levels, children, out):
 def gather_bricks(ids, bricks, out):
     """Copy bricks to rows of ``out (n, 512)``."""
     for k in range(ids.shape[0]):
-        out[k] = bricks[ids[k]]
+        for j in range(512):  # by rows it would compile for a second
+            out[k, j] = bricks[ids[k], j]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -278,7 +279,8 @@ def write_bricks(
                 brick_ref[b] -= 1
             b = take_brick(brick_ref, brick_free, counters)
             children[parent, c] = b
-        bricks[b] = values[k]
+        for j in range(512):  # by rows it would compile for two seconds
+            bricks[b, j] = values[k, j]
         lines = occupied_lines(b, threshold, bricks)
         brick_lines[b] = lines
         set_occupied(root, bx, by, bz, levels, lines != 0, children, node_occupied)
