@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import octomap
 import pytest
 
 from graphslam.core.errors import FormatError, GridError, MissingDataError
@@ -19,8 +20,6 @@ from graphslam.evidence.pool import GridPool
 from tests.reference import octomap_tree
 from tests.reference.evidence_maps import cube, grid_of_map, map_of_grid, random_map, scanned_grid
 from tests.reference.evidence_pool import check_pool
-
-octomap = pytest.importorskip("octomap")
 
 
 def open_tree(path: Path) -> Any:
