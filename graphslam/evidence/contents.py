@@ -109,7 +109,7 @@ def bounding_box(grid: EvidenceGrid) -> tuple[Array, Array] | None:
     pool = grid.pool
     bounds = np.empty(6, np.int64)
     with pool.lock:
-        find_bounds(grid._bricks(), pool.bricks, bounds)
+        find_bounds(grid.packed_bricks(), pool.bricks, bounds)
     if bounds[3] < bounds[0]:
         return None
     corners = np.stack([bounds[:3], bounds[3:] + 1]) - pool.half
@@ -124,7 +124,7 @@ def occupied_voxels(grid: EvidenceGrid) -> tuple[npt.NDArray[np.int32], npt.NDAr
     """
     pool = grid.pool
     with pool.lock:
-        rows = grid._bricks()
+        rows = grid.packed_bricks()
         rows = rows[pool.brick_lines[rows[:, 1]] != 0]
         args = rows, pool.half, grid.model.threshold_step, pool.bricks, pool.brick_lines
         n = list_occupied(*args, np.empty((0, 3), np.int32), np.empty(0, np.int16))

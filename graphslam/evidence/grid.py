@@ -215,14 +215,18 @@ class EvidenceGrid:
         keys = (u[:, 2] << 40) | (u[:, 1] << 20) | u[:, 0]
         if len(np.unique(keys)) != len(keys):
             raise GridError("a brick stands twice in one write", wanted="each brick once")
+        self.write_packed(keys, v)
+
+    def write_packed(self, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
+        """:meth:`write_bricks` by packed offset coordinates ``(n,)``, unchecked."""
         pool = self.pool
         with pool.lock, deferred_interrupts():
             own_grids((self,), pool)  # first: it may take a node itself
-            pool.reserve(len(c) * (pool.levels - 1), len(c))
+            pool.reserve(len(keys) * (pool.levels - 1), len(keys))
             write_bricks(
                 self.root,
                 keys,
-                v,
+                values,
                 self.model.threshold_step,
                 pool.levels,
                 *pool.tree_arrays(),
@@ -235,7 +239,7 @@ class EvidenceGrid:
 
     # --- reading ---------------------------------------------------------------------------------------------
 
-    def _bricks(self) -> npt.NDArray[np.int64]:
+    def packed_bricks(self) -> npt.NDArray[np.int64]:
         """Packed coordinates and ids of the bricks, ``(n, 2)``, ascending; hold the pool's lock."""
         pool = self.pool
         if self.root == 0:
@@ -248,14 +252,14 @@ class EvidenceGrid:
     def brick_coordinates(self) -> npt.NDArray[np.int64]:
         """Signed coordinates of the bricks ``(n, 3)``, ascending in (z, y, x); brick b holds voxels 8b … 8b + 7."""
         with self.pool.lock:
-            keys = self._bricks()[:, 0]
+            keys = self.packed_bricks()[:, 0]
         half = self.pool.half // BRICK_EDGE
         return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1) - half
 
     def brick_values(self) -> npt.NDArray[np.int16]:
         """Values of the bricks ``(n, 512)``, in the order of :meth:`brick_coordinates`, in units of `layout.STEP`."""
         with self.pool.lock:
-            ids = self._bricks()[:, 1]
+            ids = self.packed_bricks()[:, 1]
             out = np.empty((len(ids), BRICK_VOXELS), np.int16)
             gather_bricks(np.ascontiguousarray(ids), self.pool.bricks, out)
         return out

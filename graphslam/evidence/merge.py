@@ -9,10 +9,8 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
-from graphslam.evidence.batch import own_grids
-from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
-from graphslam.evidence.merge_kernels import add_bricks, sample_bricks
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
+from graphslam.evidence.merge_kernels import sample_bricks
 from graphslam.evidence.scan import pose_row
 
 if TYPE_CHECKING:
@@ -57,6 +55,8 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
     keys = _touched(grid, source.brick_coordinates(), R, t)
     work = grid.copy()  # the grid itself changes when all is done, or not at all
     pool, scale = grid.pool, 1.0 / grid.voxel_size
+    with pool.lock:
+        bricks = grid.packed_bricks()  # stay what they are while the work goes on: the grid is not written
     found = 0
     for begin in range(0, len(keys), CHUNK):
         part = keys[begin : begin + CHUNK]
@@ -78,14 +78,28 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
         if known == 0:
             continue
         found += known
-        with pool.lock, deferred_interrupts():
-            own_grids((work,), pool)  # first: it may take a node itself
-            pool.reserve(len(part) * (pool.levels - 1), len(part))
-            add_bricks(
-                work.root, part, values, grid.model.steps, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
-            )
+        some = (values != UNKNOWN).any(axis=1)
+        part, values = part[some], values[some]
+        with pool.lock:
+            old = pool.bricks[_ids(bricks, part)]
+        work.write_packed(part, _sum(old, values, *grid.model.clamp_steps))
     grid.take(work)
     return found
+
+
+def _ids(bricks: npt.NDArray[np.int64], keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Bricks of packed coordinates, 0 (which is all unknown) where there is none; ``bricks (n, 2)`` ascending."""
+    if len(bricks) == 0:
+        return np.zeros(len(keys), np.int64)
+    at = np.minimum(np.searchsorted(bricks[:, 0], keys), len(bricks) - 1)
+    return np.where(bricks[at, 0] == keys, bricks[at, 1], 0)
+
+
+def _sum(old: npt.NDArray[np.int16], add: npt.NDArray[np.int16], low: int, high: int) -> npt.NDArray[np.int16]:
+    """Sum of log-odds, clamped; what is unknown adds nothing, and unknown voxels start at 0."""
+    known = add != UNKNOWN
+    new = np.where(old == UNKNOWN, 0, old).astype(np.int32) + add
+    return np.where(known, np.clip(new, low, high), old).astype(np.int16)
 
 
 def _touched(grid: EvidenceGrid, coordinates: npt.NDArray[np.int64], R: Array, t: Array) -> npt.NDArray[np.int64]:

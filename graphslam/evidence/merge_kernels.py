@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from graphslam.evidence.tree_kernels import find_node, own_parent, set_occupied, take_brick
+from graphslam.evidence.tree_kernels import find_node
 
 
 @numba.njit(cache=True, nogil=True)
@@ -49,57 +49,3 @@ def sample_bricks(keys, T, scale, voxel, half, source_half, root, levels, childr
             if value != -32768:
                 found += 1
     return found
-
-
-@numba.njit(cache=True, nogil=True)
-def add_bricks(
-    root,
-    keys,
-    values,
-    steps,
-    levels,
-    children,
-    node_ref,
-    node_occupied,
-    bricks,
-    brick_ref,
-    brick_lines,
-    node_free,
-    brick_free,
-    counters,
-):
-    """Add log-odds ``values (n, 512)`` to bricks; unknown ones add nothing, unknown voxels start at 0.
-
-    Room was reserved.
-    """
-    low, high, threshold = int(steps[2]), int(steps[3]), int(steps[4])
-    for k in range(keys.shape[0]):
-        some = False
-        for v in range(512):
-            if values[k, v] != -32768:
-                some = True
-                break
-        if not some:
-            continue
-        bx, by, bz = keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40
-        parent = own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters)
-        c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
-        source = int(children[parent, c])
-        target = source
-        if source == 0 or brick_ref[source] > 1:
-            target = take_brick(brick_ref, brick_free, counters)
-            children[parent, c] = target
-            if source != 0:
-                brick_ref[source] -= 1
-        lines = 0
-        for v in range(512):
-            old, add = int(bricks[source, v]), int(values[k, v])
-            new = old
-            if add != -32768:
-                new = (0 if old == -32768 else old) + add
-                new = min(max(new, low), high)
-            bricks[target, v] = new
-            if new >= threshold:
-                lines |= 1 << (v >> 5)
-        brick_lines[target] = lines
-        set_occupied(root, bx, by, bz, levels, lines != 0, children, node_occupied)
