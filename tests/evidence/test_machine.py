@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections import Counter
 
 import hypothesis.strategies as st
 import numpy as np
@@ -39,7 +40,7 @@ STATUS = {"max": 0, "hit": 1, "inside": 2, "left": 3, "outside": 4, "unknown": 5
 def random_pose(rng: np.random.Generator, dim: int = 3) -> np.ndarray:
     """A pose a few voxels from the centre, one in four near a corner of the cube."""
     far = rng.random() < 0.25
-    t = rng.uniform(-1, 1, 3) * VOXEL * (EDGE if far else 10)
+    t = rng.uniform(-1, 1, 3) * VOXEL * (EDGE if far else 5)
     if dim == 2:
         return np.array([t[0], t[1], rng.uniform(-np.pi, np.pi)])
     q = rng.normal(size=4)
@@ -96,7 +97,6 @@ class GridMachine(RuleBasedStateMachine):
         self.living.append(pair)
         return pair
 
-    @rule(target=pairs)
     def fresh(self) -> Pair:
         grid = EvidenceGrid(VOXEL, model=self.model, pool=self.pool, dim=self.dim)
         return self.keep(grid, EvidenceTwin(VOXEL, self.model, self.pool.half, self.dim))
@@ -226,12 +226,8 @@ class GridMachine(RuleBasedStateMachine):
             np.testing.assert_array_equal(grid.bounding_box(), np.array(bounds)[:, : self.dim] * VOXEL)
 
     @rule(pair=pairs)
-    def lock(self, pair: Pair) -> None:
-        pair.grid.lock()
-
-    @rule(pair=pairs)
-    def unlock(self, pair: Pair) -> None:
-        pair.grid.unlock()
+    def lock_or_unlock(self, pair: Pair) -> None:
+        pair.grid.unlock() if pair.grid.locked else pair.grid.lock()
 
     @rule(pair=pairs)
     def release(self, pair: Pair) -> None:
@@ -263,6 +259,41 @@ class GridMachine(RuleBasedStateMachine):
         assert self.pool.used_bricks == 0
         check_pool(self.pool, [])
         gc.collect()
+
+
+@pytest.mark.parametrize(("dim", "seed"), [(3, 0), (3, 1), (2, 2)])
+def test_a_long_walk(dim: int, seed: int) -> None:
+    """The rules in a fixed random order, writing often to maps that share much: what hypothesis may not come to."""
+    rng = np.random.default_rng(seed)
+    m = GridMachine()
+    m.start(which=seed % 2, dim=dim)
+    steps = 120
+    done: Counter[str] = Counter()
+    for _ in range(steps):
+        names = ["insert", "insert_into_many", "copy", "write_bricks", "merge", "compact", "look", "release", "forget"]
+        name = str(rng.choice(names, p=[0.25, 0.2, 0.15, 0.08, 0.07, 0.05, 0.1, 0.05, 0.05]))
+        pair = m.living[int(rng.integers(len(m.living)))]
+        draw = int(rng.integers(2**32))
+        if name in ("insert", "write_bricks", "look"):
+            getattr(m, name)(pair=pair, seed=draw)
+        elif name == "insert_into_many":
+            m.insert_into_many(seed=draw, threads=draw % 3 + 1, near=draw % 5 < 3)
+        elif name == "copy" and len(m.living) < 8:
+            m.copy(pair=pair, n=draw % 2 + 1)
+        elif name == "merge":
+            m.merge(into=pair, what=m.living[draw % len(m.living)], seed=draw, whole=draw % 2 == 0)
+        elif name == "compact":
+            m.compact(seed=draw)
+        elif name in ("release", "forget") and len(m.living) > 2:
+            getattr(m, name)(pair=pair)
+        else:
+            m.lock_or_unlock(pair=pair)
+            name = "lock"
+        done[name] += 1
+        m.grids_equal_their_twins()
+        m.counts_are_right()
+    m.teardown()
+    assert len(done) == 10
 
 
 TestGridMachine = GridMachine.TestCase
