@@ -61,18 +61,14 @@ def brick_key(code):
 
 
 @numba.njit(cache=True, nogil=True)
-def find_slot(code, n, limit, window, slot_key, slot_next):
-    """Slot of a brick that is not the last one on its entry; n where it was made there, -1 where there is no room,
-    -2 where the brick lies outside the cube (an end on the cube's own face, passed by a rounding)."""
+def find_slot(code, n, window, slot_key, slot_next):
+    """Slot of a brick that is not the last one on its entry; n where it was made there, -1 where there is no room."""
     w = code & 0x3FFFF
     s = window[w, 1] >> 9
     while s >= 0 and slot_key[s] != code:
         s = np.int64(slot_next[s])
     if s >= 0:
         return s
-    key = brick_key(code)
-    if max(key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40) >= limit:
-        return -2
     if n == slot_key.shape[0]:
         return -1
     slot_key[n] = code
@@ -120,14 +116,14 @@ def mark_grids(
     single = origins.shape[0] == 1
     all_return = returns.shape[0] == 0
     edge = 2 * half
-    limit = edge >> 3
     flat = marks.reshape(marks.size)
     hits = np.empty(total, np.int64)
     left = np.zeros(16, np.int64)  # steps a lane has to go
     # rows of 16 lanes: next crossings in x, y, z (0, 16, 32), from one to the next (48, 64, 80), coordinates (96, 112,
-    # 128), bits filled in before a step so that it carries over the gaps (144, 160, 176), steps (192, 208, 224). One
-    # flat array with constant offsets: only so can the compiler see that the rows do not overlap.
-    L = np.zeros(240, np.int64)
+    # 128), bits filled in before a step so that it carries over the gaps (144, 160, 176), steps (192, 208, 224), how
+    # many are to go (240, 256, 272). One flat array with constant offsets: only so can the compiler see that the rows
+    # do not overlap.
+    L = np.zeros(288, np.int64)
     full = False
     for g in range(begin, end):
         first, active, b, n_hits = n, 0, 0, 0
@@ -179,7 +175,7 @@ def mark_grids(
                     code = p >> 9
                     slot = window[code & 0x3FFFF, 1] >> 9
                     if window[code & 0x3FFFF, 0] != code:
-                        slot = find_slot(code, n, limit, window, slot_key, slot_next)
+                        slot = find_slot(code, n, window, slot_key, slot_next)
                         if slot < 0:
                             full = True
                             break
@@ -193,8 +189,6 @@ def mark_grids(
                 a = active
                 active += 1
                 left[a] = steps
-                # an axis on which the ends share a voxel is never stepped, also where the origin lies on a plane and
-                # the beam leaves it by a rounding
                 ix = 1.0 / abs(vx) if ex != x else 0.0
                 iy = 1.0 / abs(vy) if ey != y else 0.0
                 iz = 1.0 / abs(vz) if ez != z else 0.0
@@ -212,6 +206,7 @@ def mark_grids(
                 L[192 + a] = 1 if ex > x else -1
                 L[208 + a] = 8 if ey > y else -8
                 L[224 + a] = 64 if ez > z else -64
+                L[240 + a], L[256 + a], L[272 + a] = abs(ex - x), abs(ey - y), abs(ez - z)
             if full or active == 0:
                 break
             run = left[0]
@@ -226,9 +221,7 @@ def mark_grids(
                     w = code & 0x3FFFF
                     place = window[w, 1]
                     if window[w, 0] != code:
-                        slot = find_slot(code, n, limit, window, slot_key, slot_next)
-                        if slot == -2:
-                            continue
+                        slot = find_slot(code, n, window, slot_key, slot_next)
                         if slot < 0:
                             full = True
                             break
@@ -244,9 +237,13 @@ def mark_grids(
                     mx = -(np.int64(tx < ty) & np.int64(tx < tz))  # all bits of the axis that comes next
                     my = -np.int64(ty < tz) & ~mx
                     mz = ~(mx | my)
-                    L[l] = tx + (L[48 + l] & mx)
-                    L[16 + l] = ty + (L[64 + l] & my)
-                    L[32 + l] = tz + (L[80 + l] & mz)
+                    # an axis that was stepped as often as the ends lie apart is not stepped again: whatever the
+                    # roundings, a beam through edges and corners ends where it should
+                    nx, ny, nz = L[240 + l] + mx, L[256 + l] + my, L[272 + l] + mz
+                    L[240 + l], L[256 + l], L[272 + l] = nx, ny, nz
+                    L[l] = (tx + (L[48 + l] & mx)) | (NEVER & -np.int64(nx == 0))
+                    L[16 + l] = (ty + (L[64 + l] & my)) | (NEVER & -np.int64(ny == 0))
+                    L[32 + l] = (tz + (L[80 + l] & mz)) | (NEVER & -np.int64(nz == 0))
                     L[96 + l] = ((L[96 + l] | (L[144 + l] & mx)) + (L[192 + l] & mx)) & MASK_X
                     L[112 + l] = ((L[112 + l] | (L[160 + l] & my)) + (L[208 + l] & my)) & MASK_Y
                     L[128 + l] = ((L[128 + l] | (L[176 + l] & mz)) + (L[224 + l] & mz)) & MASK_Z
@@ -259,7 +256,7 @@ def mark_grids(
                     continue
                 active -= 1
                 left[l] = left[active]
-                for k in range(0, 240, 16):
+                for k in range(0, 288, 16):
                     L[k + l] = L[k + active]
                 for k in range(48, 96, 16):
                     L[k + active] = 0  # an idle lane stays where it is
