@@ -109,8 +109,9 @@ def apply_grids(
 
     Brick 0 as a source is a brick nobody has seen. Lines without marks are copied, or not touched at all: a planar
     scanner marks few lines of the bricks it crosses, and with many particles the bricks are not in the cache.
-    Arithmetic stays in int16 after each operation, or it is not vectorised (the model's range keeps it from overflow);
-    so does having one loop that reads and writes one brick and another that copies. Applying twice is applying once.
+    Arithmetic stays in int16 after each operation, or it is not vectorised; so does having one loop that reads and
+    writes one brick and another that copies. Values are bounded before the step is added and not after: those of a
+    file may lie anywhere, and would overflow. Applying twice is applying once.
     """
     miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
     s = 0
@@ -132,10 +133,11 @@ def apply_grids(
                         v = bricks[target, a + j]
                         m = marks[s, a + j]
                         base = np.int16(0) if v == np.int16(-32768) else v
-                        w = np.int16(base + (hit if m >= 2 else miss))
-                        w = low if w < low else w
-                        w = high if w > high else w
-                        w = w if m != 0 else v
+                        step = hit if m >= 2 else miss
+                        least, most = np.int16(low - step), np.int16(high - step)
+                        base = least if base < least else base
+                        base = most if base > most else base
+                        w = np.int16(base + step) if m != 0 else v
                         bricks[target, a + j] = w
                         greatest = max(greatest, w)
                 else:
@@ -143,10 +145,11 @@ def apply_grids(
                         v = bricks[source, a + j]
                         m = marks[s, a + j]
                         base = np.int16(0) if v == np.int16(-32768) else v
-                        w = np.int16(base + (hit if m >= 2 else miss))
-                        w = low if w < low else w
-                        w = high if w > high else w
-                        w = w if m != 0 else v
+                        step = hit if m >= 2 else miss
+                        least, most = np.int16(low - step), np.int16(high - step)
+                        base = least if base < least else base
+                        base = most if base > most else base
+                        w = np.int16(base + step) if m != 0 else v
                         bricks[target, a + j] = w
                         greatest = max(greatest, w)
                 for i in range(4):

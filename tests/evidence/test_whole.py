@@ -246,6 +246,23 @@ def test_bricks_that_make_no_sense_are_refused_whole(world: World) -> None:
         world.check()
 
 
+@pytest.mark.parametrize("copied", [False, True])
+def test_values_beyond_the_clamps_do_not_overflow(world: World, copied: bool) -> None:
+    """Bricks of files may hold any value: adding a step to it comes to the clamp, not around to the other sign."""
+    values = np.array([-32767, -32000, -31938, 0, 31032, 31940, 32767, -32768], np.int16)
+    for _ in range(2):
+        bricks = np.random.default_rng(3).choice(values, (8, 512))
+        where = np.stack(np.meshgrid(*[[-1, 0]] * 3), -1).reshape(-1, 3)
+        world.grids[1].write_bricks(where, bricks)
+        world.twins[1].write_bricks(where, bricks)
+        world.check()
+        before = world.grids[1].copy() if copied else None
+        world.insert(1, np.random.default_rng(4).normal(size=(40, 3)))
+        assert_same(world.grids[1], world.twins[1])
+        del before
+    world.check()
+
+
 # -- accidents ------------------------------------------------------------------------------------------------------
 
 
