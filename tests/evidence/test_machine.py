@@ -298,7 +298,7 @@ def test_a_long_walk(dim: int, seed: int) -> None:
 
 TestGridMachine = GridMachine.TestCase
 TestGridMachine.settings = settings(
-    max_examples=25,
+    max_examples=15,
     stateful_step_count=20,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
