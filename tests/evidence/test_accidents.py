@@ -1,4 +1,4 @@
-"""Memory that runs out and Ctrl-C at any moment: each grid is as before or as after, and nothing is lost in the pool."""
+"""Memory that runs out and Ctrl-C at any moment: each grid is as before or as after, nothing is lost in the pool."""
 
 from __future__ import annotations
 
