@@ -1,7 +1,7 @@
 """Many grids at once: a particle filter's step, its memory over a long way, and the time to start.
 
-The filter of both measurements: each particle has a pose (the true one with a random walk of its own on top) and a
-grid; every scan it is moved, weighted, and its grid updated.
+The filter of both measurements: each particle has a pose and a grid; every scan it is moved by the true motion with
+noise of its own (a random walk), weighted, and its grid updated.
 """
 
 from __future__ import annotations
@@ -20,20 +20,19 @@ from tqdm import tqdm
 
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.core.se3 import se3_compose, se3_exp
+from graphslam.core.se3 import se3_between, se3_compose, se3_exp
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
 from tests.benchmarks.evidence_scenes import FAN_RATE, Scene, tunnel
 
-WALK = np.repeat([3e-4, 3e-3], 3)  # σ of a particle's motion per scan: rotation [rad], translation [m]
+WALK = np.repeat([1e-3, 1e-2], 3)  # σ of a particle's motion per scan: rotation [rad], translation [m]
 CASTING = CastLikelihood(exponent=0.02)  # 181 beams count as 3.6
-END_POINTS = EndpointLikelihood(exponent=0.02, interpolation="nearest")  # 10 scans of 181 beams count as 36
 
 
 @dataclass
 class Cloud:
-    """Particles: what they add to the true pose, their grids and log weights."""
+    """Particles: their poses, grids and log weights."""
 
     number: int
     seed: int
@@ -44,15 +43,20 @@ class Cloud:
 
     def __post_init__(self) -> None:
         self.rng = SeedTree(self.seed).child("particles").generator()
-        self.errors = np.tile([0.0, 0, 0, 0, 0, 0, 1], (self.number, 1))
+        self.poses = np.zeros((self.number, 7))
+        self.truth: Array | None = None
         first = EvidenceGrid(self.voxel_size)
         self.grids = [first, *(first.empty() for _ in range(self.number - 1))]
         self.log_weights = np.zeros(self.number)
 
-    def move(self, pose: Array) -> Array:
-        """A scan later: poses ``(P, 7)``."""
-        self.errors = se3_compose(self.errors, se3_exp(self.rng.normal(scale=WALK, size=(self.number, 6))))
-        return se3_compose(np.broadcast_to(pose, self.errors.shape), self.errors)
+    def move(self, truth: Array) -> None:
+        """Go on to the next scan, which was taken at ``truth`` ``(7,)``; the first one is where they all begin."""
+        if self.truth is None:
+            self.poses[:] = truth
+        else:
+            noise = se3_exp(self.rng.normal(scale=WALK, size=(self.number, 6)))
+            self.poses = se3_compose(self.poses, se3_compose(se3_between(self.truth, truth), noise))
+        self.truth = truth
 
     @property
     def effective(self) -> float:
@@ -67,7 +71,7 @@ class Cloud:
         index = np.searchsorted(edges, (self.rng.random() + np.arange(self.number)) / self.number)
         index = np.minimum(index, self.number - 1)
         self.grids = [self.grids[k].copy() for k in index]
-        self.errors = self.errors[index]
+        self.poses = self.poses[index]
         self.log_weights = np.zeros(self.number)
         self.resampled += 1
 
@@ -106,47 +110,54 @@ def _run(scene: Scene, cloud: Cloud, clock) -> tuple[Array, int]:  # type: ignor
         if k == len(scene) // 4:
             before = cloud.resampled
         t0 = clock()
-        poses = cloud.move(pose)
+        cloud.move(pose)
         t1 = clock()
         if k:
             cloud.log_weights += log_weights(
-                cloud.grids, poses, points, CASTING, max_range=scene.max_range, threads=cloud.threads
+                cloud.grids, cloud.poses, points, CASTING, max_range=scene.max_range, threads=cloud.threads
             )
         t2 = clock()
         if cloud.effective < cloud.number / 2:
             cloud.resample()
-            poses = se3_compose(np.broadcast_to(pose, cloud.errors.shape), cloud.errors)
         t3 = clock()
-        update_grids(cloud.grids, poses, points, max_range=scene.max_range, threads=cloud.threads)
+        update_grids(cloud.grids, cloud.poses, points, max_range=scene.max_range, threads=cloud.threads)
         parts[k] = t1 - t0, t2 - t1, t3 - t2, clock() - t3
     return parts[len(scene) // 4 :], cloud.resampled - before
 
 
-def particle_memory(*, scans: int, particles: int, png: Path | None = None) -> tuple[float, float]:
+def particle_memory(*, scans: int, particles: int, exponent: float, png: Path | None = None) -> tuple[float, float]:
     """Memory of many particles over a long way, at its end and at its peak, over that of one map at the end.
 
-    End-point weights, systematic resampling every 10 scans; memory is that of living nodes and bricks, taken after
-    every update.
+    End-point weights, systematic resampling after every 10th scan, the last one too. Memory is that of living nodes and
+    bricks, taken after every update, that is at its most just before resampling, and at the end after it. It is that of
+    the history the particles share, and of the bricks each touched since it parted from the others: so it depends on
+    how sharp the weights are (``exponent``), which decides how many particles survive a resampling.
     """
+    likelihood = EndpointLikelihood(exponent=exponent, interpolation="nearest")
     scene = tunnel(scans)
     single = EvidenceGrid(0.1)
     cloud = Cloud(particles, 6)
     used, one, room = np.zeros(scans), np.zeros(scans), 0
-    for k, (pose, points, _) in enumerate(tqdm(scene, total=scans, desc=f"{particles} particles", leave=False)):
-        poses = cloud.move(pose)
+    effective, after = [], 0
+    for k, (pose, points, _) in enumerate(
+        tqdm(scene, total=scans, desc=f"{particles} particles", leave=False, disable=None)
+    ):
+        cloud.move(pose)
         if k:
-            cloud.log_weights += log_weights(cloud.grids, poses, points, END_POINTS, max_range=scene.max_range)
-        if k and k % 10 == 0:
-            cloud.resample()
-            poses = se3_compose(np.broadcast_to(pose, cloud.errors.shape), cloud.errors)
-        update_grids(cloud.grids, poses, points, max_range=scene.max_range)
+            cloud.log_weights += log_weights(cloud.grids, cloud.poses, points, likelihood, max_range=scene.max_range)
+        update_grids(cloud.grids, cloud.poses, points, max_range=scene.max_range)
         single.insert_scan(points, pose=pose, max_range=scene.max_range)
         used[k], one[k] = cloud.grids[0].pool.used_bytes, single.pool.used_bytes
         room = max(room, cloud.grids[0].pool.nbytes)
-    end, peak = used[-1] / one[-1], used.max() / one[-1]
+        if k % 10 == 9:
+            effective.append(cloud.effective)
+            cloud.resample()
+            after = cloud.grids[0].pool.used_bytes
+    end, peak = after / one[-1], used.max() / one[-1]
     print(
-        f"memory of {particles} particles, {scans} scans: end {used[-1] / 1e6:.1f} MB ({end:.2f} ×), peak "
-        f"{used.max() / 1e6:.1f} MB ({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
+        f"memory of {particles} particles, {scans} scans, exponent {exponent:g}, {np.median(effective):.0f} of them effective at resampling: "
+        f"end {after / 1e6:.1f} MB ({end:.2f} ×; before the last resampling {used[-1] / 1e6:.1f} MB), "
+        f"peak {used.max() / 1e6:.1f} MB ({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
         flush=True,
     )
     if png is not None:

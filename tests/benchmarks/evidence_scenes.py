@@ -1,8 +1,8 @@
 """Scans for the evidence-grid benchmark: two simulated scenes and two recordings, each as poses and points.
 
-*tunnel* (0.1 m voxels): a mine of two pairs of crossing galleries, bore radius 2.2 m with rough walls, and a robot at
-1 m/s with a planar fan of 181 beams over 180° at 37.5 Hz, whose plane turns about the forward axis at 0.25 Hz. Range
-σ 2 cm; beams are cut at 30 m. Straight: 1,000 scans, 27 m. Loop: 7,500 scans, 200 m around a block.
+*tunnel* (0.1 m voxels): a mine, three galleries across three, 25 m apart, bore radius 2.2 m with rough walls, and a
+robot at 1 m/s with a planar fan of 181 beams over 180° at 37.5 Hz, whose plane turns about the forward axis at 0.25 Hz.
+Range σ 2 cm; beams are cut at 30 m. Straight: 1,000 scans, 27 m. Loop: 7,500 scans, 200 m around four blocks.
 
 *street* (0.2 m): a lidar of 64 rings × 1,875 azimuths between facades, cars, poles and a side street, 10 scans 1 m
 apart. Range σ 2 cm; cut at 50 m.
@@ -83,12 +83,20 @@ _WAVES = np.array(  # amplitude [m], along [rad/m], around [1]: a wall as it is 
 _STEEPEST = float(np.sum(_WAVES[:, 0] * np.hypot(_WAVES[:, 1], _WAVES[:, 2] / (0.7 * BORE))))
 
 
+def _galleries(x: Array, y: Array) -> list[tuple[Array, Array, float, float]]:
+    """Of each gallery: coordinate along and across, where its middle is across, phase of its walls."""
+    middles = (0.0, BLOCK / 2, BLOCK)
+    return [(x, y, m, 0.3 + 1.4 * k) for k, m in enumerate(middles)] + [
+        (y, x, m, 4.5 + 1.4 * k) for k, m in enumerate(middles)
+    ]
+
+
 def _clearance(points: Array) -> Array:
     """How far inside the mine points ``(n, 3)`` are: bore radius minus distance to the centre line, of the gallery that
     leaves most; negative in the rock."""
     x, y, z = points.T
     best = np.full(len(points), -np.inf)
-    for along, across, where, phase in ((x, y, 0.0, 0.3), (x, y, BLOCK, 1.7), (y, x, 0.0, 2.9), (y, x, BLOCK, 4.4)):
+    for along, across, where, phase in _galleries(x, y):
         side = across - where
         near = np.flatnonzero(np.abs(side) < 1.25 * BORE)
         s, o, up = along[near], side[near], z[near]
