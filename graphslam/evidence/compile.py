@@ -6,15 +6,21 @@ waits; a first use that waits in silence looks like a hang.
 
 from __future__ import annotations
 
+import gc
 import inspect
+import os
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
+from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.mark_kernels import mark_grids
 
 if TYPE_CHECKING:
@@ -44,52 +50,103 @@ def announce_compilation() -> None:
 
 
 def compile_kernels(*, progress: bool = True) -> None:
-    """Compile every kernel of the package by using it on a map of one voxel."""
+    """Compile every kernel of the package by using it on a map of one voxel.
+
+    Compiling is the compiler's own Python, on one core: a second process takes one half, where there is one to take it.
+    """
     _state["checked"] = True
-    with tqdm(
-        _uses(), desc="compiling evidence kernels, once", unit="part", file=sys.stderr, disable=not progress, leave=True
-    ) as bar:
-        for name, use in bar:
+    other = _start_other_half()
+    with (
+        _without_garbage_collection(),
+        tqdm(desc="compiling evidence kernels, once", unit="part", file=sys.stderr, disable=not progress) as bar,
+    ):
+        uses = _first_half()
+        bar.reset(total=len(uses) + 1)
+        for name, use in uses:
             bar.set_postfix_str(name)
+            use()
+            bar.update()
+        bar.set_postfix_str("files")
+        if other is None or other.wait() != 0:
+            for _, use in _second_half():
+                use()
+        bar.update()
+
+
+def _start_other_half() -> subprocess.Popen[bytes] | None:
+    if not sys.executable or (os.cpu_count() or 1) < 2:
+        return None
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", "from graphslam.evidence.compile import _as_other_half as f; f()"],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+    except OSError:
+        return None
+
+
+def _as_other_half() -> None:
+    """All that the second process does."""
+    _state["checked"] = True  # or it would look for a process of its own
+    with _without_garbage_collection():
+        for _, use in _second_half():
             use()
 
 
-def _uses() -> list[tuple[str, Callable[[], object]]]:
-    """Small pieces of work that together call every kernel."""
-    import numpy as np
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Compiling makes millions of objects that live; looking through them again and again is a tenth of the time."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
-    from graphslam.evidence.batch import update_grids as update_many
-    from graphslam.evidence.compact import compact
-    from graphslam.evidence.formats import to_dense
+
+def _first_half() -> list[tuple[str, Callable[[], object]]]:
+    """Small pieces of work: what a filter does with its maps."""
+    from graphslam.evidence.batch import update_grids
     from graphslam.evidence.grid import EvidenceGrid
 
     grid = EvidenceGrid(1.0)
     other = grid.copy()
     point = np.array([[3.0, 0.0, 0.0]])
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1))
-    folder = tempfile.TemporaryDirectory()
-    uses: list[tuple[str, Callable[[], object]]] = [
-        ("scans", lambda: grid.insert_scan(point)),
-        ("threads", lambda: update_many([grid, other], poses, point, threads=2)),
-        ("merges", lambda: grid.merge(other)),
-        ("bricks", lambda: grid.write_bricks(grid.brick_coordinates(), grid.brick_values())),
+    return [
+        ("scans", lambda: update_grids([grid, other], poses, point)),
         ("values", lambda: grid.values_at(point)),
         ("casts", lambda: grid.cast(None, point, 5.0)),
         ("points", lambda: grid.log_odds_at(point)),
         ("boxes", lambda: (grid.box_query(-point, point), grid.bounding_box())),
+    ]
+
+
+def _second_half() -> list[tuple[str, Callable[[], object]]]:
+    """Small pieces of work: what is done with whole maps. None of it inserts a scan, which is compiled elsewhere."""
+    from graphslam.evidence.compact import compact
+    from graphslam.evidence.formats import to_dense
+    from graphslam.evidence.grid import EvidenceGrid
+
+    grid = EvidenceGrid(1.0)
+    values = np.full((1, BRICK_VOXELS), UNKNOWN, np.int16)
+    values[0, 0] = 100
+    return [
+        ("bricks", lambda: grid.write_bricks([[0, 0, 0]], values)),
+        ("merges", lambda: grid.merge(grid.copy())),
         ("clouds", grid.occupied_cloud),
         ("sums", lambda: (grid.entropy(), grid.memory())),
         ("dense", lambda: to_dense(grid, dtype=np.float32)),
-        ("compaction", lambda: compact([grid, other])),
-        ("files", lambda: _through_files(grid, Path(folder.name))),
-        ("clean-up", folder.cleanup),
+        ("compaction", lambda: compact([grid, grid.copy()])),
+        ("files", lambda: _through_files(grid)),
     ]
-    return uses
 
 
-def _through_files(grid: EvidenceGrid, folder: Path) -> None:
+def _through_files(grid: EvidenceGrid) -> None:
     from graphslam.evidence.octomap import read_octomap, write_octomap
 
-    for suffix in (".bt", ".ot"):
-        write_octomap(grid, folder / f"one{suffix}")
-        read_octomap(folder / f"one{suffix}")
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in (".bt", ".ot"):
+            write_octomap(grid, Path(folder) / f"one{suffix}")
+            read_octomap(Path(folder) / f"one{suffix}")
