@@ -80,7 +80,8 @@ def filter_step(scans: int, *, particles: int = 40) -> float:
     """Print the parts of a filter step, with one thread and with two; real time over the step's, with one.
 
     Weight by ray casting, resample when N_eff falls below half, update; 181 beams in the tunnel at 0.1 m, after
-    the first quarter of the scans. Moving the particles is no work of the grids: printed, not counted. One thread: process CPU time. Two: wall time, so it needs an idle machine.
+    the first quarter of the scans. Moving the particles is no work of the grids: printed, not counted. One thread:
+    process CPU time. Two: wall time, so it needs an idle machine.
     """
     print(f"filter step, {particles} particles, 181 beams, 0.1 m (ms a scan)")
     scene = tunnel(scans)
@@ -155,8 +156,10 @@ def particle_memory(*, scans: int, particles: int, exponent: float, png: Path | 
             after = cloud.grids[0].pool.used_bytes
     end, peak = after / one[-1], used.max() / one[-1]
     print(
-        f"memory of {particles} particles, {scans} scans, exponent {exponent:g} ({np.median(effective):.0f} effective): end {after / 1e6:.1f} MB "
-        f"({end:.2f} ×; before the last resampling {used[-1] / 1e6:.1f} MB), peak {used.max() / 1e6:.1f} MB ({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
+        f"memory of {particles} particles, {scans} scans, exponent {exponent:g} "
+        f"({np.median(effective):.0f} effective): end {after / 1e6:.1f} MB ({end:.2f} ×; "
+        f"before the last resampling {used[-1] / 1e6:.1f} MB), peak {used.max() / 1e6:.1f} MB ({peak:.2f} ×, "
+        f"{room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
         flush=True,
     )
     if png is not None:
