@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from graphslam.evidence.kernel import kernel
 
 MAX_RANGE, HIT, INSIDE, LEFT, UNUSABLE, UNKNOWN_SPACE = 0, 1, 2, 3, 4, 5
 
@@ -26,7 +27,7 @@ NEAR = 1e-9
 FLAT, NEVER = 1e-200, 1e300
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def coordinate_after(o, d, inverse, first, t, tie):
     """Voxel coordinate on one axis when all its planes crossed before ``t`` (or at ``t`` too: ``tie``) lie behind.
 
@@ -45,7 +46,7 @@ def coordinate_after(o, d, inverse, first, t, tie):
     return min(k, first)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def crossed_lines(oy, dy, oz, dz, t, end):
     """Bits of the lines of a brick (8 x 4 x 1 voxels each) that a ray may meet between parameters t and end.
 
@@ -63,7 +64,7 @@ def crossed_lines(oy, dy, oz, dz, t, end):
     return lines
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def unit_directions(directions, out):
     """Directions ``(n, 3)`` of unit length; NaN where there is none."""
     for b in range(directions.shape[0]):
@@ -78,7 +79,7 @@ def unit_directions(directions, out):
         out[b, 0], out[b, 1], out[b, 2] = x * s, y * s, z * s
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def cast_rays(
     begin,
     end,

@@ -120,6 +120,7 @@ def _first_half() -> list[tuple[str, Callable[[], object]]]:
         ("casts", lambda: grid.cast(None, point, 5.0)),
         ("points", lambda: grid.log_odds_at(point)),
         ("boxes", lambda: (grid.box_query(-point, point), grid.bounding_box())),
+        ("sums", lambda: (grid.entropy(), grid.memory())),
     ]
 
 
@@ -136,7 +137,6 @@ def _second_half() -> list[tuple[str, Callable[[], object]]]:
         ("bricks", lambda: grid.write_bricks([[0, 0, 0]], values)),
         ("merges", lambda: grid.merge(grid.copy())),
         ("clouds", grid.occupied_cloud),
-        ("sums", lambda: (grid.entropy(), grid.memory())),
         ("dense", lambda: to_dense(grid, dtype=np.float32)),
         ("compaction", lambda: compact([grid, grid.copy()])),
         ("files", lambda: _through_files(grid)),

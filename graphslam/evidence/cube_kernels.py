@@ -8,16 +8,16 @@ OCCUPIED_STATE first. The *size* s of a cube: 0 a brick, s a node of level s - 1
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from graphslam.evidence.kernel import kernel
 from graphslam.evidence.tree_kernels import drop_brick, occupied_lines, release_roots, take_brick, take_node
 
 MIXED, UNSEEN = 1 << 20, 1 << 21  # no value of a voxel
 FREE_STATE, OCCUPIED_STATE = -1, 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def voxel_state(value, classes, threshold):
     """State of one voxel."""
     v = int(value)
@@ -26,7 +26,7 @@ def voxel_state(value, classes, threshold):
     return 1 if v >= threshold else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def voxels_state(row, classes, threshold):
     """State of the voxels of a brick ``(512,)``."""
     if classes:
@@ -45,7 +45,7 @@ def voxels_state(row, classes, threshold):
     return int(first)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_states(
     root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
 ):  # fmt: skip
@@ -92,7 +92,7 @@ def find_states(
                 brick_max[child] = top
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def share_cubes(
     root, levels, brick_state, node_state, seen, shared, children, node_ref, brick_ref, node_free, brick_free, counters
 ):  # fmt: skip
@@ -138,7 +138,7 @@ def share_cubes(
                 n += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, found):
     """List what is known: mixed bricks as [packed offset coordinates, id] in ``mixed (n, 2)``, the largest cubes of one
     value as [packed offset coordinates of their first brick, size, value] in ``cubes (m, 3)``.
@@ -181,7 +181,7 @@ def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, f
 # --- building a tree that nobody else holds: room reserved, root owned, no shared node on any path ---------------
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def make_path(root, bx, by, bz, size, levels, children, node_ref, node_occupied, node_free, counters):
     """Node whose children are cubes of a size, over a brick; missing nodes are made."""
     node = root
@@ -196,7 +196,7 @@ def make_path(root, bx, by, bz, size, levels, children, node_ref, node_occupied,
     return node
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def uniform_cube(
     size, value, threshold, uniform, children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free,
     brick_free, counters,
@@ -231,7 +231,7 @@ def uniform_cube(
     return int(uniform[size, k])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def fill_cube(
     root, bx, by, bz, log_edge, value, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
     brick_lines, node_free, brick_free, counters,
@@ -260,7 +260,7 @@ def fill_cube(
                     node_ref[child] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def add_brick(
     root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, brick_free, counters
 ):  # fmt: skip
@@ -272,7 +272,7 @@ def add_brick(
     return b
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines):
     """Write the flags of occupied voxels of a tree just built; parts with several parents have theirs already."""
     node = np.zeros(9, np.int64)
@@ -304,7 +304,7 @@ def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, 
             brick_lines[child] = occupied_lines(child, threshold, bricks)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def build_tree(
     root, corners, values, cubes, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
     brick_lines, node_free, brick_free, counters,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from graphslam.evidence.kernel import kernel
 from graphslam.evidence.tree_kernels import find_node
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def row_of_bricks(root, bx, by, bz, levels, children, ids):
     """Bricks bx, bx + 1, … at one height and depth, 0 (all unknown) where there is none or no room for one."""
     edge = 1 << (2 * levels)
@@ -26,7 +26,7 @@ def row_of_bricks(root, bx, by, bz, levels, children, ids):
             ids[k] = children[parent, ((bz & 3) << 4) | ((by & 3) << 2) | (x & 3)]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def known_box(root, levels, children, bricks, box):
     """First known voxel and the one after the last per axis, ``box (6,) int64`` [offset coordinates]; first > last
     where none is.
@@ -69,7 +69,7 @@ def known_box(root, levels, children, bricks, box):
                 n += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def dense_values(root, first, levels, children, bricks, out):
     """Fill ``out (nz, ny, nx) int16`` from the voxel of offset coordinates ``first (3,)`` on."""
     nz, ny, nx = out.shape
@@ -107,7 +107,7 @@ def dense_values(root, first, levels, children, bricks, out):
                             target[row + 8 * last - begin + i] = source[512 * ids[last] + j + i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def dense_log_odds(values, out):
     """Log-odds ``out`` float32 of ``values`` int16 in steps of 1/2048, both ``(n,)``; NaN where unknown."""
     for k in range(values.shape[0]):

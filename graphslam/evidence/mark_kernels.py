@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from graphslam.evidence.kernel import kernel
 
 # what a tally counts, per call
 RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS = 0, 1, 2, 3, 4, 5, 6
@@ -35,7 +36,7 @@ ONE = 2.0**58  # parameter of a beam's end in fixed point
 NEVER = 2**61
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def voxel_code(x, y, z):
     """Integer of a voxel: the bits of its offset coordinates, each field apart."""
     return (
@@ -51,7 +52,7 @@ def voxel_code(x, y, z):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def brick_key(code):
     """Packed brick coordinates (20 bits each) of a brick's code."""
     bx = (code & 0x3F) | (((code >> 18) & 0x1FF) << 6)
@@ -60,7 +61,7 @@ def brick_key(code):
     return (bz << 40) | (by << 20) | bx
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_slot(code, n, window, slot_key, slot_next):
     """Slot of a brick that is not the last one on its entry; n where it was made there, -1 where there is no room."""
     w = code & 0x3FFFF
@@ -78,14 +79,14 @@ def find_slot(code, n, window, slot_key, slot_next):
     return n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fixed(parameter):
     """Parameter along a beam in fixed point, far beyond its end where it is no number we can hold."""
     f = parameter * ONE
     return np.int64(f) if f < 2.0**61 else np.int64(NEVER)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def mark_grids(
     begin,
     end,

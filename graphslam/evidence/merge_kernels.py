@@ -6,13 +6,13 @@ as scattering the source's voxels over a turned lattice would.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from graphslam.evidence.kernel import kernel
 from graphslam.evidence.tree_kernels import find_node
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def sample_bricks(keys, T, scale, voxel, half, source_half, root, levels, children, bricks, values):
     """Source values ``(n, 512)`` at the voxel centres of target bricks ``keys (n,)``; returns how many are known.
 

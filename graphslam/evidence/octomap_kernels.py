@@ -10,17 +10,17 @@ A *record* is what the file holds of a node: in a ``.bt`` two bits for each chil
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from graphslam.evidence.cube_kernels import voxel_state
+from graphslam.evidence.kernel import kernel
 
 # what reading found, and where it stands in a tally
 TRUNCATED, TOO_DEEP, CHILDLESS = 1, 2, 3
 ERROR, RECORD, NODES, REACH, BRICKS, CUBES = 0, 1, 2, 3, 4, 5
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tally):
     """Go through a file's records; list its bricks and its leaves of at least a brick's size.
 
@@ -105,7 +105,7 @@ def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tall
 # 2·levels + 2) there are nodes with one octant of the root each, since ours are centred on a corner of OctoMap's.
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def child_of(m, node, part, i, levels, children):
     """Child i of a node of the octree as (id, part)."""
     ix, iy, iz = i & 1, (i >> 1) & 1, i >> 2
@@ -122,7 +122,7 @@ def child_of(m, node, part, i, levels, children):
     return int(children[node, (z << 4) | (y << 2) | x]), 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def look_at(
     m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
 ):  # fmt: skip
@@ -151,7 +151,7 @@ def look_at(
     return state, largest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def write_brick(row, order, classes, threshold, states, maxima, codes, values, record, tally):
     """Records of a brick ``row (512,)`` that is not of one value, from ``record`` on; returns the end of them.
 
@@ -207,7 +207,7 @@ def write_brick(row, order, classes, threshold, states, maxima, codes, values, r
     return record
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def write_tree(
     root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max, order, stack,
     codes, values, tally,

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
+from graphslam.evidence.aligned import aligned_empty, aligned_zeros
 from graphslam.evidence.compile import announce_compilation
 from graphslam.evidence.layout import BRICK_VOXELS, CHILDREN, DEFAULT_LEVELS, MAX_LEVELS, UNKNOWN, half_edge
 from graphslam.evidence.scratch import Scratch
@@ -72,11 +73,12 @@ class GridPool:
         self.lock = threading.RLock()
         # node 0 and brick 0 are "absent"; the last one is up while an update is between its phases
         self.counters = np.array([1, 0, 1, 0, 0], np.int64)
-        self.children = np.zeros((64, CHILDREN), np.int32)
+        self.children = aligned_zeros((64, CHILDREN), np.int32)
         self.node_ref = np.zeros(64, np.int32)
         self.node_occupied = np.zeros(64, np.uint64)
         self.node_free = np.zeros(64, np.int32)
-        self.bricks = np.full((64, BRICK_VOXELS), UNKNOWN, np.int16)
+        self.bricks = aligned_zeros((64, BRICK_VOXELS), np.int16)
+        self.bricks[:] = UNKNOWN
         self.brick_ref = np.zeros(64, np.int32)
         self.brick_lines = np.zeros(64, np.uint16)
         self.brick_free = np.zeros(64, np.int32)
@@ -210,6 +212,6 @@ class GridPool:
 
 def _longer(a: npt.NDArray[Any], n: int, used: int) -> npt.NDArray[Any]:
     """A copy with room for n rows. Rows that were never used are not touched, so they take no memory yet."""
-    grown = np.empty((n, *a.shape[1:]), a.dtype)
+    grown = aligned_empty((n, *a.shape[1:]), a.dtype)
     grown[:used] = a[:used]
     return grown

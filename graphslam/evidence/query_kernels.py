@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from graphslam.evidence.kernel import kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel()
 def find_brick(root, x, y, z, levels, children, last):
     """Brick that holds voxel (x, y, z) [offset coordinates], or 0.
 
@@ -34,7 +35,7 @@ def find_brick(root, x, y, z, levels, children, last):
     return int(children[np.uint64(last[3]), np.uint64(((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3))])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def look_up(begin, end, roots, poses, points, scale, half, levels, trilinear, table, children, bricks, out):
     """Figures of ``table (65536,)``, one for each value a voxel may hold, at points seen from grids ``begin … end-1``.
 
@@ -89,7 +90,7 @@ def look_up(begin, end, roots, poses, points, scale, half, levels, trilinear, ta
             out[g, b] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
     """Occupied and known voxels in boxes.
 
@@ -137,7 +138,7 @@ def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
         out[q, 0], out[q, 1] = occupied, known
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_bounds(rows, bricks, out):
     """First and last known voxel per axis, ``out (6,)`` int64 [offset coordinates]; first > last where none is."""
     out[:3] = 1 << 40
@@ -155,7 +156,7 @@ def find_bounds(rows, bricks, out):
                 out[3], out[4], out[5] = max(out[3], vx), max(out[4], vy), max(out[5], vz)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
     """Number of occupied voxels; fills ``voxels (n, 3) int32`` (signed) and ``values (n,) int16`` where they have rows.
 
@@ -182,7 +183,7 @@ def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def walk_once(roots, levels, children, node_times, brick_times, nodes, links, begins):
     """Visit every node and brick below some roots once, level by level, however many parents share it.
 
@@ -236,7 +237,7 @@ def walk_once(roots, levels, children, node_times, brick_times, nodes, links, be
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def count_values(ids, times, bricks, counts):
     """Histogram ``counts (65536,) int64`` of the values of bricks ``ids (n,)``, each counted ``times[id]`` times."""
     for k in range(ids.shape[0]):
@@ -246,7 +247,7 @@ def count_values(ids, times, bricks, counts):
             counts[int(bricks[b, i]) + 32768] += t
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def count_private(nodes, begins, free_roots, levels, children, node_ref, brick_ref, node_left, brick_left):
     """Nodes and bricks that would be freed with some roots, as (nodes, bricks).
 

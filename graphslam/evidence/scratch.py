@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphslam.evidence.aligned import aligned_zeros
 from graphslam.evidence.layout import BRICK_VOXELS
 
 WINDOW = 64**3
@@ -21,7 +22,7 @@ class Scratch:
 
     def resize(self, slots: int) -> None:
         """Room for so many bricks touched by a scan."""
-        marks = np.zeros((slots, BRICK_VOXELS), np.uint8)  # first: it alone can fail for want of memory
+        marks = aligned_zeros((slots, BRICK_VOXELS), np.uint8)  # first: it alone can fail for want of memory
         self.slot_key = np.zeros(slots, np.int64)
         self.slot_next = np.zeros(slots, np.int32)
         self.work = np.zeros((slots, 5), np.int32)

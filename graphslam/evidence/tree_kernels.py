@@ -10,25 +10,26 @@ brick 0 stand for "absent"; brick 0 is all unknown, so that reading it as a sour
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from graphslam.evidence.kernel import kernel
 
 NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def free_nodes(node_free, counters):
     """Nodes that can be taken without growing."""
     return node_free.shape[0] - counters[NODES_USED] + counters[NODES_FREE]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def free_bricks(brick_free, counters):
     """Bricks that can be taken without growing."""
     return brick_free.shape[0] - counters[BRICKS_USED] + counters[BRICKS_FREE]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def take_node(children, node_ref, node_occupied, node_free, counters):
     """An empty node with one parent."""
     if counters[NODES_FREE] > 0:
@@ -44,7 +45,7 @@ def take_node(children, node_ref, node_occupied, node_free, counters):
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def take_brick(brick_ref, brick_free, counters):
     """A brick with one parent; its voxels are whatever they were."""
     if counters[BRICKS_FREE] > 0:
@@ -57,7 +58,7 @@ def take_brick(brick_ref, brick_free, counters):
     return b
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """A copy with one parent; the source has one parent less, the children one more."""
     n = take_node(children, node_ref, node_occupied, node_free, counters)
@@ -74,7 +75,7 @@ def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Node of level 0 over a brick, with no other parent on the way from the root: missing nodes are made, shared ones
     copied. The root is the caller's own."""
@@ -93,7 +94,7 @@ def own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, bric
     return node
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_node(root, bx, by, bz, levels, children):
     """Node of level 0 over a brick, or 0."""
     node = root
@@ -106,7 +107,7 @@ def find_node(root, bx, by, bz, levels, children):
     return node
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
     """Write on the path from the root whether a brick holds an occupied voxel. The path is the caller's own."""
     path = np.empty(8, np.int64)
@@ -132,7 +133,7 @@ def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
         bit = after != np.uint64(0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def own_roots(roots, shared, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Copy the roots ``(n,)`` marked ``shared (n,)`` (and those that are 0: empty maps), in place.
 
@@ -147,7 +148,7 @@ def own_roots(roots, shared, levels, children, node_ref, node_occupied, brick_re
             node_ref[old] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def drop_brick(brick, brick_ref, brick_free, counters):
     """One parent less; the last one frees it."""
     brick_ref[brick] -= 1
@@ -156,7 +157,7 @@ def drop_brick(brick, brick_ref, brick_free, counters):
         counters[BRICKS_FREE] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick_free, counters):
     """Give back trees; what other trees share stays."""
     # at most 63 siblings wait on each level, besides the node itself
@@ -184,7 +185,7 @@ def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick
             counters[NODES_FREE] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def list_bricks(root, levels, children, out):
     """Number of bricks below a root; fills ``out (n, 2)`` [packed offset coordinates, brick] where it has rows."""
     stack = np.empty((64 * 8, 5), np.int64)  # node, level, coordinates of its corner in bricks
@@ -213,7 +214,7 @@ def list_bricks(root, levels, children, out):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def gather_bricks(ids, bricks, out):
     """Copy bricks to rows of ``out (n, 512)``."""
     for k in range(ids.shape[0]):
@@ -221,7 +222,7 @@ def gather_bricks(ids, bricks, out):
             out[k, j] = bricks[ids[k], j]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def read_values(root, points, scale, half, levels, children, bricks, out):
     """Values of the voxels that points ``(n, 3)`` lie in."""
     edge = 2.0 * half
@@ -238,7 +239,7 @@ def read_values(root, points, scale, half, levels, children, bricks, out):
         out[k] = bricks[b, ((l & 7) << 6) | ((j & 7) << 3) | (i & 7)]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def occupied_lines(brick, threshold, bricks):
     """Bits of the lines of a brick that hold an occupied voxel."""
     lines = 0
@@ -251,7 +252,7 @@ def occupied_lines(brick, threshold, bricks):
     return lines
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def write_bricks(
     root,
     keys,

@@ -7,16 +7,19 @@ is half marked has changed no map, and applying cannot fail, since room was rese
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from graphslam.evidence.kernel import kernel
+from graphslam.evidence.prefetch import prefetch
 from graphslam.evidence.tree_kernels import clone_node, drop_brick, set_occupied, take_brick, take_node
 
+AHEAD = 4
+"""Bricks that memory is asked for before the one that is worked on."""
 PENDING = 4
 """Place in the pool's counters: an update is between its phases, and its trees are no maps."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def resolve_grids(
     begin,
     end,
@@ -88,7 +91,20 @@ def resolve_grids(
     counters[PENDING] = 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
+def _fetch(s, marks64, work, bricks):
+    """Ask for the lines of a slot's bricks that will be read or written."""
+    source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
+    for line in range(16):
+        k = 4 * line
+        if source != target:
+            prefetch(bricks, source, 32 * line)
+            prefetch(bricks, target, 32 * line)
+        elif (marks64[s, k] | marks64[s, k + 1] | marks64[s, k + 2] | marks64[s, k + 3]) != np.uint64(0):
+            prefetch(bricks, target, 32 * line)
+
+
+@kernel()
 def apply_grids(
     begin,
     end,
@@ -115,10 +131,17 @@ def apply_grids(
     """
     miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
     s = 0
+    last = ends[end - 1]
+    for s in range(min(AHEAD, last)):
+        _fetch(s, marks64, work, bricks)
+    s = 0
     for g in range(begin, end):
         while s < ends[g]:
             source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
             lines = np.int64(brick_lines[source])
+            next_s = s + AHEAD
+            if next_s < last:
+                _fetch(next_s, marks64, work, bricks)
             for line in range(16):
                 k = 4 * line
                 a = 32 * line
@@ -170,7 +193,7 @@ def apply_grids(
             s += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def drop_sources(end, work, brick_ref, brick_free, counters):
     """Take one parent from the bricks that were copied."""
     for s in range(end):

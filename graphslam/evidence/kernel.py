@@ -1,0 +1,16 @@
+"""How every compiled function of the package is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def kernel(*, error_model: str = "python") -> Callable[[Any], Any]:
+    """Compiled on first use, kept on disk, runs beside other threads.
+
+    Nobody calls a kernel from C, and a wrapper for that would be a fifteenth of the time it takes to compile.
+    """
+    return numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model=error_model)  # type: ignore[no-any-return]
