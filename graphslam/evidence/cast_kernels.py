@@ -183,7 +183,7 @@ def cast_rays(
                     for level in range(levels - 1, 0, -1):
                         s = 2 * level
                         c = (((bz >> s) & 3) << 4) | (((by >> s) & 3) << 2) | ((bx >> s) & 3)
-                        child = int(children[np.uint64(node), np.uint64(c)])
+                        child = np.int64(children[np.uint64(node), np.uint64(c)])
                         if stop_at_unknown:
                             if child == 0:
                                 state = UNKNOWN_SPACE
@@ -222,10 +222,10 @@ def cast_rays(
                     mask = node_occupied[np.uint64(node)]
                 c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
                 if stop_at_unknown or ((mask >> np.uint64(c)) & np.uint64(1)) != np.uint64(0):
-                    brick = int(children[np.uint64(node), np.uint64(c)])
+                    brick = np.int64(children[np.uint64(node), np.uint64(c)])
                     lines = 0xFFFF
                     if not stop_at_unknown:
-                        lines = int(brick_lines[np.uint64(brick)])
+                        lines = np.int64(brick_lines[np.uint64(brick)])
                         lines &= crossed_lines(oy - (by << 3), dy, oz - (bz << 3), dz, t, min(gx, gy, gz))
                     if lines == 0:
                         pass

@@ -6,20 +6,19 @@ waits; a first use that waits in silence looks like a hang.
 
 from __future__ import annotations
 
-import gc
 import inspect
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
 
+from graphslam.evidence.kernel import without_garbage_collection
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.mark_kernels import mark_grids
 
@@ -40,13 +39,17 @@ def is_compiled(kernel: Any) -> bool:
 
 
 def announce_compilation() -> None:
-    """Compile every kernel now, with a line of progress on stderr, if this machine has not done so before."""
+    """Load the kernels that insert a scan. If this machine has not compiled them yet, compile every kernel, with a line
+    of progress on stderr.
+    """
     if _state["checked"]:
         return
     _state["checked"] = True
-    if is_compiled(mark_grids):
+    if not is_compiled(mark_grids):
+        compile_kernels()
         return
-    compile_kernels()
+    with without_garbage_collection():
+        _first_half()[0][1]()
 
 
 def compile_kernels(*, progress: bool = True) -> None:
@@ -57,7 +60,7 @@ def compile_kernels(*, progress: bool = True) -> None:
     _state["checked"] = True
     other = _start_other_half()
     with (
-        _without_garbage_collection(),
+        without_garbage_collection(),
         tqdm(desc="compiling evidence kernels, once", unit="part", file=sys.stderr, disable=not progress) as bar,
     ):
         uses = _first_half()
@@ -88,21 +91,9 @@ def _start_other_half() -> subprocess.Popen[bytes] | None:
 def _as_other_half() -> None:
     """All that the second process does."""
     _state["checked"] = True  # or it would look for a process of its own
-    with _without_garbage_collection():
+    with without_garbage_collection():
         for _, use in _second_half():
             use()
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Compiling makes millions of objects that live; looking through them again and again is a tenth of the time."""
-    was = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was:
-            gc.enable()
 
 
 def _first_half() -> list[tuple[str, Callable[[], object]]]:

@@ -54,8 +54,9 @@ def find_states(
     ``brick_max (B,), node_max (N,) int16`` take the largest known value (-32768: none); empty if not wanted.
     """
     want_max = brick_max.shape[0] > 0
-    node = np.zeros(9, np.int64)
-    cursor = np.zeros(9, np.int64)
+    node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
+    for k in range(9):  # np.zeros would take longer to compile
+        cursor[k] = 0
     level = levels - 1
     node[level] = root
     while level < levels:
@@ -63,12 +64,12 @@ def find_states(
         if c == 64:
             state, top = 1 << 21, -32768
             for k in range(64):
-                child = int(children[n, k])
+                child = np.int64(children[n, k])
                 s = -32768
                 if child != 0:
-                    s = int(brick_state[child]) if level == 0 else int(node_state[child])
+                    s = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
                     if want_max:
-                        top = max(top, int(brick_max[child]) if level == 0 else int(node_max[child]))
+                        top = max(top, np.int64(brick_max[child]) if level == 0 else np.int64(node_max[child]))
                 state = s if state == 1 << 21 or state == s else 1 << 20
             node_state[n] = state
             if want_max:
@@ -76,7 +77,7 @@ def find_states(
             level += 1
             continue
         cursor[level] += 1
-        child = int(children[n, c])
+        child = np.int64(children[n, c])
         if child == 0:
             continue
         if level > 0:
@@ -102,7 +103,7 @@ def share_cubes(
     ``seen (N,) uint8`` marks nodes that were done; ``shared (levels, 65536) int32`` holds the brick or node of each
     size and value, 0 where none is known yet.
     """
-    one = np.zeros(1, np.int64)
+    one = np.empty(1, np.int64)
     stack = np.empty((64 * 8, 2), np.int64)
     stack[0, 0], stack[0, 1] = root, levels - 1
     n = 1
@@ -111,10 +112,10 @@ def share_cubes(
         n -= 1
         node, level = stack[n, 0], stack[n, 1]
         for c in range(64):
-            child = int(children[node, c])
+            child = np.int64(children[node, c])
             if child == 0:
                 continue
-            state = int(brick_state[child]) if level == 0 else int(node_state[child])
+            state = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
             if state != 1 << 20:
                 keep = 0
                 if state != -32768:
@@ -156,10 +157,10 @@ def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, f
         x, y, z = stack[n, 2], stack[n, 3], stack[n, 4]
         shift = 2 * level
         for c in range(64):
-            child = int(children[node, c])
+            child = np.int64(children[node, c])
             if child == 0:
                 continue
-            state = int(brick_state[child]) if level == 0 else int(node_state[child])
+            state = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
             if state == -32768:
                 continue
             cx, cy, cz = x + ((c & 3) << shift), y + (((c >> 2) & 3) << shift), z + ((c >> 4) << shift)
@@ -188,7 +189,7 @@ def make_path(root, bx, by, bz, size, levels, children, node_ref, node_occupied,
     for level in range(levels - 1, size, -1):
         shift = 2 * level
         c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
-        child = int(children[node, c])
+        child = np.int64(children[node, c])
         if child == 0:
             child = take_node(children, node_ref, node_occupied, node_free, counters)
             children[node, c] = child
@@ -275,8 +276,9 @@ def add_brick(
 @kernel()
 def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines):
     """Write the flags of occupied voxels of a tree just built; parts with several parents have theirs already."""
-    node = np.zeros(9, np.int64)
-    cursor = np.zeros(9, np.int64)
+    node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
+    for k in range(9):  # np.zeros would take longer to compile
+        cursor[k] = 0
     level = levels - 1
     node[level] = root
     while level < levels:
@@ -284,7 +286,7 @@ def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, 
         if c == 64:
             flags = np.uint64(0)
             for k in range(64):
-                child = int(children[n, k])
+                child = np.int64(children[n, k])
                 if child == 0:
                     continue
                 if (level == 0 and brick_lines[child] != 0) or (level > 0 and node_occupied[child] != np.uint64(0)):
@@ -293,7 +295,7 @@ def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, 
             level += 1
             continue
         cursor[level] += 1
-        child = int(children[n, c])
+        child = np.int64(children[n, c])
         if child == 0:
             continue
         if level > 0:

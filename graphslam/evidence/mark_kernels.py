@@ -119,12 +119,14 @@ def mark_grids(
     edge = 2 * half
     flat = marks.reshape(marks.size)
     hits = np.empty(total, np.int64)
-    left = np.zeros(16, np.int64)  # steps a lane has to go
+    left = np.empty(16, np.int64)  # steps a lane has to go
     # rows of 16 lanes: next crossings in x, y, z (0, 16, 32), from one to the next (48, 64, 80), coordinates (96, 112,
     # 128), bits filled in before a step so that it carries over the gaps (144, 160, 176), steps (192, 208, 224), how
     # many are to go (240, 256, 272). One flat array with constant offsets: only so can the compiler see that the rows
     # do not overlap.
-    L = np.zeros(288, np.int64)
+    L = np.empty(288, np.int64)
+    for l in range(288):  # np.zeros would take longer to compile
+        L[l] = 0
     full = False
     for g in range(begin, end):
         first, active, b, n_hits = n, 0, 0, 0

@@ -43,7 +43,7 @@ def sample_bricks(keys, T, scale, voxel, half, source_half, root, levels, childr
                 brick = 0
                 if parent != 0:
                     c = (((l >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((i >> 3) & 3)
-                    brick = int(children[parent, c])
+                    brick = np.int64(children[parent, c])
             value = bricks[brick, ((l & 7) << 6) | ((j & 7) << 3) | (i & 7)]
             values[k, v] = value
             if value != -32768:

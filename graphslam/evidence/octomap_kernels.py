@@ -47,9 +47,9 @@ def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tall
             if record == codes.shape[0]:
                 tally[ERROR] = TRUNCATED
                 return
-            code = int(codes[record])
+            code = np.int64(codes[record])
             if not binary:
-                value = int(values[record])
+                value = np.int64(values[record])
             elif code == 0:
                 tally[ERROR] = CHILDLESS
                 return
@@ -115,11 +115,11 @@ def child_of(m, node, part, i, levels, children):
             return node, i
         return (node, part) if i == 7 - part else (0, 0)
     if m == 16:  # of 7 levels: OctoMap's cube is the middle of ours
-        return int(children[node, ((1 + iz) << 4) | ((1 + iy) << 2) | (1 + ix)]), 0
+        return np.int64(children[node, ((1 + iz) << 4) | ((1 + iy) << 2) | (1 + ix)]), 0
     if m & 1:
         return node, i
     z, y, x = 2 * (part >> 2) + iz, 2 * ((part >> 1) & 1) + iy, 2 * (part & 1) + ix
-    return int(children[node, (z << 4) | (y << 2) | x]), 0
+    return np.int64(children[node, (z << 4) | (y << 2) | x]), 0
 
 
 @kernel()
@@ -131,9 +131,9 @@ def look_at(
         return -32768, -32768
     want_max = brick_max.shape[0] > 0
     if m == 3:
-        return int(brick_state[node]), (int(brick_max[node]) if want_max else 0)
+        return np.int64(brick_state[node]), (np.int64(brick_max[node]) if want_max else 0)
     if m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
-        return int(node_state[node]), (int(node_max[node]) if want_max else 0)
+        return np.int64(node_state[node]), (np.int64(node_max[node]) if want_max else 0)
     state, largest = 1 << 21, -32768
     level = min(m, 2 * levels + 2)
     for i in range(8):
@@ -141,9 +141,9 @@ def look_at(
         s, v = -32768, -32768
         if child != 0:
             if level == 4:
-                s, v = int(brick_state[child]), (int(brick_max[child]) if want_max else 0)
+                s, v = np.int64(brick_state[child]), (np.int64(brick_max[child]) if want_max else 0)
             else:
-                s, v = int(node_state[child]), (int(node_max[child]) if want_max else 0)
+                s, v = np.int64(node_state[child]), (np.int64(node_max[child]) if want_max else 0)
         largest = max(largest, v)
         state = s if state == 1 << 21 or state == s else 1 << 20
     if m > level and state != -32768:
@@ -162,7 +162,7 @@ def write_brick(row, order, classes, threshold, states, maxima, codes, values, r
         state, largest = 1 << 21, -32768
         for c in range(8):
             if q < 64:
-                v = int(row[order[8 * q + c]])
+                v = np.int64(row[order[8 * q + c]])
                 s = voxel_state(v, classes, threshold)
             else:
                 v, s = maxima[8 * (q - 64) + c], states[8 * (q - 64) + c]

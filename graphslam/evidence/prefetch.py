@@ -40,4 +40,4 @@ def _prefetch(_: Any, array: Any, row: Any, column: Any) -> Any:
 
 @overload(prefetch)
 def _compiled(array, row, column):  # type: ignore[no-untyped-def]  # as the lambda's, or numba refuses it
-    return lambda array, row, column: _prefetch(array, row, column)
+    return lambda array, row, column: _prefetch(array, row, column)  # type: ignore[call-arg]

@@ -27,12 +27,12 @@ def find_brick(root, x, y, z, levels, children, last):
         for level in range(levels - 1, 0, -1):
             s = 2 * level
             c = (((bz >> s) & 3) << 4) | (((by >> s) & 3) << 2) | ((bx >> s) & 3)
-            node = int(children[np.uint64(node), np.uint64(c)])
+            node = np.int64(children[np.uint64(node), np.uint64(c)])
             if node == 0:
                 break
         last[3] = node
     # node 0 has no children, so that an absent block has absent bricks
-    return int(children[np.uint64(last[3]), np.uint64(((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3))])
+    return np.int64(children[np.uint64(last[3]), np.uint64(((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3))])
 
 
 @kernel(error_model="numpy")
@@ -117,7 +117,7 @@ def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
             ox, oy, oz = stack[n, 2], stack[n, 3], stack[n, 4]
             s = 2 * level + 3
             for c in range(64):
-                child = int(children[node, c])
+                child = np.int64(children[node, c])
                 if child == 0:
                     continue
                 x, y, z = ox + ((c & 3) << s), oy + (((c >> 2) & 3) << s), oz + ((c >> 4) << s)
@@ -165,7 +165,7 @@ def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
     n = 0
     for r in range(rows.shape[0]):
         b = rows[r, 1]
-        lines = int(brick_lines[b])
+        lines = np.int64(brick_lines[b])
         if lines == 0:
             continue
         key = rows[r, 0]
@@ -220,7 +220,7 @@ def walk_once(roots, levels, children, node_times, brick_times, nodes, links, be
             node = nodes[q]
             times = node_times[node]
             for c in range(64):
-                child = int(children[node, c])
+                child = np.int64(children[node, c])
                 if child == 0:
                     continue
                 if step == levels - 1:
@@ -265,7 +265,7 @@ def count_private(nodes, begins, free_roots, levels, children, node_ref, brick_r
                 continue
             freed_nodes += 1
             for c in range(64):
-                child = int(children[node, c])
+                child = np.int64(children[node, c])
                 if child == 0:
                     continue
                 if step == levels - 1:

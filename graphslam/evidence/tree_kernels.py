@@ -83,7 +83,7 @@ def own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, bric
     for level in range(levels - 1, 0, -1):
         shift = 2 * level
         c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
-        child = int(children[node, c])
+        child = np.int64(children[node, c])
         if child == 0:
             child = take_node(children, node_ref, node_occupied, node_free, counters)
             children[node, c] = child
@@ -101,7 +101,7 @@ def find_node(root, bx, by, bz, levels, children):
     for level in range(levels - 1, 0, -1):
         shift = 2 * level
         c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
-        node = int(children[node, c])
+        node = np.int64(children[node, c])
         if node == 0:
             return 0
     return node
@@ -173,7 +173,7 @@ def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick
             if node_ref[node] > 0:
                 continue
             for c in range(64):
-                child = int(children[node, c])
+                child = np.int64(children[node, c])
                 if child == 0:
                     continue
                 if level == 0:
@@ -198,7 +198,7 @@ def list_bricks(root, levels, children, out):
         x, y, z = stack[n, 2], stack[n, 3], stack[n, 4]
         shift = 2 * level
         for c in range(64):
-            child = int(children[node, c])
+            child = np.int64(children[node, c])
             if child == 0:
                 continue
             cx, cy, cz = x + ((c & 3) << shift), y + (((c >> 2) & 3) << shift), z + ((c >> 4) << shift)
@@ -235,7 +235,7 @@ def read_values(root, points, scale, half, levels, children, bricks, out):
         parent = find_node(root, i >> 3, j >> 3, l >> 3, levels, children)
         if parent == 0:
             continue
-        b = int(children[parent, (((l >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((i >> 3) & 3)])
+        b = np.int64(children[parent, (((l >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((i >> 3) & 3)])
         out[k] = bricks[b, ((l & 7) << 6) | ((j & 7) << 3) | (i & 7)]
 
 
@@ -274,7 +274,7 @@ def write_bricks(
         bx, by, bz = keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40
         parent = own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters)
         c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
-        b = int(children[parent, c])
+        b = np.int64(children[parent, c])
         if b == 0 or brick_ref[b] > 1:
             if b != 0:
                 brick_ref[b] -= 1

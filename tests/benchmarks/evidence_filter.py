@@ -7,7 +7,6 @@ noise of its own (a random walk), weighted, and its grid updated.
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -184,41 +183,46 @@ def _draw(png: Path, used: Array, one: Array, particles: int) -> None:
     figure.savefig(png, dpi=150)
 
 
-_COMPILE = "from graphslam.evidence.compile import compile_kernels; compile_kernels(progress=False)"
+_COMPILE = """
+import time
+begin = time.perf_counter(), time.process_time()
+from graphslam.evidence.compile import compile_kernels
+compile_kernels(progress=False)
+print(time.perf_counter() - begin[0], time.process_time() - begin[1])
+"""
 _START = """
+import time
 import numpy as np
+begin = time.perf_counter(), time.process_time()
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.queries import cast
 grid = EvidenceGrid(0.1)
 grid.insert_scan(np.array([[3.0, 0.0, 0.0], [3.0, 1.0, 0.0]]), max_range=30.0)
-assert abs(cast(grid, np.zeros(3), np.array([[1.0, 0.0, 0.0]]), 30.0).ranges[0] - 3.0) < 0.11
+assert abs(grid.cast(None, np.array([[1.0, 0.0, 0.0]]), 30.0).ranges[0] - 3.0) < 0.11
+print(time.perf_counter() - begin[0], time.process_time() - begin[1])
 """
 
 
 def start_up(repetitions: int) -> tuple[float, float]:
-    """CPU seconds of compiling every kernel in a fresh process, and of import, first grid, first scan and first cast
-    in one that finds them compiled, over those of importing numpy; the least of the repetitions."""
-    with tempfile.TemporaryDirectory() as cache:
-        cold = _child(_COMPILE, cache) - _least(_numpy_and_numba, cache, repetitions)
-        warm = _least(_START, cache, repetitions + 2) - _least("import numpy", cache, repetitions + 2)
-        megabytes = sum(p.stat().st_size for p in Path(cache).rglob("*") if p.is_file()) / 1e6
+    """Seconds from the first import to every kernel compiled, in a fresh process and its helper; CPU seconds from
+    NumPy imported to a grid made, a scan inserted and a beam cast, in a process that finds them compiled. The least of
+    the repetitions.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        cold = []
+        for k in range(repetitions):
+            cold.append(_child(_COMPILE, f"{folder}/{k}"))
+        warm = min(_child(_START, f"{folder}/0")[1] for _ in range(repetitions + 2))
+        megabytes = sum(p.stat().st_size for p in Path(folder, "0").rglob("*") if p.is_file()) / 1e6
+    wall = min(w for w, _ in cold)
     print(
-        f"start: compiling everything {cold:.2f} s, {megabytes:.1f} MB kept; compiled before {warm:.2f} s", flush=True
+        f"start: compiling everything {wall:.2f} s, {megabytes:.1f} MB kept; compiled before {warm:.2f} s", flush=True
     )
-    return cold, warm
+    return wall, warm
 
 
-_numpy_and_numba = "import numpy, numba"
-
-
-def _least(code: str, cache: str, repetitions: int) -> float:
-    return min(_child(code, cache) for _ in range(repetitions))
-
-
-def _child(code: str, cache: str) -> float:
-    """CPU seconds of a fresh process."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def _child(code: str, cache: str) -> tuple[float, float]:
+    """What a fresh process prints: wall and CPU seconds."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, stderr=subprocess.DEVNULL)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    done = subprocess.run([sys.executable, "-c", code], check=True, env=environment, stdout=subprocess.PIPE, text=True)
+    wall, cpu = map(float, done.stdout.split())
+    return wall, cpu

@@ -76,6 +76,7 @@ class Scene:
 # --- tunnel ----------------------------------------------------------------------------------------------------------
 
 BORE, BLOCK, OVERHANG, TURN = 2.2, 50.8584073464, 30.0, 2.0  # [m]; 4 (BLOCK - 2 TURN) + 2 π TURN = 200
+CORNER = np.array([0.013, 0.027, 0.041])  # of the map, in the tunnel's own coordinates
 FAN_RATE, SPIN_RATE, SPEED, FAN_BEAMS, FAN_RANGE, FAN_SIGMA = 37.5, 0.25, 1.0, 181, 30.0, 0.02
 _WAVES = np.array(  # amplitude [m], along [rad/m], around [1]: a wall as it is left by blasting
     [(0.10, 0.9, 2), (0.08, 2.3, 3), (0.06, 4.1, 5), (0.05, 7.7, 4), (0.04, 11.3, 9)]
@@ -141,7 +142,11 @@ def _loop(s: Array) -> tuple[Array, Array]:
 
 
 def tunnel(scans: int = 1000, *, seed: int = 4) -> Scene:
-    """The first ``scans`` scans of the way around the block; 1,000 are straight, 7,500 come back to the beginning."""
+    """The first ``scans`` scans of the way around the block; 1,000 are straight, 7,500 come back to the beginning.
+
+    The map begins at `CORNER`: the sensor's height and way would lie between two voxels exactly, and into which of them
+    a whole level fan falls would be decided by OctoMap's rounding to single precision.
+    """
     t = np.arange(scans) / FAN_RATE
     xy, heading = _loop(SPEED * t)
     yaw = np.zeros((scans, 4))
@@ -162,6 +167,7 @@ def tunnel(scans: int = 1000, *, seed: int = 4) -> Scene:
     noise = SeedTree(seed).child("tunnel").generator().normal(scale=FAN_SIGMA, size=true.shape)
     measured = np.where(true < FAN_RANGE, np.maximum(true + noise, 0.05), true)
     clouds = list(np.ascontiguousarray(measured[:, :, None] * fan))
+    poses[:, :3] -= CORNER
     return Scene("tunnel", 0.1, FAN_RANGE, poses, clouds, FAN_RATE)
 
 

@@ -10,6 +10,7 @@ from tests.benchmarks import evidence_scenes as scenes
 
 def test_tunnel_rays_end_on_the_wall_and_nowhere_before():
     s = scenes.tunnel(40)
+    s.poses[:, :3] += scenes.CORNER
     points = s.clouds[17]
     directions = quat_rotate(s.poses[17, 3:], points / np.linalg.norm(points, axis=1)[:, None])
     origins = np.broadcast_to(s.poses[17, :3], directions.shape)
