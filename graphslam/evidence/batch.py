@@ -29,14 +29,14 @@ from graphslam.evidence.mark_kernels import (
 )
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
-from graphslam.evidence.update_kernels import PENDING, apply_grids, drop_sources, resolve_grids
+from graphslam.evidence.update_kernels import PENDING, apply_grids, drop_left, resolve_grids, settle_grids
 
 if TYPE_CHECKING:
     from graphslam.evidence.grid import EvidenceGrid
 
 BATCH = 64
 """Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
-SERIAL_BATCH = 4
+SERIAL_BATCH = 8
 """The same on one thread: so few marks are still in the cache when they are applied."""
 
 Scan = tuple[Array, Array, npt.NDArray[np.uint8], float]
@@ -112,14 +112,22 @@ def report_of(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
 
 
 def insert(grids: Sequence[EvidenceGrid], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
-    """Write a checked scan; hold the pool's lock. ``poses (P, 12)``."""
+    """Write a checked scan; hold the pool's lock, and Ctrl-C back where there are several grids. ``poses (P, 12)``."""
     pool = grids[0].pool
     tally = np.zeros(TALLY, np.int64)
     roots = own_grids(grids, pool)
     n = len(roots)
-    work, size = (_insert_serial, SERIAL_BATCH) if threads == 1 or n == 1 else (_insert_threads, BATCH)
-    for begin in range(0, n, size):
-        work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, threads, tally)
+    work, size = (_insert_serial, SERIAL_BATCH) if threads == 1 else (_insert_threads, BATCH)
+    if n == 1:
+        _insert_serial(grids[0], roots, poses, scan, False, threads, tally)
+        return tally
+    shared = pool.scratch(0)
+    shared.forget_made()
+    try:
+        for begin in range(0, n, size):
+            work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, True, threads, tally)
+    finally:  # not before the end: what is shared must not depend on the size of a batch
+        drop_left(shared.left, pool.brick_ref, pool.brick_free, pool.counters)
     return tally
 
 
@@ -141,6 +149,7 @@ def _insert_serial(
     roots: npt.NDArray[np.int64],
     poses: Array,
     scan: Scan,
+    share: bool,
     threads: int,
     tally: npt.NDArray[np.int64],
 ) -> None:
@@ -158,7 +167,12 @@ def _insert_serial(
             0, n, roots, ends, levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work, pool.children,
             pool.node_occupied, pool.bricks, pool.brick_lines,
         )  # fmt: skip
-        drop_sources(slots, s.work, pool.brick_ref, pool.brick_free, pool.counters)
+        settle_grids(
+            0, n, roots, ends, levels, s.slot_key, s.work, pool.children, pool.node_occupied, pool.brick_lines, s.left,
+            pool.counters,
+        )  # fmt: skip
+        if not share:
+            drop_left(s.left, pool.brick_ref, pool.brick_free, pool.counters)
 
     try:
         while not mark_grids(
@@ -169,14 +183,18 @@ def _insert_serial(
         slots = int(ends[-1])
         # every touched brick may need itself and a path of its own; the root is there
         pool.reserve(slots * (levels - 1), slots)
+        s.reserve_left(slots)
         resolve_grids(
-            0, n, roots, ends, levels, s.slot_key, s.work, pool.children, pool.node_ref, pool.node_occupied,
-            pool.brick_ref, pool.node_free, pool.brick_free, pool.counters,
+            0, n, roots, ends, levels, s.slot_key, s.marks64, s.work, share, s.table, s.made, s.made_marks,
+            pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref, pool.node_free, pool.brick_free,
+            pool.counters,
         )  # fmt: skip
         finish()
     except BaseException:  # Ctrl-C may fall between any two calls
         if pool.counters[PENDING]:
             finish()
+        elif not share:
+            drop_left(s.left, pool.brick_ref, pool.brick_free, pool.counters)
         s.reset()
         raise
     tally += count
@@ -188,6 +206,7 @@ def _insert_threads(
     roots: npt.NDArray[np.int64],
     poses: Array,
     scan: Scan,
+    share: bool,
     threads: int,
     tally: npt.NDArray[np.int64],
 ) -> None:
@@ -198,7 +217,7 @@ def _insert_threads(
     n = len(roots)
     ends = np.zeros(n, np.int64)
     cuts = [i * n // threads for i in range(threads + 1)]
-    scratches = [pool.scratch(i) for i in range(threads)]
+    shared, scratches = pool.scratch(0), [pool.scratch(i) for i in range(threads)]
     counts = [np.zeros(TALLY, np.int64) for _ in range(threads)]
 
     def mark(i: int) -> None:
@@ -222,18 +241,23 @@ def _insert_threads(
         slots = [int(ends[cuts[i + 1] - 1]) for i in range(threads)]
         # every touched brick may need itself and a path of its own; the root is there
         pool.reserve(sum(slots) * (pool.levels - 1), sum(slots))
+        shared.reserve_left(sum(slots))
     except BaseException:
         for s in scratches:
             s.reset()
         raise
     for i, s in enumerate(scratches):
         resolve_grids(
-            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, pool.children, pool.node_ref,
-            pool.node_occupied, pool.brick_ref, pool.node_free, pool.brick_free, pool.counters,
+            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.marks64, s.work, share, shared.table,
+            shared.made, shared.made_marks, pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref,
+            pool.node_free, pool.brick_free, pool.counters,
         )  # fmt: skip
     _in_threads(apply, threads)
-    for s, used in zip(scratches, slots):
-        drop_sources(used, s.work, pool.brick_ref, pool.brick_free, pool.counters)
+    for i, s in enumerate(scratches):
+        settle_grids(
+            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, pool.children, pool.node_occupied,
+            pool.brick_lines, shared.left, pool.counters,
+        )  # fmt: skip
     for count in counts:
         tally += count
     tally[BRICKS] += sum(slots)

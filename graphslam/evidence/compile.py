@@ -29,13 +29,13 @@ _state = {"checked": False}
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Whether compiled code of a kernel lies on disk, no older than its source; true also where nothing is compiled."""
+    """Whether compiled code of a kernel lies on disk, of this source or an older one; true also where nothing is
+    compiled.
+    """
     if not hasattr(kernel, "stats"):  # NUMBA_DISABLE_JIT
         return True
     source = Path(inspect.getsourcefile(kernel.py_func) or "")
-    folder = Path(kernel.stats.cache_path)
-    indices = folder.glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi")
-    return any(i.stat().st_mtime >= source.stat().st_mtime for i in indices)
+    return any(Path(kernel.stats.cache_path).glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi"))
 
 
 def announce_compilation() -> None:
@@ -50,6 +50,8 @@ def announce_compilation() -> None:
         return
     with without_garbage_collection():
         _first_half()[0][1]()
+    if hasattr(mark_grids, "stats") and mark_grids.stats.cache_misses:  # it was code of an older source
+        compile_kernels()
 
 
 def compile_kernels(*, progress: bool = True) -> None:

@@ -8,6 +8,8 @@ from graphslam.evidence.aligned import aligned_zeros
 from graphslam.evidence.layout import BRICK_VOXELS
 
 WINDOW = 64**3
+MADE = 32768
+"""New bricks of one update that later grids can share; beyond them bricks are not looked for, only made."""
 
 
 class Scratch:
@@ -18,6 +20,11 @@ class Scratch:
 
     def __init__(self, slots: int = 16384) -> None:
         self.window = np.full((WINDOW, 2), -1, np.int64)
+        self.table = np.full(2 * MADE, -1, np.int32)
+        self.made = np.zeros((MADE, 4), np.int64)
+        self.made[0, 0] = 1
+        self.made_marks = np.zeros((MADE + 1, 16), np.uint64)
+        self.left = np.zeros(4096, np.int64)
         self.resize(slots)
 
     def resize(self, slots: int) -> None:
@@ -28,6 +35,18 @@ class Scratch:
         self.work = np.zeros((slots, 5), np.int32)
         self.marks = marks
         self.marks64 = marks.view(np.uint64)
+
+    def reserve_left(self, more: int) -> None:
+        """Room to note so many more sources."""
+        if self.left[0] + 1 + more > len(self.left):
+            longer = np.zeros(2 * (int(self.left[0]) + 1 + more), np.int64)
+            longer[: len(self.left)] = self.left
+            self.left = longer
+
+    def forget_made(self) -> None:
+        """Another update begins: what it makes of a brick is not what the last one made."""
+        self.table[self.made[1 : self.made[0, 0], 3]] = -1
+        self.made[0, 0] = 1
 
     def reset(self) -> None:
         """Forget marks that will not be applied."""

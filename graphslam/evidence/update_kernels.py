@@ -20,6 +20,51 @@ PENDING = 4
 
 
 @kernel()
+def find_twin(s, source, marks64, table, made, made_marks):
+    """Place in ``made`` of the brick made of this source and these marks, and the last one is the new brick's own if
+    there was none; -1 where there is no room for it.
+
+    ``made (M, 4) int64``: [source, target, hash, place in the table], row 0 the number of rows in use;
+    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1 (T a power of two, at least 2 M).
+    Compared in full; the hash only finds what to compare.
+    """
+    n = made[0, 0]
+    for k in range(16):  # packed where it stays if it is new
+        word = np.uint64(0)
+        for j in range(4):
+            m = marks64[s, 4 * k + j]
+            m = (m | (m >> np.uint64(6))) & np.uint64(0x000F000F000F000F)
+            m = (m | (m >> np.uint64(12))) & np.uint64(0x000000FF000000FF)
+            m = (m | (m >> np.uint64(24))) & np.uint64(0xFFFF)
+            word |= m << np.uint64(16 * j)
+        made_marks[n, k] = word
+    h = np.uint64(source)
+    for k in range(16):  # no product: where nothing is compiled its overflow would be a warning
+        h ^= made_marks[n, k]
+        h ^= h << np.uint64(13)
+        h ^= h >> np.uint64(7)
+        h ^= h << np.uint64(17)
+    mixed = np.int64(h >> np.uint64(1))
+    last = table.shape[0] - 1
+    i = mixed & last
+    while table[i] >= 0:
+        t = np.int64(table[i])
+        if made[t, 2] == mixed and made[t, 0] == source:
+            differ = np.uint64(0)
+            for k in range(16):
+                differ |= made_marks[n, k] ^ made_marks[t, k]
+            if differ == np.uint64(0):
+                return t
+        i = (i + 1) & last
+    if n == made.shape[0]:
+        return np.int64(-1)
+    table[i] = n
+    made[n, 0], made[n, 1], made[n, 2], made[n, 3] = source, 0, mixed, i
+    made[0, 0] = n + 1
+    return n
+
+
+@kernel()
 def resolve_grids(
     begin,
     end,
@@ -27,7 +72,12 @@ def resolve_grids(
     ends,
     levels,
     slot_key,
+    marks64,
     work,
+    share,
+    table,
+    made,
+    made_marks,
     children,
     node_ref,
     node_occupied,
@@ -38,11 +88,15 @@ def resolve_grids(
 ):
     """Own the paths to the bricks of the slots of grids ``begin … end-1``, and a brick at the end of each.
 
+    ``work (S, 5)`` becomes [parent node, child, source, target, state]. Source equals target where the brick is nobody
+    else's. Bricks with the same source and the same marks will be equal, so several grids get one target: particles
+    that came from one parent see most of their surroundings alike for some scans, and what they see alike stays one
+    brick. State is 0, or ~source where another slot writes the target. Sources keep all their parents until
+    :func:`drop_left`, at the end of the update: what is shared must not depend on who came first. From here to
+    :func:`settle_grids` ``counters[PENDING]`` is set: the trees are no maps. Room was reserved.
 
-    ``work (S, 5)`` becomes [parent node, child, source, target, 0]. Source equals target where the brick is nobody
-    else's; a copied brick keeps all its parents until :func:`drop_sources`, when everybody has read it. From here to
-    there ``counters[PENDING]`` is set: the trees are no maps. Room was
-    reserved. The loops are inside: handing a dozen arrays to a function for every brick would cost more than the work.
+    ``share``: look for such bricks, among those of this update, with ``table, made, made_marks`` of the scratch. The
+    loops are inside: handing a dozen arrays to a function for every brick would cost more than the work.
     """
     path = np.empty(8, np.int64)
     s = 0
@@ -78,15 +132,22 @@ def resolve_grids(
             parent = path[0]
             c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
             source = np.int64(children[parent, c])
-            target = source
+            target, state = source, 0
+            work[s, 2] = source
             if source == 0 or brick_ref[source] > 1:
-                target = take_brick(brick_ref, brick_free, counters)
+                twin = find_twin(s, source, marks64, table, made, made_marks) if share else np.int64(-1)
+                if twin >= 0 and made[twin, 1] != 0:
+                    target, state = made[twin, 1], ~source
+                    brick_ref[target] += 1
+                else:
+                    target = take_brick(brick_ref, brick_free, counters)
+                    if twin >= 0:
+                        made[twin, 1] = target
                 children[parent, c] = target
             work[s, 0] = parent
             work[s, 1] = c
-            work[s, 2] = source
             work[s, 3] = target
-            work[s, 4] = 0
+            work[s, 4] = state
             s += 1
     counters[PENDING] = 1
 
@@ -95,6 +156,8 @@ def resolve_grids(
 def _fetch(s, marks64, work, bricks):
     """Ask for the lines of a slot's bricks that will be read or written."""
     source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
+    if work[s, 4] < 0:
+        return
     for line in range(16):
         k = 4 * line
         if source != target:
@@ -102,6 +165,16 @@ def _fetch(s, marks64, work, bricks):
             prefetch(bricks, target, 32 * line)
         elif (marks64[s, k] | marks64[s, k + 1] | marks64[s, k + 2] | marks64[s, k + 3]) != np.uint64(0):
             prefetch(bricks, target, 32 * line)
+
+
+@kernel()
+def carry_flag(s, root, lines, levels, slot_key, work, children, node_occupied):
+    """Carry a slot's flag "something is occupied" up its grid's tree where it changed."""
+    bit = (node_occupied[work[s, 0]] >> np.uint64(work[s, 1])) & np.uint64(1)
+    if (bit != np.uint64(0)) != (lines != 0):
+        key = slot_key[s]
+        bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
+        set_occupied(root, bx, by, bz, levels, lines != 0, children, node_occupied)
 
 
 @kernel()
@@ -137,11 +210,16 @@ def apply_grids(
     s = 0
     for g in range(begin, end):
         while s < ends[g]:
-            source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
-            lines = np.int64(brick_lines[source])
             next_s = s + AHEAD
             if next_s < last:
                 _fetch(next_s, marks64, work, bricks)
+            if work[s, 4] < 0:  # another slot writes this brick
+                for k in range(64):
+                    marks64[s, k] = np.uint64(0)
+                s += 1
+                continue
+            source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
+            lines = np.int64(brick_lines[source])
             for line in range(16):
                 k = 4 * line
                 a = 32 * line
@@ -184,20 +262,36 @@ def apply_grids(
             brick_lines[target] = lines
             if source != target:
                 work[s, 2], work[s, 4] = target, source
-            # carry the brick's flag up the tree where it changed
-            bit = (node_occupied[work[s, 0]] >> np.uint64(work[s, 1])) & np.uint64(1)
-            if (bit != np.uint64(0)) != (lines != 0):
-                key = slot_key[s]
-                bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
-                set_occupied(roots[g], bx, by, bz, levels, lines != 0, children, node_occupied)
+            carry_flag(s, roots[g], lines, levels, slot_key, work, children, node_occupied)
             s += 1
 
 
 @kernel()
-def drop_sources(end, work, brick_ref, brick_free, counters):
-    """Take one parent from the bricks that were copied."""
-    for s in range(end):
-        if work[s, 4] != 0:
-            drop_brick(np.int64(work[s, 4]), brick_ref, brick_free, counters)
+def settle_grids(
+    begin, end, roots, ends, levels, slot_key, work, children, node_occupied, brick_lines, left, counters
+):  # fmt: skip
+    """Once every brick is written, whatever thread did it: flags of those another slot wrote, and the sources that
+    were copied are added to ``left (n,) int64``, the first of which is their number. Doing it twice is doing it once.
+    """
+    s = 0
+    for g in range(begin, end):
+        while s < ends[g]:
+            source = np.int64(work[s, 4])
+            if source < 0:
+                source = ~source
+                lines = np.int64(brick_lines[work[s, 3]])
+                carry_flag(s, roots[g], lines, levels, slot_key, work, children, node_occupied)
+            if source != 0:
+                left[0] += 1
+                left[left[0]] = source
             work[s, 4] = 0
+            s += 1
     counters[PENDING] = 0
+
+
+@kernel()
+def drop_left(left, brick_ref, brick_free, counters):
+    """Take one parent from each of the bricks that were left for a copy."""
+    for k in range(left[0]):
+        drop_brick(left[k + 1], brick_ref, brick_free, counters)
+    left[0] = 0

@@ -290,10 +290,12 @@ def main(arguments: list[str] | None = None) -> int:
     targets.most("cold compilation [s]", compile_seconds, 10)
     targets.most("cached start [s]", start_seconds, 0.5)
     if options.full:
-        evidence_filter.particle_memory(scans=7500, particles=100, exponent=0.02)
-        end, peak = evidence_filter.particle_memory(scans=7500, particles=100, exponent=0.1, png=options.png)
+        end, peak = evidence_filter.particle_memory(scans=7500, particles=100, png=options.png)
         targets.most("100 particles, 200 m, end / one map", end, 3)
         targets.most("100 particles, 200 m, peak / one map", peak, 8)
+        end, peak = evidence_filter.particle_memory(scans=7500, particles=100, every=10)
+        targets.most("100 particles, resampled every 10 scans, end / one map", end, 3)
+        targets.most("100 particles, resampled every 10 scans, peak / one map", peak, 8)
     return 1 if targets.missed else 0
 
 

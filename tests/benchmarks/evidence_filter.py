@@ -25,7 +25,8 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
 from tests.benchmarks.evidence_scenes import FAN_RATE, Scene, tunnel
 
-WALK = np.repeat([1e-3, 1e-2], 3)  # σ of a particle's motion per scan: rotation [rad], translation [m]
+# σ of a particle's motion per scan: rotation [rad], translation [m]; at 1 m/s that is 0.1° and 2 cm after a metre
+WALK = np.repeat([3e-4, 3e-3], 3)
 CASTING = CastLikelihood(exponent=0.02)  # 181 beams count as 3.6
 
 
@@ -125,15 +126,14 @@ def _run(scene: Scene, cloud: Cloud, clock) -> tuple[Array, int]:  # type: ignor
     return parts[len(scene) // 4 :], cloud.resampled - before
 
 
-def particle_memory(*, scans: int, particles: int, exponent: float, png: Path | None = None) -> tuple[float, float]:
+def particle_memory(*, scans: int, particles: int, every: int = 0, png: Path | None = None) -> tuple[float, float]:
     """Memory of many particles over a long way, at its end and at its peak, over that of one map at the end.
 
-    End-point weights, systematic resampling after every 10th scan, the last one too. Memory is that of living nodes and
-    bricks, taken after every update, that is at its most just before resampling, and at the end after it. It is that of
-    the history the particles share, and of the bricks each touched since it parted from the others: so it depends on
-    how sharp the weights are (``exponent``), which decides how many particles survive a resampling.
+    End-point weights of 18 effective beams, systematic resampling where N_eff falls below half (``every``: after so
+    many scans), and at the end. Memory is that of living nodes and bricks, taken after every update, that is at its
+    most just before resampling, and at the end after it.
     """
-    likelihood = EndpointLikelihood(exponent=exponent, interpolation="nearest")
+    likelihood = EndpointLikelihood(exponent=0.1, interpolation="nearest")
     scene = tunnel(scans)
     single = EvidenceGrid(0.1)
     cloud = Cloud(particles, 6)
@@ -149,16 +149,17 @@ def particle_memory(*, scans: int, particles: int, exponent: float, png: Path | 
         single.insert_scan(points, pose=pose, max_range=scene.max_range)
         used[k], one[k] = cloud.grids[0].pool.used_bytes, single.pool.used_bytes
         room = max(room, cloud.grids[0].pool.nbytes)
-        if k % 10 == 9:
+        if k == scans - 1 or (k % every == every - 1 if every else cloud.effective < particles / 2):
             effective.append(cloud.effective)
             cloud.resample()
             after = cloud.grids[0].pool.used_bytes
     end, peak = after / one[-1], used.max() / one[-1]
+    rule = f"after every {every}th scan" if every else "where N_eff < half"
     print(
-        f"memory of {particles} particles, {scans} scans, exponent {exponent:g} "
-        f"({np.median(effective):.0f} effective): end {after / 1e6:.1f} MB ({end:.2f} ×; "
-        f"before the last resampling {used[-1] / 1e6:.1f} MB), peak {used.max() / 1e6:.1f} MB ({peak:.2f} ×, "
-        f"{room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
+        f"memory of {particles} particles, {scans} scans, {cloud.resampled} times resampled ({rule}; then "
+        f"{np.median(effective):.0f} effective): end {after / 1e6:.1f} MB ({end:.2f} ×; before the last resampling "
+        f"{used[-1] / 1e6:.1f} MB), median {np.median(used / one):.2f} × the map so far, peak {used.max() / 1e6:.1f} MB "
+        f"({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
         flush=True,
     )
     if png is not None:
