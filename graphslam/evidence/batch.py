@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 BATCH = 64
 """Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
-SERIAL_BATCH = 8
+SERIAL_BATCH = 4
 """The same on one thread: so few marks are still in the cache when they are applied."""
 
 Scan = tuple[Array, Array, npt.NDArray[np.uint8], float]

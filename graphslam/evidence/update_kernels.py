@@ -25,25 +25,26 @@ def find_twin(s, source, marks64, table, made, made_marks):
     there was none; -1 where there is no room for it.
 
     ``made (M, 4) int64``: [source, target, hash, place in the table], row 0 the number of rows in use;
-    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1 (T a power of two, at least 2 M).
-    Compared in full; the hash only finds what to compare.
+    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1; T is a power of two, at least
+    2 M. Compared in full; the hash only finds what to compare.
     """
     n = made[0, 0]
     for k in range(16):  # packed where it stays if it is new
-        word = np.uint64(0)
-        for j in range(4):
-            m = marks64[s, 4 * k + j]
-            m = (m | (m >> np.uint64(6))) & np.uint64(0x000F000F000F000F)
-            m = (m | (m >> np.uint64(12))) & np.uint64(0x000000FF000000FF)
-            m = (m | (m >> np.uint64(24))) & np.uint64(0xFFFF)
-            word |= m << np.uint64(16 * j)
-        made_marks[n, k] = word
-    h = np.uint64(source)
-    for k in range(16):  # no product: where nothing is compiled its overflow would be a warning
-        h ^= made_marks[n, k]
-        h ^= h << np.uint64(13)
-        h ^= h >> np.uint64(7)
-        h ^= h << np.uint64(17)
+        a, b, c, d = marks64[s, k], marks64[s, 16 + k], marks64[s, 32 + k], marks64[s, 48 + k]
+        made_marks[n, k] = a | (b << np.uint64(2)) | (c << np.uint64(4)) | (d << np.uint64(6))
+    # Four chains, so that none waits for another. No product: where nothing is compiled its overflow is a warning.
+    h, h1, h2, h3 = np.uint64(source), np.uint64(0), np.uint64(0), np.uint64(0)
+    left, right = np.uint64(13), np.uint64(7)
+    for k in range(4):
+        h, h1 = h ^ made_marks[n, k], h1 ^ made_marks[n, 4 + k]
+        h2, h3 = h2 ^ made_marks[n, 8 + k], h3 ^ made_marks[n, 12 + k]
+        h, h1, h2, h3 = h ^ (h << left), h1 ^ (h1 << left), h2 ^ (h2 << left), h3 ^ (h3 << left)
+        h, h1, h2, h3 = h ^ (h >> right), h1 ^ (h1 >> right), h2 ^ (h2 >> right), h3 ^ (h3 >> right)
+    h ^= (h1 << np.uint64(17)) ^ (h1 >> np.uint64(47)) ^ (h2 << np.uint64(31)) ^ (h2 >> np.uint64(33))
+    h ^= (h3 << np.uint64(43)) ^ (h3 >> np.uint64(21))
+    h ^= h << left
+    h ^= h >> right
+    h ^= h << np.uint64(17)
     mixed = np.int64(h >> np.uint64(1))
     last = table.shape[0] - 1
     i = mixed & last

@@ -158,8 +158,8 @@ def particle_memory(*, scans: int, particles: int, every: int = 0, png: Path | N
     print(
         f"memory of {particles} particles, {scans} scans, {cloud.resampled} times resampled ({rule}; then "
         f"{np.median(effective):.0f} effective): end {after / 1e6:.1f} MB ({end:.2f} ×; before the last resampling "
-        f"{used[-1] / 1e6:.1f} MB), median {np.median(used / one):.2f} × the map so far, peak {used.max() / 1e6:.1f} MB "
-        f"({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
+        f"{used[-1] / 1e6:.1f} MB), median {np.median(used / one):.2f} × the map so far, "
+        f"peak {used.max() / 1e6:.1f} MB ({peak:.2f} ×, {room / 1e6:.1f} MB allocated); one map {one[-1] / 1e6:.1f} MB",
         flush=True,
     )
     if png is not None:
