@@ -25,7 +25,7 @@ def find_twin(s, source, marks64, table, made, made_marks):
     there was none; -1 where there is no room for it.
 
     ``made (M, 4) int64``: [source, target, hash, place in the table], row 0 the number of rows in use;
-    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1; T is a power of two, at least
+    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1; T a power of two, at least
     2 M. Compared in full; the hash only finds what to compare.
     """
     n = made[0, 0]
