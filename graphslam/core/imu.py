@@ -1,0 +1,96 @@
+"""Inertial measurements with the noise their maker states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.records import check_times
+
+GRAVITY = 9.80665
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuNoise:
+    """Stated noise, continuous: densities, and the walks of the biases."""
+
+    gyro: float
+    """Density of the angular rate [rad/s/√Hz]."""
+    gyro_bias: float
+    """σ of the angular rate's constant bias at the start [rad/s]."""
+    gyro_walk: float
+    """Walk of that bias [rad/s/√s]."""
+    accelerometer: float
+    """Density of the specific force [m/s²/√Hz]."""
+    accelerometer_bias: float
+    """σ of its constant bias [m/s²]."""
+    accelerometer_walk: float
+    """Walk of that bias [m/s²/√s]."""
+    attitude: float = 0.0
+    """σ of the unit's own roll and pitch [rad]; 0 where it gives none."""
+    attitude_time: float = 1.0
+    """Time over which errors of roll and pitch stay alike [s]."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise DataError(f"IMU noise {name} is impossible", got=value, wanted="≥ 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imu:
+    """Angular rates and specific forces.
+
+    Parameters
+    ----------
+    times : (n,)
+    angular_rate : (n, 3)
+        [rad/s], frame of the unit.
+    specific_force : (n, 3)
+        [m/s²], frame of the unit; (0, 0, +g) at rest and level.
+    noise : ImuNoise
+    attitude : (n, 2) or None
+        The unit's own roll and pitch [rad]: gravity is seen, heading is not.
+    T_base_imu : (7,)
+
+    Raises
+    ------
+    DataError, GeometryError
+    """
+
+    times: Array
+    angular_rate: Array
+    specific_force: Array
+    noise: ImuNoise
+    attitude: Array | None = None
+    T_base_imu: Array = field(default_factory=lambda: np.array([0.0, 0, 0, 0, 0, 0, 1]))
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        shapes: list[tuple[str, tuple[int, ...]]] = [("angular_rate", (n, 3)), ("specific_force", (n, 3))]
+        if self.attitude is not None:
+            shapes.append(("attitude", (n, 2)))
+        for name, shape in [*shapes, ("T_base_imu", (7,))]:
+            a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if a.shape != shape:
+                raise GeometryError(f"IMU {name} has the wrong shape", got=a.shape, wanted=shape)
+            if not np.all(np.isfinite(a)):
+                k = int(np.argwhere(~np.isfinite(a))[0][0])
+                raise DataError(f"IMU {name} of record {k} is not finite", got=a[k], wanted="finite numbers")
+            object.__setattr__(self, name, a)
+
+    def take(self, index: Any) -> Imu:
+        """See :class:`graphslam.core.records.Stream`."""
+        return replace(
+            self,
+            times=self.times[index],
+            angular_rate=self.angular_rate[index],
+            specific_force=self.specific_force[index],
+            attitude=None if self.attitude is None else self.attitude[index],
+        )

@@ -1,0 +1,114 @@
+"""Scans of a range finder whose head may spin while the vehicle drives: every beam has a time and an origin of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.records import check_times
+from graphslam.core.se3 import quat_multiply, quat_rotate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeScans:
+    """Scans of one scanner.
+
+    Beam j of scan k leaves at ``times[k] + beam_times[j]``, when the head stands at the angle
+    ``spin[k] + spin_rate[k] · beam_times[j]`` about the x axis of its mount.
+
+    Parameters
+    ----------
+    times : (n,)
+        Stamps of the first beams [s].
+    ranges : (n, m)
+        Metres, float32 or float64; NaN: no reading; ≥ ``max_range``: nothing met.
+    directions : (m, 3)
+        Unit vectors, frame of the head.
+    beam_times : (m,)
+        Seconds after the stamp, not decreasing.
+    max_range : float
+    sigma : float
+        Standard deviation of a range [m].
+    T_base_mount : (7,)
+        Mount of the head in the base.
+    spin, spin_rate : (n,)
+        Angle at the stamp [rad] and its rate [rad/s]; zeros for a head that stands still.
+
+    Raises
+    ------
+    DataError, GeometryError
+    """
+
+    times: Array
+    ranges: npt.NDArray[np.floating[Any]]
+    directions: Array
+    beam_times: Array
+    max_range: float
+    sigma: float
+    T_base_mount: Array = field(default_factory=lambda: np.array([0.0, 0, 0, 0, 0, 0, 1]))
+    spin: Array | None = None
+    spin_rate: Array | None = None
+
+    def __post_init__(self) -> None:
+        ranges = np.ascontiguousarray(self.ranges)
+        if ranges.ndim != 2 or ranges.dtype.kind != "f":
+            raise DataError(
+                "ranges have the wrong shape or type", got=f"{ranges.dtype} {ranges.shape}", wanted="(n, m)"
+            )
+        n, m = ranges.shape
+        set_ = object.__setattr__
+        set_(self, "ranges", ranges)
+        set_(self, "times", check_times(self.times, n))
+        for name, shape in (("directions", (m, 3)), ("beam_times", (m,)), ("T_base_mount", (7,))):
+            set_(self, name, _finite(getattr(self, name), shape, name))
+        for name in ("spin", "spin_rate"):
+            value = getattr(self, name)
+            set_(self, name, np.zeros(n) if value is None else _finite(value, (n,), name))
+        length = np.linalg.norm(self.directions, axis=1)
+        if np.any(np.abs(length - 1.0) > 1e-6):
+            k = int(np.argmax(np.abs(length - 1.0)))
+            raise GeometryError(f"direction of beam {k} is no unit vector", got=length[k], wanted="length 1")
+        if np.any(np.diff(self.beam_times) < 0) or (m and self.beam_times[0] < 0):
+            raise DataError("times of the beams fall, or are before the stamp", got=self.beam_times[:3], wanted="≥ 0")
+        for name in ("max_range", "sigma"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise DataError(f"{name} is impossible", got=getattr(self, name), wanted="> 0 m")
+
+    def take(self, index: Any) -> RangeScans:
+        """See :class:`graphslam.core.records.Stream`."""
+        assert self.spin is not None
+        assert self.spin_rate is not None
+        return replace(
+            self,
+            times=self.times[index],
+            ranges=self.ranges[index],
+            spin=self.spin[index],
+            spin_rate=self.spin_rate[index],
+        )
+
+    def head_rays(self, index: Any = slice(None)) -> tuple[Array, Array]:
+        """Origin ``(3,)`` and unit directions ``(k, m, 3)`` of scans, base frame.
+
+        The base is that of each beam's own time: what the vehicle does meanwhile is not in it.
+        """
+        assert self.spin is not None
+        assert self.spin_rate is not None
+        angle = np.asarray(self.spin[index])[..., None] + np.asarray(self.spin_rate[index])[..., None] * self.beam_times
+        half = np.zeros((*angle.shape, 4))
+        half[..., 0], half[..., 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
+        q = quat_multiply(np.broadcast_to(self.T_base_mount[3:], half.shape), half)
+        return self.T_base_mount[:3].copy(), quat_rotate(q, np.broadcast_to(self.directions, (*angle.shape, 3)))
+
+
+def _finite(value: Any, shape: tuple[int, ...], name: str) -> Array:
+    a = np.ascontiguousarray(value, dtype=np.float64)
+    if a.shape != shape:
+        raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shape)
+    if not np.all(np.isfinite(a)):
+        raise DataError(f"{name} is not finite", got=a[~np.isfinite(a)][0], wanted="finite numbers")
+    return a
