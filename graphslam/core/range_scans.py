@@ -1,4 +1,4 @@
-"""Scans of a range finder whose head may spin while the vehicle drives: every beam has a time and an origin of its own."""
+"""Scans of a range finder whose head may spin while the vehicle drives: each beam has its own time and origin."""
 
 from __future__ import annotations
 
