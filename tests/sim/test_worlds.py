@@ -1,0 +1,179 @@
+"""Worlds: the way has the stated length, is free and lies on the floor; seeds move clutter, layouts differ."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from graphslam.core.errors import GeometryError, UnknownNameError
+from graphslam.sim.garage import garage
+from graphslam.sim.world import World, find_revisits
+from tests.sim.solid import Solid
+
+NAMES = ["garage-A", "garage-B", "garage-C"]
+LENGTH = {"garage-A": (303.0, 10.0), "garage-B": (303.0, 10.0), "garage-C": (303.0, 10.0)}
+
+
+@functools.cache
+def world(name: str, seed: int = 0) -> World:
+    kind, _, layout = name.partition("-")
+    return {"garage": lambda: garage(layout, seed=seed)}[kind]()
+
+
+@functools.cache
+def solid(name: str, seed: int = 0) -> Solid:
+    return Solid(world(name, seed))
+
+
+def clearance(name: str, seed: int = 0, shift: float = 0.0) -> float:
+    """Least distance from the axis of the robot's capsule, moved sideways, to anything on its way [m]."""
+    route = world(name, seed).route()
+    s = route.every(0.1)
+    h = route.headings(s)
+    axis = route.positions(s) + shift * np.column_stack([-np.sin(h), np.cos(h), np.zeros(len(s))])
+    # radius 0.35 m, from 0.15 to 1.2 m above the floor: the axis goes from 0.5 to 0.85 m
+    points = np.concatenate([axis + [0.0, 0.0, z] for z in np.linspace(0.5, 0.85, 8)])
+    return float(solid(name, seed).distance(points).min())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_way_has_the_stated_length(name: str) -> None:
+    wanted, tolerance = LENGTH[name]
+    w = world(name)
+    s = w.route().every(0.05)
+    driven = np.linalg.norm(np.diff(w.route().positions(s), axis=0), axis=1).sum()
+    assert driven == pytest.approx(wanted, abs=tolerance)
+    assert w.meta["length"] == pytest.approx(driven, rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("name", NAMES)
+def test_robot_hits_nothing_on_its_way(name: str, seed: int) -> None:
+    assert clearance(name, seed) >= 0.35
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_robot_would_hit_something_beside_its_way(name: str) -> None:
+    """The test above can fail: a few metres to one side it does."""
+    assert min(clearance(name, shift=d) for d in (-3.0, 3.0)) < 0.2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_floor_lies_at_the_stated_height(name: str) -> None:
+    route = world(name).route()
+    p = route.positions(route.every(0.1))
+    down = solid(name).cast(p + [0.0, 0.0, 0.5], np.broadcast_to([0.0, 0.0, -1.0], p.shape))
+    assert np.abs(down - 0.5).max() < (0.06 if name == "mine" else 0.01)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_beam_leaves_through_a_slit(name: str) -> None:
+    """Rays downwards from the robot, and steeply, always end: floors and walls join."""
+    route = world(name).route()
+    p = route.positions(route.every(0.5)) + [0.0, 0.0, 0.6]
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False) + 0.013
+    d = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(36, -0.15)])
+    t = solid(name).cast(np.repeat(p, 36, axis=0), np.tile(d, (len(p), 1)))
+    assert np.isfinite(t).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_loops_are_places_seen_before(name: str) -> None:
+    w = world(name)
+    route = w.route()
+    loops = np.array(w.meta["loops"])
+    assert len(loops) >= 1
+    a, b = route.positions(loops[:, 0]), route.positions(loops[:, 1])
+    assert np.linalg.norm(a - b, axis=1).max() <= 1.0
+    assert np.all(loops[:, 1] - loops[:, 0] > 20.0)
+    # and none is missing: by brute force, every revisited point lies in a stated stretch
+    s = route.every(1.0)
+    p = route.positions(s)
+    near = (np.linalg.norm(p[:, None] - p[None], axis=2) < 0.8) & (s[:, None] - s[None] > 21.0)
+    again = s[near.any(axis=1)]
+    stretches = np.array([r["again"] for r in find_revisits(route)])
+    inside = (again[:, None] >= stretches[:, 0] - 1.0) & (again[:, None] <= stretches[:, 1] + 1.0)
+    assert inside.any(axis=1).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_slopes_can_be_driven_and_corners_are_level(name: str) -> None:
+    route = world(name).route()
+    assert np.abs(np.rad2deg(np.arctan(route.slopes(route.starts[:-1])))).max() < 9.0
+    bends = route.curvature != 0.0
+    assert np.abs(np.diff(route.points[:, 2])[bends]).max() < 1e-9
+
+
+def walls(w: World) -> set[bytes]:
+    """Every triangle as bytes."""
+    return {t.tobytes() for t in np.round(w.vertices[w.triangles], 6)}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_seeds_move_clutter_not_walls(name: str) -> None:
+    a, same, b, c = world(name, 0), world.__wrapped__(name, 0), world(name, 1), world(name, 2)
+    assert np.array_equal(a.vertices, same.vertices)
+    assert np.array_equal(a.triangles, same.triangles)
+    assert np.array_equal(a.waypoints, b.waypoints)
+    common, only = walls(a) & walls(b), walls(a) - walls(b)
+    assert only  # something moved
+    assert len(common & walls(c)) == len(common)  # what two seeds share, all share: the walls
+
+
+def test_garage_layouts_differ() -> None:
+    a, b, c = (world(n) for n in ("garage-A", "garage-B", "garage-C"))
+    assert len({w.meta["pillar_period"] for w in (a, b, c)}) == 3
+    turned = [np.sign(w.route().curvature).sum() for w in (a, b, c)]
+    assert turned[0] * turned[1] < 0  # mirrored: left turns for right ones
+    assert len({round(np.ptp(w.waypoints[:, 0])) for w in (a, b, c)}) == 3
+
+
+def test_garage_drives_through_both_levels_and_retraces_its_start() -> None:
+    for name in ("garage-A", "garage-B", "garage-C"):
+        w = world(name)
+        route = w.route()
+        p = route.positions(route.every(0.1))
+        assert p[:, 2].max() == pytest.approx(3.2)
+        [stretch] = w.meta["revisits"]
+        assert stretch["first"][0] == 0.0
+        assert stretch["first"][1] == pytest.approx(28.0, abs=1.0)
+        assert stretch["same_heading"]
+        centroid = p.mean(axis=0)
+        assert np.linalg.norm(p[0] - centroid) > 18.0
+        assert np.linalg.norm(p[-1] - centroid) > 12.0
+
+
+def test_garage_levels_look_alike() -> None:
+    """Pillars of both levels stand above one another at one period: what makes a false match."""
+    w = world("garage-A")
+    s = solid("garage-A")
+    x = np.arange(10.5, 50.0, 0.1)
+    sight = {}
+    for level, floor in enumerate(w.meta["levels"]):
+        origins = np.column_stack([x, np.full(len(x), 9.0), np.full(len(x), floor + 2.2)])
+        t = s.cast(origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape))
+        pillar = t < 2.0
+        sight[level] = pillar
+        starts = x[1:][pillar[1:] & ~pillar[:-1]]
+        assert np.allclose(np.diff(starts), 8.0, atol=0.11)
+    assert np.array_equal(sight[0], sight[1])
+
+
+def test_unknown_layout_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match="garage layout"):
+        garage("Z")
+
+
+def test_impossible_world_is_refused() -> None:
+    w = world("garage-A")
+    parts = {k: getattr(w, k) for k in ("name", "vertices", "triangles", "waypoints", "corner_radius", "speed", "meta")}
+    with pytest.raises(GeometryError, match="names a vertex"):
+        World(**{**parts, "triangles": w.triangles + len(w.vertices)})
+    with pytest.raises(GeometryError, match="not finite"):
+        World(**{**parts, "vertices": np.where(w.vertices == w.vertices[5], np.nan, w.vertices)})
+    with pytest.raises(GeometryError, match="do not fit"):
+        World(**{**parts, "corner_radius": 30.0})
+    with pytest.raises(GeometryError, match="speed"):
+        World(**{**parts, "speed": 0.0})
