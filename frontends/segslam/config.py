@@ -1,0 +1,265 @@
+"""What steers SegSLAM. Defaults are those that segmented and closed a simulated garage of two levels sanely; the path
+lengths and times in them assume a robot of some tenths to a few metres a second."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+from graphslam.core.errors import ConfigError
+
+
+def _check(config: Any, part: str, *, positive: tuple[str, ...] = (), unit: tuple[str, ...] = ()) -> None:
+    """Refuse numbers that are NaN or negative, ``positive`` ones that are 0, and ``unit`` ones above 1."""
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            continue
+        if math.isnan(value) or value < 0 or (f.name in positive and value == 0) or (f.name in unit and value > 1):
+            wanted = "0 … 1" if f.name in unit else "> 0" if f.name in positive else "≥ 0"
+            raise ConfigError(f"{part}.{f.name} = {value}; wanted {wanted}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmentationConfig:
+    """When a segment ends: A7 motion error, A8 predictive score, period; between a minimum and a maximum size."""
+
+    score: float = 0.45
+    """The predictive score below which a segment ends (A8); 0 = off."""
+    relative_score: float = 0.65
+    """… or below this share of its running maximum since the segment began; 0 = off."""
+    window: float = 4.0
+    """Look-ahead window W [s]; the filter runs this far behind."""
+    tolerance: float = 0.6
+    """A look-ahead beam is predicted if its cast range is within this [m]."""
+    score_sigma: float = 0.3
+    """σ of the ranges in the score's log-likelihood [m]."""
+    score_beams: int = 600
+    """Beams of a window that are cast, at most (evenly thinned)."""
+    excluded: float = 5.0
+    """The score says nothing in the first seconds of a segment, and does not count for its maximum [s]."""
+    every: float = 2.0
+    """Time between decisions [s]."""
+    min_seconds: float = 12.0
+    """Minimum size of a segment [s] …"""
+    min_length: float = 9.0
+    """… and [m]: both must be reached."""
+    max_length: float = 60.0
+    """A segment ends at this length at the latest [m]."""
+    max_seconds: float = math.inf
+    """… or after this time [s], except where less than the minimum length was driven."""
+    period: float = 0.0
+    """With a number: segments of this many seconds, whatever score and motion say [s]; 0 = off."""
+    motion_translation: float = 0.0
+    """α1 of the motion error: error a metre driven [1/m] (A7)."""
+    motion_rotation: float = 0.0
+    """α2: error a radian turned [1/rad]."""
+    motion_limit: float = 1.0
+    """A segment ends where its motion error reaches this; α1 = α2 = 0: never."""
+    decide: Literal["filter", "particle"] = "filter"
+    """One decision for the filter, or one for each particle, which leaves fewer segments that fit together."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "segmentation",
+            positive=("window", "tolerance", "score_sigma", "score_beams", "every", "max_length", "max_seconds"),
+            unit=("score", "relative_score"),
+        )
+        if self.min_length > self.max_length or self.min_seconds > self.max_seconds:
+            raise ConfigError(f"segmentation: the minimum size is above the maximum, got {self}")
+        if self.decide not in ("filter", "particle"):
+            raise ConfigError(f"segmentation.decide = {self.decide!r}; known: filter, particle")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WinnowConfig:
+    """Which earlier segments are worth matching (A10)."""
+
+    gap: float = 40.0
+    """Segments that ended less than this ago are not candidates [s]."""
+    sigma: float = 0.5
+    """σ of the path-length model: this [m] …"""
+    sigma_per_metre: float = 0.03
+    """… plus this for each metre driven since."""
+    sigmas: float = 2.5
+    """A candidate is nearer than this many σ."""
+    height: float = 1.6
+    """… and its path not farther above or below [m]."""
+    near: float = 2.0
+    """Edge of the box around the robot in which voxels must be known [m], widened by the uncertainty."""
+    known: int = 50
+    """Voxels in it that the candidate must know."""
+    keep: int = 4
+    """Candidates of one particle at one time, nearest (in σ) first."""
+    local_length: float = 0.0
+    """A local map sample reaches this far along the path [m]; 0 = over the whole map."""
+
+    def __post_init__(self) -> None:
+        _check(self, "winnowing", positive=("sigma", "sigmas", "keep"))
+
+    def drift(self, length: Any) -> Any:
+        """σ after a path of a length [m]; arrays too."""
+        return self.sigma + self.sigma_per_metre * length
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchConfig:
+    """The correlative search that brings registration within its reach, and the registration itself."""
+
+    grid: float = 0.4
+    """Steps of the search in position [m]."""
+    yaw_step: float = 0.05
+    """Steps in heading [rad]."""
+    max_radius: float = 12.0
+    """Half width of the search: this [m], or 2.5 σ of the path-length model if that is less."""
+    height: float = 0.8
+    """Half width in z [m]."""
+    yaw: float = 0.1
+    """Half width in heading [rad] …"""
+    yaw_per_metre: float = 2.5e-3
+    """… plus this for each metre driven since."""
+    max_yaw: float = 0.8
+    """… but no more [rad]."""
+    starts: int = 6
+    """Distinct modes handed to the registration."""
+    source_radius: float = 15.0
+    """Points of the look-ahead window beyond this are left out [m]."""
+    source_points: int = 300
+    """Points of the look-ahead window, at most."""
+    cloud_level: int = 1
+    """Cells of 2**level voxels, in which a map's occupied voxels are gathered for matching."""
+    coarse: float = 1.0
+    """First radius of the registration [m]."""
+    fine: float = 0.5
+    """Second one [m]."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "search",
+            positive=("grid", "yaw_step", "max_radius", "starts", "source_radius", "source_points", "coarse", "fine"),
+        )
+
+    def yaw_width(self, length: float) -> float:
+        """Half width in heading after a path of a length [m]."""
+        return min(self.yaw + self.yaw_per_metre * length, self.max_yaw)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChoiceConfig:
+    """Which matches are believed, and how often (A9)."""
+
+    every: float = 4.0
+    """Time between attempts [s]; each needs a full look-ahead window."""
+    fitness: float = 0.85
+    """A match explains at least this share of the points."""
+    degeneracy: float = 0.006
+    """Least over greatest eigenvalue of the translational Hessian: below, the place does not fix the position."""
+    tilt: float = math.radians(4.0)
+    """The z axes enclose no more than this [rad]."""
+    height: float = 1.6
+    """The match is no farther above or below the prediction [m]."""
+    shift: float = 2.5
+    """… and no farther from it than this many σ of the path-length model."""
+    margin: float = 0.03
+    """A second mode must be worse by this share of the points …"""
+    mode_distance: float = 1.5
+    """… if it is farther off than this [m]."""
+    fitness_sigma: float = 0.15
+    """Weight of the fitness: ``exp(-½ ((1 - fitness) / this)²)``."""
+    error_sigma: float = 0.4
+    """Weight of the range error of localisation [m], in the same way."""
+    spread_sigma: float = 0.3
+    """Weight of the spread of localisation [m], in the same way."""
+    null_weight: float = 0.05
+    """Weight of no match at all, which is always in the draw."""
+    registration_sigma: float = 0.1
+    """Standard deviations of an accepted match: position [m] …"""
+    registration_angle: float = 0.012
+    """… and angles [rad], added to the registration's own covariance."""
+    registration_scale: float = 10.0
+    """Factor on the registration's own covariance: points of one window are not independent."""
+    method: Literal["registration", "localisation", "both"] = "registration"
+    """What judges a match (eq. 18, eq. 19)."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "choice",
+            positive=(
+                "every", "shift", "fitness_sigma", "error_sigma", "spread_sigma", "null_weight",
+                "registration_sigma", "registration_angle", "registration_scale",
+            ),
+            unit=("fitness", "margin"),
+        )  # fmt: skip
+        if self.method not in ("registration", "localisation", "both"):
+            raise ConfigError(f"choice.method = {self.method!r}; known: registration, localisation, both")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalisationConfig:
+    """The throw-away particle filter that tries a match (eq. 19)."""
+
+    particles: int = 100
+    """Poses drawn around the start."""
+    rounds: int = 4
+    """Times they are weighed and resampled; the likelihood is spent in equal parts."""
+    position: float = 0.4
+    """σ of the draw in position [m]."""
+    angle: float = 0.05
+    """σ of the draw in heading [rad]; roll and pitch stay where gravity put them."""
+    effective_beams: float = 60.0
+    """Beams of the window count for so many independent ones."""
+    cast_sigma: float = 0.2
+    """σ of the ranges in the error [m]."""
+    clip: float = 3.0
+    """Range errors are no larger than this many σ."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "localisation",
+            positive=("particles", "rounds", "position", "angle", "effective_beams", "cast_sigma", "clip"),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandoverConfig:
+    """What a settled segment hands over."""
+
+    drift_scale: float = 1.0
+    """Factor on the drift model in the exit covariance."""
+    matched_only: bool = False
+    """The paper's moment matching instead of particles plus drift: to be measured, not to be used."""
+    minimum_support: float = 0.05
+    """Matches that took a smaller share of the particles' weight are not handed over."""
+
+    def __post_init__(self) -> None:
+        _check(self, "handover", positive=("drift_scale",), unit=("minimum_support",))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegSlamConfig:
+    """Everything of SegSLAM but the particle filter inside its segments."""
+
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    """When a segment ends."""
+    winnowing: WinnowConfig = field(default_factory=WinnowConfig)
+    """Which segments are tried."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """How a match is searched and registered."""
+    choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+    """Which matches are believed."""
+    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
+    """The throw-away filter."""
+    handover: HandoverConfig = field(default_factory=HandoverConfig)
+    """What is handed over."""
+    segments_per_interval: int = 0
+    """Segments of one interval that are kept, heaviest first; 0 = all."""
+    lock_after: int = 0
+    """A submap that was entered this often is locked: localised in, no more updated; 0 = never."""
+
+    def __post_init__(self) -> None:
+        _check(self, "segslam")

@@ -1,0 +1,163 @@
+"""How sure a segment is of its exit: the spread of the particles, and what particles cannot know.
+
+The spread alone, which is what moment matching hands over, is over-confident a hundredfold: resampling leaves the
+particles a recent common ancestor, and the error that all of them share (a bias of the heading) is in none of them.
+So the default adds a drift model, the covariance of dead reckoning over the length of the segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.poses import group_of, pose_mean, pose_scatter
+from graphslam.core.errors import CovarianceError
+from graphslam.core.gaussian import check_covariance, chi2_quantile
+from graphslam.core.geometry import Array, ArrayLike
+
+Drift = Callable[[float], Any]
+"""Covariance ``(d, d)``, right tangent, at the end of a path of a length [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExitCovariance:
+    """Covariances of a segment's exit, all in the right tangent of :attr:`pose`.
+
+    Parameters
+    ----------
+    pose : (7,) or (3,)
+    total : (d, d)
+        Particles plus drift model: what a graph gets.
+    particles : (d, d)
+        Second moment of the particles about ``pose``.
+    matched : (d, d)
+        The paper's: moments of the particles about their own mean, with a floor that makes it invertible.
+    drift : (d, d)
+    effective : float
+        ``1 / Σ w²`` of the particles that gave the spread.
+    """
+
+    pose: Array
+    total: Array
+    particles: Array
+    matched: Array
+    drift: Array
+    effective: float
+
+
+def exit_covariance(
+    exits: ArrayLike,
+    about: ArrayLike,
+    length: float,
+    drift: Drift,
+    *,
+    weights: ArrayLike | None = None,
+    drift_scale: float = 1.0,
+    floor_position: float = 0.01,
+    floor_angle: float = 1e-3,
+) -> ExitCovariance:
+    """Covariance of the pose at the end of a segment, seen from its start.
+
+    Parameters
+    ----------
+    exits : (n, 7) or (n, 3)
+        Of all particles of the interval, each in the frame of the body's own start.
+    about : (7,) or (3,)
+        The exit that is handed over; need not be the mean, and how far it lies off is added.
+    length : float
+        Path length of the segment [m].
+    drift : callable
+        Path length [m] → covariance ``(d, d)``.
+    weights : (n,), optional
+    drift_scale : float
+        Factor on the drift model's covariance.
+    floor_position, floor_angle : float
+        Standard deviations [m], [rad] added to the moment-matched covariance.
+
+    Raises
+    ------
+    CovarianceError
+        The drift model's answer is no covariance; then nothing may enter a graph.
+    GeometryError
+    """
+    group = group_of(about)
+    D = np.array(drift(float(length)), dtype=np.float64)
+    if D.shape != (group.dof, group.dof) or not np.all(np.isfinite(D)):
+        raise CovarianceError(
+            "the drift model gave no covariance", got=D.tolist(), wanted=f"({group.dof}, {group.dof}) finite numbers"
+        )
+    p = np.atleast_2d(np.asarray(exits, dtype=np.float64))
+    n = len(p)
+    w = np.full(n, 1.0 / n) if weights is None else np.asarray(weights, dtype=np.float64)
+    mean = pose_mean(p, w)
+    floor = np.full(group.dof, floor_angle**2)
+    floor[group.position] = floor_position**2
+    particles = pose_scatter(p, about, w)
+    matched = pose_scatter(p, mean, w) + np.diag(floor)
+    total = check_covariance(particles + drift_scale * D, what="exit covariance of a segment", dim=group.dof)
+    return ExitCovariance(
+        pose=np.array(about, dtype=np.float64),
+        total=total,
+        particles=particles,
+        matched=0.5 * (matched + matched.T),
+        drift=D,
+        effective=float(w.sum() ** 2 / np.sum(w**2)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Nees:
+    """Normalised squared errors of exits.
+
+    Parameters
+    ----------
+    values : (n,)
+        ``eᵀ P⁻¹ e``; its expectation is ``dof`` if the covariances are honest.
+    dof : int
+    errors : (n, dof)
+        Right tangents at the estimates, of the components that were asked for.
+    """
+
+    values: Array
+    dof: int
+    errors: Array
+
+    @property
+    def per_dof(self) -> float:
+        """Mean, one for honest covariances."""
+        return float(self.values.mean() / self.dof)
+
+    def inside(self, probability: float = 0.95) -> float:
+        """Share inside the region that should hold this share."""
+        return float(np.mean(self.values <= chi2_quantile(probability, self.dof)))
+
+
+def exit_nees(
+    estimates: ArrayLike,
+    covariances: ArrayLike,
+    truths: ArrayLike,
+    *,
+    components: npt.ArrayLike | None = None,
+) -> Nees:
+    """Are the covariances of exits honest?
+
+    Parameters
+    ----------
+    estimates, truths : (n, 7) or (n, 3)
+        Exits in the frames of the segments' starts.
+    covariances : (n, d, d)
+        Right tangent at the estimates.
+    components : sequence of int, optional
+        Tangent components to judge; default all. Where roll and pitch come from gravity: ``(2, 3, 4, 5)``.
+    """
+    T = np.atleast_2d(np.asarray(estimates, dtype=np.float64))
+    group = group_of(T)
+    keep = np.arange(group.dof) if components is None else np.asarray(components, dtype=np.intp)
+    e = group.log(group.between(T, truths))[:, keep]
+    P = np.asarray(covariances, dtype=np.float64)[:, keep[:, None], keep[None, :]]
+    values = np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0])
+    return Nees(values, len(keep), e)

@@ -1,0 +1,420 @@
+"""The SegMap Θ: all segments of the path, their submaps, and which of them fit together in time (SegSLAM section 3).
+
+A segment covers the steps of an *interval*, from the boundary where a particle entered a submap to the one where it
+left. Particles that are alive at a boundary leave one segment each, so an interval has many, and those of one interval
+are interchangeable: any of them may be followed by any that begins where it ends (A6).
+
+Frames. The frame of a new segment is the body at its entry, levelled where gravity is known. A segment that entered an
+older map works in the frame of that map, on a copy of it. Poses are ``T_segment_body``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.poses import SE2, SE3, Group, normalised
+from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment
+from frontends.segslam.store import Maps, Table
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.records import check_times
+from graphslam.evidence.grid import EvidenceGrid
+
+Ints = npt.NDArray[np.int64]
+
+__all__ = ["KINDS", "MATCH", "NEW", "SAME", "Entry", "SegMap", "Segment"]
+
+
+class SegMap:
+    """All segments of one filter.
+
+    Parameters
+    ----------
+    times : (n,)
+        Of the steps [s].
+    path_length : (n,)
+        Way by odometry up to each step [m].
+    particles : int
+    dim : {3, 2}
+    gravity : bool
+        Frames are aligned with gravity: only headings lie between them.
+
+    Raises
+    ------
+    DataError, GeometryError
+    """
+
+    def __init__(self, times: Any, path_length: Any, particles: int, *, dim: int = 3, gravity: bool = True) -> None:
+        self.times = check_times(times, where="steps of a SegMap")
+        self.path_length = np.ascontiguousarray(path_length, dtype=np.float64)
+        if self.path_length.shape != self.times.shape or np.any(~(np.diff(self.path_length) >= 0)):
+            raise GeometryError(
+                "path lengths do not belong to the steps", got=self.path_length.shape, wanted="one each, never falling"
+            )
+        if particles < 1 or dim not in (2, 3):
+            raise GeometryError("impossible SegMap", got=f"{particles} particles, dim {dim}", wanted="≥ 1; 2 or 3")
+        self.group: Group = SE2 if dim == 2 else SE3
+        self.gravity = bool(gravity) and dim == 3
+        self.particles = int(particles)
+        self.table = Table(self.group.size)
+        self.maps = Maps(self.group)
+        # the open segment of each particle: how it was entered, since which boundary, after which closed segment
+        self.entries: list[Entry | None] = [None] * self.particles
+        self.links: list[Array] = [self.group.identity] * self.particles
+        self.start: Ints = np.zeros(self.particles, np.int64)
+        self.previous: Ints = np.full(self.particles, -1, np.int64)
+        self.pruned = 0
+
+    def __len__(self) -> int:
+        """Number of segments ever closed; their indices are 0 … len - 1, also of those pruned since."""
+        return self.table.count
+
+    def __getitem__(self, index: int) -> Segment:
+        i = self._alive(index)
+        t = self.table
+        a, b = int(t.start[i]), int(t.end[i])
+        return Segment(
+            index=i,
+            interval=(a, b),
+            t_start=float(self.times[a]),
+            t_end=float(self.times[b]),
+            kind=KINDS[t.kind[i]],
+            source=int(t.source[i]),
+            previous=int(t.previous[i]),
+            T_entry=t.entry[i],
+            T_exit=t.exit[i],
+            path=cast(Array, t.paths[i]),
+            length=float(self.path_length[b] - self.path_length[a]),
+            weight=float(t.weight[i]),
+            match_covariance=t.covariances[i],
+            fitness=float(t.fitness[i]),
+            locked=self.maps.locked[t.map[i]],
+        )
+
+    @property
+    def alive(self) -> Ints:
+        """Indices of the segments that are viable, ascending."""
+        return np.flatnonzero(self.table.alive).astype(np.int64)
+
+    # --- life of the current segments ------------------------------------------------------------------------
+
+    def open(
+        self, step: int, entries: Sequence[Entry], which: Iterable[int] | None = None
+    ) -> list[EvidenceGrid | None]:
+        """Particles enter segments at a boundary.
+
+        Parameters
+        ----------
+        step : int
+        entries : sequence of Entry
+            One for each particle, in its order.
+        which : iterable of int, optional
+            The particles; default all.
+
+        Returns
+        -------
+        list of EvidenceGrid or None
+            The map to go on with: a copy of the one that is entered, locked if that is; None of a new segment, whose
+            map the filter makes.
+
+        Raises
+        ------
+        DataError
+            A particle has not left its last segment, or enters one that is not there.
+        GeometryError
+        """
+        chosen = self._which(which, len(entries), "entries")
+        if not 0 <= step < len(self.times):
+            raise DataError("a segment begins outside the path", got=step, wanted=f"0 … {len(self.times) - 1}")
+        grids: list[EvidenceGrid | None] = []
+        links = []
+        for p, e in zip(chosen, entries):
+            if self.entries[p] is not None:
+                raise DataError(f"particle {p} enters a segment before it left its last one", where=f"step {step}")
+            if self.previous[p] >= 0 and self.start[p] != step:
+                raise DataError(
+                    f"particle {p} enters a segment elsewhere than where it left the last one",
+                    got=step, wanted=int(self.start[p]),
+                )  # fmt: skip
+            links.append(self._check_entry(p, e))
+        for p, e, link in zip(chosen, entries, links):
+            grid = None
+            if e.kind != NEW:
+                m = int(self.table.map[e.source])
+                grid = cast(EvidenceGrid, self.maps.grids[m]).copy()
+                if self.maps.locked[m]:
+                    grid.lock()
+                if e.kind == MATCH:
+                    self.maps.entered[m] += 1
+            grids.append(grid)
+            self.entries[p], self.links[p], self.start[p] = e, link, step
+        return grids
+
+    def resample(self, ancestors: npt.ArrayLike) -> None:
+        """Particle i becomes a copy of particle ``ancestors[i]``; closed segments stay, whoever made them (A6)."""
+        a = np.asarray(ancestors, dtype=np.int64)
+        if a.shape != (self.particles,) or a.min() < 0 or a.max() >= self.particles:
+            raise DataError("impossible ancestors", got=a, wanted=f"{self.particles} of 0 … {self.particles - 1}")
+        self.entries = [self.entries[i] for i in a]
+        self.links = [self.links[i] for i in a]
+        self.start, self.previous = self.start[a], self.previous[a]
+
+    def close(
+        self,
+        step: int,
+        grids: Sequence[EvidenceGrid],
+        paths: Sequence[Array],
+        weights: npt.ArrayLike | None = None,
+        which: Iterable[int] | None = None,
+    ) -> Ints:
+        """Particles leave their segments at a boundary; what they hold is kept.
+
+        Parameters
+        ----------
+        step : int
+        grids : sequence of EvidenceGrid
+            Their maps, in the frames they work in. Only handles are kept: the filter may go on writing to its own.
+        paths : sequence of (step - start + 1, 7 or 3)
+            ``T_segment_body`` at every step since the boundary, both boundaries included, **in the frame of this
+            segment**: the first pose is that of the entry.
+        weights : (particles,), optional
+            Of all particles; default equal.
+        which : iterable of int, optional
+
+        Returns
+        -------
+        (n,) int64
+            Indices of the segments. Particles that are copies of each other share one.
+
+        Raises
+        ------
+        DataError
+            Nothing is open, or the interval is empty.
+        GeometryError
+            A path of the wrong shape, not finite, or in another frame.
+        """
+        chosen = self._which(which, len(grids), "grids")
+        self._which(which, len(paths), "paths")
+        w = normalised(weights, self.particles)
+        rows = [self._check_path(p, step, path) for p, path in zip(chosen, paths)]
+        known: dict[tuple[Any, ...], int] = {}
+        out = np.empty(len(chosen), np.int64)
+        for k, (p, grid, path) in enumerate(zip(chosen, grids, rows)):
+            e = cast(Entry, self.entries[p])
+            key = (int(self.start[p]), e.kind, e.source, int(self.previous[p]), path.tobytes())
+            i = known.get(key, -1)
+            if i < 0:
+                i = known[key] = self._append(p, step, e, grid, path)
+            self.table.weight[i] += w[p]
+            out[k] = i
+        for p, i in zip(chosen, out.tolist()):
+            self.entries[p], self.start[p], self.previous[p] = None, step, i
+        return out
+
+    # --- what fits together ----------------------------------------------------------------------------------
+
+    def ending_at(self, step: int) -> Ints:
+        """Viable segments that end at a boundary, ascending: those that may come before what begins there."""
+        t = self.table
+        return np.flatnonzero(t.alive & (t.end == step)).astype(np.int64)
+
+    def beginning_at(self, step: int) -> Ints:
+        """Viable segments that begin at a boundary, ascending: those that may follow what ends there."""
+        t = self.table
+        return np.flatnonzero(t.alive & (t.start == step)).astype(np.int64)
+
+    def intervals(self) -> Ints:
+        """Intervals ``(k, 2)`` of the viable segments, ascending."""
+        a = self.alive
+        return np.unique(np.stack([self.table.start[a], self.table.end[a]], axis=1), axis=0)
+
+    def in_interval(self, interval: tuple[int, int]) -> Ints:
+        """Viable segments of an interval, ascending."""
+        t = self.table
+        return np.flatnonzero(t.alive & (t.start == interval[0]) & (t.end == interval[1])).astype(np.int64)
+
+    def chain(self, index: int) -> Ints:
+        """Segments from the first to ``index`` as one particle lived them, as far as they are viable."""
+        found = [self._alive(index)]
+        while (p := int(self.table.previous[found[-1]])) >= 0 and self.table.alive[p]:
+            found.append(p)
+        return np.array(found[::-1], np.int64)
+
+    def map_of(self, index: int) -> tuple[EvidenceGrid, Array]:
+        """Map of a segment, and ``T_map_segment``: the identity, except where maps were merged. Not to be written."""
+        m = int(self.table.map[self._alive(index)])
+        return cast(EvidenceGrid, self.maps.grids[m]), self.table.T_map[index]
+
+    # --- care ------------------------------------------------------------------------------------------------
+
+    def prune(self) -> int:
+        """Drop the segments that are not viable any more, and give their maps back; returns how many.
+
+        A segment is viable while a chain of segments, each beginning where the one before ends, leads from it to
+        where a particle is now (A12).
+        """
+        t = self.table
+        here = set(self.start.tolist())
+        ends = t.end[: t.count]
+        for b in np.unique(ends[t.alive[: t.count]])[::-1].tolist():
+            if b in here:
+                here.update(t.start[self.ending_at(b)].tolist())
+        dead = np.flatnonzero(t.alive[: t.count] & ~np.isin(ends, list(here)))
+        return self._release(dead)
+
+    def thin(self, most: int) -> int:
+        """Keep no more than ``most`` segments of each interval, the heaviest; returns how many were dropped.
+
+        Those that the particles of now came through are kept beside them.
+        """
+        if most < 1:
+            raise DataError("an interval cannot do without any segment", got=most, wanted="≥ 1")
+        t = self.table
+        through = {int(i) for p in np.unique(self.previous) if p >= 0 and t.alive[p] for i in self.chain(int(p))}
+        dead = []
+        for interval in self.intervals():
+            i = self.in_interval((int(interval[0]), int(interval[1])))
+            order = i[np.lexsort((i, -t.weight[i]))]
+            dead += [k for k in order[most:].tolist() if k not in through]
+        return self._release(np.sort(np.array(dead, np.int64)))
+
+    def lock(self, index: int) -> None:
+        """A segment's map is localised in from now on, not updated: also its copies that are entered later (A12)."""
+        self.maps.lock(int(self.table.map[self._alive(index)]))
+
+    def entered(self, index: int) -> int:
+        """How often particles entered the map of a segment by a match."""
+        return self.maps.entered[int(self.table.map[self._alive(index)])]
+
+    def merge(self, keep: int, other: int, T_keep_other: npt.ArrayLike | None = None) -> EvidenceGrid:
+        """Make one map of two by adding their log-odds (A12); both segments, and all that use the two maps, have it.
+
+        Each scan counts once: where one map holds all scans of the other (it was entered, and went on), it takes its
+        place and nothing is added.
+
+        Parameters
+        ----------
+        keep, other : int
+        T_keep_other : (7,) or (3,), optional
+            Between the frames of the segments; default the identity.
+
+        Raises
+        ------
+        DataError
+            The maps share some scans and neither holds all of the other's: these would count twice.
+        GridLockedError, GridError, GeometryError
+        """
+        i, j = self._alive(keep), self._alive(other)
+        T = self.group.identity if T_keep_other is None else np.asarray(T_keep_other, dtype=np.float64)
+        if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):
+            raise GeometryError("impossible transform between segments", got=T, wanted=f"({self.group.size},) finite")
+        t, g = self.table, self.group
+        T_maps = g.compose(g.compose(t.T_map[i], T), g.inverse(t.T_map[j]))  # T_mapkeep_mapother
+        m = self.maps.merge(t, int(t.map[i]), int(t.map[j]), T_maps)
+        return cast(EvidenceGrid, self.maps.grids[m])
+
+    def describe(self) -> dict[str, Any]:
+        """Intervals, segments and counts, ready for JSON; the same for the same seed."""
+        t = self.table
+        return {
+            "segments": [
+                {
+                    "index": int(i),
+                    "interval": [int(t.start[i]), int(t.end[i])],
+                    "seconds": [float(self.times[t.start[i]]), float(self.times[t.end[i]])],
+                    "kind": KINDS[t.kind[i]],
+                    "source": int(t.source[i]),
+                    "previous": int(t.previous[i]),
+                    "entry": t.entry[i].tolist(),
+                    "exit": t.exit[i].tolist(),
+                    "weight": float(t.weight[i]),
+                    "fitness": None if np.isnan(t.fitness[i]) else float(t.fitness[i]),
+                    "map": int(t.map[i]),
+                    "locked": self.maps.locked[t.map[i]],
+                }
+                for i in self.alive
+            ],
+            "intervals": self.intervals().tolist(),
+            "closed": len(self),
+            "pruned": self.pruned,
+            "matches": int(np.sum(t.alive & (t.kind == MATCH))),
+        }
+
+    # --- inside ----------------------------------------------------------------------------------------------
+
+    def _append(self, p: int, step: int, e: Entry, grid: EvidenceGrid, path: Array) -> int:
+        interval = (int(self.start[p]), step)
+        scans = {interval}
+        if e.kind != NEW:  # a copy: what its source held is in it, also if that was pruned since
+            scans |= self._scans_of(e.source)
+        m = self.maps.add(grid.copy(), frozenset(scans), grid.locked)
+        return self.table.append(
+            interval, e.kind, e.source, int(self.previous[p]), e.T_entry, path, m, e.fitness, e.covariance,
+            self.links[p], self.group.identity,
+        )  # fmt: skip
+
+    def _scans_of(self, source: int) -> frozenset[tuple[int, int]]:
+        """Intervals whose scans the map of a segment holds."""
+        return self.maps.scans[int(self.table.map[source])]
+
+    def _release(self, dead: Ints) -> int:
+        for i in dead.tolist():
+            self.table.alive[i] = False
+            self.table.paths[i] = None
+            self.maps.drop(int(self.table.map[i]))
+        self.pruned += len(dead)
+        return len(dead)
+
+    def _alive(self, index: int) -> int:
+        i = int(index)
+        if not 0 <= i < self.table.count:
+            raise DataError("there is no such segment", got=i, wanted=f"0 … {self.table.count - 1}")
+        if not self.table.alive[i]:
+            raise DataError(f"segment {i} was pruned: it fits no path of now")
+        return i
+
+    def _which(self, which: Iterable[int] | None, n: int, what: str) -> list[int]:
+        chosen = list(range(self.particles)) if which is None else [int(p) for p in which]
+        if len(chosen) != n or len(set(chosen)) != n or any(not 0 <= p < self.particles for p in chosen):
+            raise DataError(f"{what} do not belong to the particles", got=n, wanted=f"one each of {len(chosen)}")
+        return chosen
+
+    def _check_entry(self, p: int, e: Entry) -> Array:
+        """Raise if a particle cannot enter so; ``T_segment_source`` between the frames."""
+        T = np.asarray(e.T_entry, dtype=np.float64)
+        if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):
+            raise GeometryError(f"entry of particle {p} is no pose", got=T, wanted=f"({self.group.size},) finite")
+        if e.kind not in (NEW, MATCH, SAME) or (e.kind == NEW) != (e.source < 0):
+            raise DataError(
+                f"particle {p} enters impossibly", got=f"kind {e.kind}, source {e.source}", wanted="a source, or new"
+            )
+        if e.kind == NEW:
+            return self.group.identity
+        self._alive(e.source)
+        return np.array(self.table.T_map[e.source])
+
+    def _check_path(self, p: int, step: int, path: Any) -> Array:
+        e = self.entries[p]
+        if e is None:
+            raise DataError(f"particle {p} leaves a segment that it never entered", where=f"step {step}")
+        n = step - int(self.start[p]) + 1
+        if n < 2 or step >= len(self.times):
+            raise DataError(
+                f"segment of particle {p} is empty or ends outside the path", got=f"steps {self.start[p]} … {step}"
+            )
+        rows = np.ascontiguousarray(path, dtype=np.float64)
+        if rows.shape != (n, self.group.size) or not np.all(np.isfinite(rows)):
+            raise GeometryError(
+                f"path of particle {p} is impossible", got=rows.shape, wanted=f"({n}, {self.group.size}) finite poses"
+            )
+        if np.abs(self.group.log(self.group.between(e.T_entry, rows[0]))).max() > 1e-6:
+            raise GeometryError(
+                f"path of particle {p} does not begin where it entered: is it in the frame of the segment before?",
+                got=rows[0].tolist(),
+                wanted=np.asarray(e.T_entry).tolist(),
+            )
+        return rows

@@ -1,0 +1,146 @@
+"""Storage behind a SegMap: a table of segments in growing arrays, and the maps that segments may share."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.poses import Group
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.evidence.grid import EvidenceGrid
+
+Ints = npt.NDArray[np.int64]
+Scans = frozenset[tuple[int, int]]
+
+
+class Table:
+    """Segments as columns; rows beyond :attr:`count` are not used, and are not alive.
+
+    Parameters
+    ----------
+    size : int
+        Numbers of a pose.
+    """
+
+    _COLUMNS = ("start", "end", "kind", "source", "previous", "map", "weight", "fitness", "alive", "entry", "exit",
+                "link", "T_map")  # fmt: skip
+
+    def __init__(self, size: int) -> None:
+        self.count = 0
+        n = 16
+        self.start: Ints = np.zeros(n, np.int64)
+        self.end: Ints = np.full(n, -1, np.int64)
+        self.kind: Ints = np.zeros(n, np.int64)
+        self.source: Ints = np.full(n, -1, np.int64)
+        self.previous: Ints = np.full(n, -1, np.int64)
+        self.map: Ints = np.zeros(n, np.int64)
+        self.weight: Array = np.zeros(n)
+        self.fitness: Array = np.full(n, np.nan)
+        self.alive: npt.NDArray[np.bool_] = np.zeros(n, bool)
+        self.entry: Array = np.zeros((n, size))
+        self.exit: Array = np.zeros((n, size))
+        self.link: Array = np.zeros((n, size))  # T_segment_source: between the frames, of those with a source
+        self.T_map: Array = np.zeros((n, size))  # T_map_segment
+        self.paths: list[Array | None] = []
+        self.covariances: list[Array | None] = []
+
+    def append(
+        self,
+        interval: tuple[int, int],
+        kind: int,
+        source: int,
+        previous: int,
+        entry: Any,
+        path: Array,
+        map: int,
+        fitness: float,
+        covariance: Array | None,
+        link: Array,
+        T_map: Array,
+    ) -> int:
+        """A segment more, without weight; its index."""
+        i = self.count
+        if i == len(self.alive):
+            for name in self._COLUMNS:
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+        self.start[i], self.end[i] = interval
+        self.kind[i], self.source[i], self.previous[i], self.map[i] = kind, source, previous, map
+        self.weight[i], self.fitness[i], self.alive[i] = 0.0, fitness, True
+        self.entry[i], self.exit[i], self.link[i], self.T_map[i] = entry, path[-1], link, T_map
+        self.paths.append(path)
+        self.covariances.append(covariance)
+        self.count += 1
+        return i
+
+
+class Maps:
+    """Evidence grids that segments use, each until its last user is gone.
+
+    Parameters
+    ----------
+    group : Group
+    """
+
+    def __init__(self, group: Group) -> None:
+        self.group = group
+        self.grids: list[EvidenceGrid | None] = []
+        self.users: list[int] = []
+        self.locked: list[bool] = []
+        self.entered: list[int] = []
+        self.scans: list[Scans] = []
+
+    def add(self, grid: EvidenceGrid, scans: Scans, locked: bool) -> int:
+        """A map more, with one user; its number. The grid is kept as it is: it must be a handle of our own."""
+        if locked:
+            grid.lock()
+        self.grids.append(grid)
+        self.users.append(1)
+        self.locked.append(locked)
+        self.entered.append(0)
+        self.scans.append(scans)
+        return len(self.grids) - 1
+
+    def drop(self, m: int, users: int = 1) -> None:
+        """Users less; the grid goes with the last."""
+        self.users[m] -= users
+        if self.users[m] == 0:
+            cast(EvidenceGrid, self.grids[m]).release()
+            self.grids[m] = None
+
+    def lock(self, m: int) -> None:
+        """Localise only."""
+        cast(EvidenceGrid, self.grids[m]).lock()
+        self.locked[m] = True
+
+    def merge(self, table: Table, a: int, b: int, T_a_b: Array) -> int:
+        """One map of two; every user of the one that goes is moved to the other. See `SegMap.merge`."""
+        if a == b:
+            return a
+        if self.scans[a] < self.scans[b]:  # b went on from a: it is in there already
+            return self._move(table, a, b, self.group.inverse(T_a_b))
+        if not self.scans[b] <= self.scans[a]:
+            for s, e in sorted(self.scans[a]):
+                both = sorted((x, y) for x, y in self.scans[b] if x < e and s < y)
+                if both:
+                    raise DataError("the maps share scans, which would count twice", got=f"steps {both[0]}")
+            grid_b = cast(EvidenceGrid, self.grids[b])
+            cast(EvidenceGrid, self.grids[a]).merge(grid_b, T_a_b)
+            self.scans[a] |= self.scans[b]
+        return self._move(table, b, a, T_a_b)
+
+    def _move(self, table: Table, gone: int, to: int, T_to_gone: Array) -> int:
+        moved = np.flatnonzero((table.map == gone) & table.alive)
+        table.map[moved] = to
+        table.T_map[moved] = self.group.compose(
+            np.broadcast_to(T_to_gone, table.T_map[moved].shape), table.T_map[moved]
+        )
+        self.users[to] += len(moved)
+        self.entered[to] += self.entered[gone]
+        if self.locked[gone] and not self.locked[to]:
+            self.lock(to)
+        self.drop(gone, len(moved))
+        return to
