@@ -2,32 +2,22 @@
 
 ``log.json`` holds name, meta, counts and the list of streams (name, kind, file, records); ``truth.npz`` holds the
 truth where it is known. Every number comes back bit for bit. Nothing is pickled; ``log.json`` is written last, so a
-folder without it is an unfinished log.
+folder without it is an unfinished log. The kinds of streams are those of :mod:`graphslam.io.log_kinds`.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError, GraphSlamError
 from graphslam.core.log import SensorLog, Truth
-from graphslam.core.records import (
-    AckermannGeometry,
-    Gps,
-    LandmarkObservations,
-    LaserScans,
-    Odometry,
-    SteeringControls,
-    VelocityControls,
-)
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.log_kinds import KINDS, Arrays
 
 LOG_FORMAT = "graphslam.log/1"
 STREAM_FORMAT = "graphslam.stream/1"
@@ -35,61 +25,14 @@ TRUTH_FORMAT = "graphslam.truth/1"
 INDEX_NAME = "log.json"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
-Arrays = Mapping[str, Any]
-
-# kind -> (class, arrays stored under the field's own name); what is not a plain array is packed below
-_FIELDS: dict[str, tuple[type, tuple[str, ...]]] = {
-    "laser-scans": (LaserScans, ("times", "ranges", "bearings", "T_base_sensor")),
-    "steering-controls": (SteeringControls, ("times", "speed", "steering")),
-    "velocity-controls": (VelocityControls, ("times", "speed", "yaw_rate")),
-    "odometry": (Odometry, ("times", "increments", "covariances")),
-    "gps": (Gps, ("times", "positions", "sigma", "lever")),
-    "landmark-observations": (
-        LandmarkObservations,
-        ("times", "offsets", "ranges", "bearings", "sigmas", "T_base_sensor"),
-    ),
-}
-
-
-def _extra_arrays(stream: Any) -> dict[str, Any]:
-    """Fields that are no arrays, as arrays."""
-    match stream:
-        case LaserScans():
-            return {"max_range": np.float64(stream.max_range)}
-        case SteeringControls():
-            g = stream.geometry
-            return {
-                "wheelbase": np.float64(g.wheelbase),
-                "encoder_offset": np.float64(g.encoder_offset),
-                "model": np.str_(g.model),
-            }
-        case LandmarkObservations():
-            extra = {"max_range": np.float64(stream.max_range), "field_of_view": np.array(stream.field_of_view)}
-            return extra if stream.ids is None else {**extra, "ids": stream.ids}
-        case _:
-            return {}
-
-
-def _extra_fields(kind: str, a: Arrays) -> dict[str, Any]:
-    """Inverse of :func:`_extra_arrays`."""
-    if kind == "laser-scans":
-        return {"max_range": float(a["max_range"])}
-    if kind == "steering-controls":
-        geometry = AckermannGeometry(
-            wheelbase=float(a["wheelbase"]), encoder_offset=float(a["encoder_offset"]), model=str(a["model"])
-        )
-        return {"geometry": geometry}
-    if kind == "landmark-observations":
-        low, high = (float(v) for v in a["field_of_view"])
-        return {"max_range": float(a["max_range"]), "field_of_view": (low, high), "ids": a.get("ids")}
-    return {}
-
 
 def _kind_of(stream: Any, where: str) -> str:
-    for kind, (cls, _) in _FIELDS.items():
-        if type(stream) is cls:
-            return kind
-    raise FormatError("stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=_FIELDS)
+    for name, kind in KINDS.items():
+        if type(stream) is kind.cls:
+            return name
+    raise FormatError(
+        "stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=", ".join(KINDS)
+    )
 
 
 def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
@@ -109,9 +52,8 @@ def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
         if not _SAFE_NAME.fullmatch(name) or name.lower() == "truth":
             raise FormatError("stream name is no file name", where=where, wanted="letters, digits, _ . - (not truth)")
         kind = _kind_of(stream, where)
-        arrays = {f: getattr(stream, f) for f in _FIELDS[kind][1]}
         header = {"format": STREAM_FORMAT, "kind": kind}
-        write_npz(root / f"{name}.npz", {**header, **arrays, **_extra_arrays(stream)})
+        write_npz(root / f"{name}.npz", {**header, **KINDS[kind].arrays(stream)})
         entries.append({"name": name, "kind": kind, "file": f"{name}.npz", "records": len(stream.times)})
     if log.truth is not None:
         write_npz(root / "truth.npz", _truth_arrays(log.truth))
@@ -147,11 +89,11 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
         name, file, kind, records = (_get(entry, k, t, where) for k, t in _ENTRY)
         path = _inside(root, file, where)
         arrays = read_npz(path, fmt=STREAM_FORMAT)
-        if kind not in _FIELDS or str(arrays.get("kind")) != kind:
+        if kind not in KINDS or str(arrays.get("kind")) != kind:
             raise FormatError(
                 "unknown stream kind", where=str(path), got=f"{arrays.get('kind')} listed as {kind!r}", wanted=kind
             )
-        streams[name] = _build(str(path), lambda a=arrays, k=kind: _stream(k, a))  # type: ignore[misc]
+        streams[name] = _build(str(path), lambda a=arrays, k=kind: KINDS[k].stream(a))  # type: ignore[misc]
         if len(streams[name].times) != records:
             raise FormatError("wrong number of records", where=str(path), got=len(streams[name].times), wanted=records)
     truth = None
@@ -169,11 +111,6 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
 
 
 _ENTRY: tuple[tuple[str, type], ...] = (("name", str), ("file", str), ("kind", str), ("records", int))
-
-
-def _stream(kind: str, arrays: Arrays) -> Any:
-    cls, names = _FIELDS[kind]
-    return cls(**{n: arrays[n] for n in names}, **_extra_fields(kind, arrays))
 
 
 def _truth_arrays(truth: Truth) -> dict[str, Any]:

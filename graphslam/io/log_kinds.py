@@ -1,0 +1,144 @@
+"""Kinds of streams that a log on disk can hold, and how each becomes arrays and a stream again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.imu import Imu, ImuNoise
+from graphslam.core.point_clouds import ArrayClouds, PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import (
+    AckermannGeometry,
+    Gps,
+    LandmarkObservations,
+    LaserScans,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+)
+from graphslam.core.trajectory import Trajectory
+
+Arrays = Mapping[str, Any]
+
+
+def _nothing(_: Any) -> dict[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How streams of one class are stored.
+
+    Parameters
+    ----------
+    cls : type
+    fields : tuple of str
+        Arrays stored under the field's own name.
+    pack : callable
+        Stream → further arrays.
+    unpack : callable
+        Arrays → further arguments of the class.
+    """
+
+    cls: type
+    fields: tuple[str, ...]
+    pack: Callable[[Any], dict[str, Any]] = _nothing
+    unpack: Callable[[Arrays], dict[str, Any]] = _nothing
+
+    def arrays(self, stream: Any) -> dict[str, Any]:
+        """The stream as arrays by name."""
+        return {**{f: getattr(stream, f) for f in self.fields}, **self.pack(stream)}
+
+    def stream(self, arrays: Arrays) -> Any:
+        """Inverse of :meth:`arrays`; what the class refuses is raised as it is."""
+        return self.cls(**{f: arrays[f] for f in self.fields}, **self.unpack(arrays))
+
+
+def _pack_steering(s: SteeringControls) -> dict[str, Any]:
+    g = s.geometry
+    return {
+        "wheelbase": np.float64(g.wheelbase),
+        "encoder_offset": np.float64(g.encoder_offset),
+        "model": np.str_(g.model),
+    }
+
+
+def _unpack_steering(a: Arrays) -> dict[str, Any]:
+    return {
+        "geometry": AckermannGeometry(
+            wheelbase=float(a["wheelbase"]), encoder_offset=float(a["encoder_offset"]), model=str(a["model"])
+        )
+    }
+
+
+def _pack_landmarks(s: LandmarkObservations) -> dict[str, Any]:
+    extra = {"max_range": np.float64(s.max_range), "field_of_view": np.array(s.field_of_view)}
+    return extra if s.ids is None else {**extra, "ids": s.ids}
+
+
+def _unpack_landmarks(a: Arrays) -> dict[str, Any]:
+    low, high = (float(v) for v in a["field_of_view"])
+    return {"max_range": float(a["max_range"]), "field_of_view": (low, high), "ids": a.get("ids")}
+
+
+def _pack_imu(s: Imu) -> dict[str, Any]:
+    noise = {f"noise_{f.name}": np.float64(getattr(s.noise, f.name)) for f in dataclasses.fields(ImuNoise)}
+    return noise if s.attitude is None else {**noise, "attitude": s.attitude}
+
+
+def _unpack_imu(a: Arrays) -> dict[str, Any]:
+    noise = ImuNoise(**{f.name: float(a[f"noise_{f.name}"]) for f in dataclasses.fields(ImuNoise)})
+    return {"noise": noise, "attitude": a.get("attitude")}
+
+
+def _pack_clouds(s: PointClouds) -> dict[str, Any]:
+    """Decodes every scan of the stream, and no other of its source."""
+    clouds = [np.asarray(c, dtype=np.float64).reshape(-1, 3) for c in s]
+    offsets = np.concatenate([[0], np.cumsum([len(c) for c in clouds])]).astype(np.int64)
+    return {"points": np.concatenate(clouds) if clouds else np.zeros((0, 3)), "offsets": offsets}
+
+
+def _unpack_clouds(a: Arrays) -> dict[str, Any]:
+    return {"source": ArrayClouds(a["points"], a["offsets"])}
+
+
+def _floats(*names: str) -> dict[str, Callable[[Any], dict[str, Any]]]:
+    """Packing of fields that are single numbers."""
+    return {
+        "pack": lambda s: {n: np.float64(getattr(s, n)) for n in names},
+        "unpack": lambda a: {n: float(a[n]) for n in names},
+    }
+
+
+KINDS: dict[str, Kind] = {
+    "laser-scans": Kind(LaserScans, ("times", "ranges", "bearings", "T_base_sensor"), **_floats("max_range")),
+    "range-scans": Kind(
+        RangeScans,
+        ("times", "ranges", "directions", "beam_times", "T_base_mount", "spin", "spin_rate"),
+        **_floats("max_range", "sigma"),
+    ),
+    "point-clouds": Kind(PointClouds, ("times", "origin", "T_base_sensor"), _pack_clouds, _unpack_clouds),
+    "imu": Kind(Imu, ("times", "angular_rate", "specific_force", "T_base_imu"), _pack_imu, _unpack_imu),
+    "steering-controls": Kind(SteeringControls, ("times", "speed", "steering"), _pack_steering, _unpack_steering),
+    "velocity-controls": Kind(VelocityControls, ("times", "speed", "yaw_rate")),
+    "odometry": Kind(Odometry, ("times", "increments", "covariances")),
+    "gps": Kind(Gps, ("times", "positions", "sigma", "lever")),
+    "landmark-observations": Kind(
+        LandmarkObservations,
+        ("times", "offsets", "ranges", "bearings", "sigmas", "T_base_sensor"),
+        _pack_landmarks,
+        _unpack_landmarks,
+    ),
+    "trajectory": Kind(
+        Trajectory,
+        ("times", "poses"),
+        lambda s: {} if s.covariances is None else {"covariances": s.covariances},
+        lambda a: {"covariances": a.get("covariances")},
+    ),
+}
+"""By the name that ``log.json`` gives."""

@@ -1,0 +1,287 @@
+"""A robot drives its way through a world: where it is, and how it moves, at any time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.se3 import quat_multiply, quat_normalize
+from graphslam.core.trajectory import Trajectory
+from graphslam.sim.route import Route
+
+if TYPE_CHECKING:
+    from graphslam.sim.raycast import RayCaster
+    from graphslam.sim.world import World
+
+_STEP = 0.02  # m between the samples of a way
+_FLOOR_ABOVE = 0.5  # m: rays down to the floor begin so high above the way
+_FLOOR_OFF = 0.2  # m: what lies farther from the way's height is not the floor under a wheel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveConfig:
+    """How a robot drives."""
+
+    rate: float = 100.0
+    """Poses per second of the trajectory [Hz]."""
+    wheelbase: float = 0.6
+    """Length over which changes of slope and curvature are smoothed [m]."""
+    track: float = 0.5
+    """Distance of left and right wheels [m]: what lies under them gives the roll."""
+    ramp: float = 2.0
+    """Time from rest to cruise, and back at the end [s]."""
+    most_turn_rate: float = 0.6
+    """Fastest yaw rate [rad/s]; tighter corners are driven more slowly."""
+    stand: float = 0.0
+    """Time at rest before it starts [s]."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            least_ok = value >= 0 if name in ("wheelbase", "stand") else value > 0
+            if not (np.isfinite(value) and least_ok):
+                raise ConfigError(f"drive: {name} = {value}; wanted a number above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """A way over the floor, sampled evenly along its length.
+
+    Parameters
+    ----------
+    step : float
+        Between samples [m].
+    positions : (n, 3)
+        Of the base, on the floor [m].
+    yaw, pitch, roll : (n,)
+        Attitude, ``R_z(yaw) R_y(pitch) R_x(roll)`` [rad]; the yaw is not wrapped.
+    """
+
+    step: float
+    positions: Array
+    yaw: Array
+    pitch: Array
+    roll: Array
+
+
+def sample_way(route: Route) -> Way:
+    """Samples of a route; pitch is its slope, roll is 0."""
+    s = route.every(_STEP)
+    positions = route.positions(s)
+    rise = np.gradient(positions[:, 2], s)  # central: a slope that jumps at a sample would be half a sample late
+    return Way(
+        step=float(s[1]),
+        positions=positions,
+        yaw=np.unwrap(route.headings(s)),
+        pitch=-np.arcsin(np.clip(rise, -1.0, 1.0)),
+        roll=np.zeros(len(s)),
+    )
+
+
+def smooth_way(way: Way, width: float) -> Way:
+    """The same way without corners in slope or curvature: everything is averaged over ``width`` metres.
+
+    A robot stands on the floor with a wheelbase: where the slope changes, its pitch changes over that length. The
+    average is a triangle (two running means), so that pitch and yaw have a continuous rate.
+    """
+    half = round(0.5 * width / way.step) // 2 * 2 + 1  # samples of one running mean, odd
+    if half < 3:
+        return way
+    pad = 2 * half
+
+    def smooth(a: Array, *, straight: bool = False) -> Array:
+        first, last = np.repeat(a[:1], pad, axis=0), np.repeat(a[-1:], pad, axis=0)
+        if straight:  # go on as the way begins and ends, or the mean would pull its ends in
+            k = np.arange(1, pad + 1)[:, None]
+            first, last = first - (k * (a[1] - a[0]))[::-1], last + k * (a[-1] - a[-2])
+        wide = np.concatenate([first, a, last])
+        for _ in range(2):
+            wide = uniform_filter1d(wide, half, axis=0, mode="nearest")
+        return np.asarray(wide[pad:-pad], dtype=np.float64)
+
+    return Way(
+        step=way.step,
+        positions=smooth(way.positions, straight=True),
+        yaw=smooth(way.yaw),
+        pitch=smooth(way.pitch),
+        roll=smooth(way.roll),
+    )
+
+
+class Motion:
+    """Position, attitude and their derivatives along a way, at any time between 0 and ``duration``.
+
+    Parameters
+    ----------
+    way : Way
+        Smooth (:func:`smooth_way`).
+    speed : float
+        Cruise [m/s].
+    config : DriveConfig
+
+    Raises
+    ------
+    DataError
+        An impossible speed.
+    """
+
+    def __init__(self, way: Way, speed: float, config: DriveConfig) -> None:
+        if not (np.isfinite(speed) and speed > 0):
+            raise DataError("speed is impossible", got=speed, wanted="> 0 m/s")
+        self.config = config
+        u = np.arange(len(way.yaw)) * way.step
+        columns = np.column_stack([way.positions, way.yaw, way.pitch, way.roll])
+        self._way: BSpline = make_interp_spline(u, columns, k=5)
+        self._way1, self._way2 = self._way.derivative(1), self._way.derivative(2)
+
+        # cruise time τ(u) = ∫ du / pace, the pace less than the speed where the way turns fast
+        turning = np.abs(self._way1(u)[:, 3])
+        pace = np.minimum(speed, config.most_turn_rate / np.maximum(turning, 1e-9))
+        window = max(round(1.0 / way.step), 1)
+        pace = minimum_filter1d(pace, window, mode="nearest")
+        for _ in range(2):  # the running means stay inside what the minimum has widened: never faster than allowed
+            pace = uniform_filter1d(pace, max(window // 2, 1), mode="nearest")
+        slowness = 1.0 / pace
+        tau = np.concatenate([[0.0], np.cumsum(0.5 * (slowness[1:] + slowness[:-1]) * way.step)])
+        self._cruise = float(tau[-1])
+        self._along: BSpline = make_interp_spline(tau, u, k=3)
+        self._along1, self._along2 = self._along.derivative(1), self._along.derivative(2)
+        self.length = float(u[-1])
+        self._ramp = min(config.ramp, self._cruise)
+        self.duration = config.stand + self._cruise + self._ramp
+
+    def _clock(self, t: Array) -> tuple[Array, Array, Array]:
+        """Cruise time, and its two derivatives, at times: a smooth start and a smooth end of ``ramp`` seconds."""
+        if not np.all((t >= -1e-9) & (t <= self.duration + 1e-9)):
+            raise DataError(
+                "time outside the drive", got=f"{t.min():.3f} … {t.max():.3f}", wanted=f"0 … {self.duration:.3f}"
+            )
+        r = self._ramp
+        s = np.clip(t - self.config.stand, 0.0, self._cruise + r)
+        a, b = np.clip(s / r, 0.0, 1.0), np.clip((self._cruise + r - s) / r, 0.0, 1.0)  # shares of the two ramps
+        # rate of the clock: smoothstep 3x² - 2x³ of either share; its integral is x³ - x⁴/2, which ends at 1/2
+        fa, fb = (3.0 - 2.0 * a) * a**2, (3.0 - 2.0 * b) * b**2
+        rate = fa + fb - 1.0
+        acceleration = (6.0 * a * (1.0 - a) - 6.0 * b * (1.0 - b)) / r
+        before = r * (a**3 - 0.5 * a**4) + np.maximum(s - r, 0.0)
+        lost = r * ((1.0 - b) - (0.5 - (b**3 - 0.5 * b**4)))  # what the ramp at the end falls short of the cruise
+        return before - lost, rate, acceleration
+
+    def _progress(self, t: ArrayLike) -> tuple[Array, Array, Array]:
+        """Length driven and its derivatives by time."""
+        tau, d1, d2 = self._clock(np.asarray(t, dtype=np.float64))
+        tau = np.clip(tau, 0.0, self._cruise)
+        e1 = self._along1(tau)
+        return np.clip(self._along(tau), 0.0, self.length), e1 * d1, self._along2(tau) * d1**2 + e1 * d2
+
+    def poses(self, t: ArrayLike) -> Array:
+        """``T_world_base`` ``(n, 7)`` at times ``(n,)`` [s]."""
+        w = self._way(self._progress(t)[0])
+        return np.concatenate([w[..., :3], euler_to_quat(w[..., 3], w[..., 4], w[..., 5])], -1)
+
+    def velocities(self, t: ArrayLike) -> Array:
+        """World velocities of the base ``(n, 3)`` [m/s]."""
+        u, du, _ = self._progress(t)
+        return self._way1(u)[..., :3] * du[..., None]
+
+    def accelerations(self, t: ArrayLike) -> Array:
+        """World accelerations of the base ``(n, 3)`` [m/s²]."""
+        u, du, ddu = self._progress(t)
+        return self._way2(u)[..., :3] * du[..., None] ** 2 + self._way1(u)[..., :3] * ddu[..., None]
+
+    def rotation(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Angular rates [rad/s] and angular accelerations [rad/s²] in the base frame, each ``(n, 3)``."""
+        u, du, ddu = self._progress(t)
+        w, w1 = self._way(u)[..., 3:], self._way1(u)[..., 3:]
+        d1 = w1 * du[..., None]
+        d2 = self._way2(u)[..., 3:] * du[..., None] ** 2 + w1 * ddu[..., None]
+        pitch, roll = w[..., 1], w[..., 2]
+        (yaw1, pitch1, roll1), (yaw2, pitch2, roll2) = np.moveaxis(d1, -1, 0), np.moveaxis(d2, -1, 0)
+        sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
+        # ω = (φ' - ψ' sin θ, θ' cos φ + ψ' sin φ cos θ, -θ' sin φ + ψ' cos φ cos θ), and its derivative
+        rate = np.stack([roll1 - yaw1 * sp, pitch1 * cr + yaw1 * sr * cp, -pitch1 * sr + yaw1 * cr * cp], -1)
+        change = np.stack(
+            [
+                roll2 - yaw2 * sp - yaw1 * pitch1 * cp,
+                pitch2 * cr - pitch1 * roll1 * sr + yaw2 * sr * cp + yaw1 * (roll1 * cr * cp - pitch1 * sr * sp),
+                -pitch2 * sr - pitch1 * roll1 * cr + yaw2 * cr * cp - yaw1 * (roll1 * sr * cp + pitch1 * cr * sp),
+            ],
+            -1,
+        )
+        return rate, change
+
+    def trajectory(self) -> Trajectory:
+        """The drive at ``config.rate``, from 0 up to the last whole period."""
+        n = int(np.floor(self.duration * self.config.rate + 1e-9)) + 1
+        times = np.arange(n) / self.config.rate
+        return Trajectory(times, self.poses(times))
+
+
+def euler_to_quat(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
+    """Quaternions ``(..., 4)`` (xyzw) of ``R_z(yaw) R_y(pitch) R_x(roll)``."""
+    parts = []
+    for axis, angle in ((2, yaw), (1, pitch), (0, roll)):
+        half = 0.5 * np.asarray(angle, dtype=np.float64)
+        q = np.zeros((*half.shape, 4))
+        q[..., axis], q[..., 3] = np.sin(half), np.cos(half)
+        parts.append(q)
+    return quat_normalize(quat_multiply(quat_multiply(parts[0], parts[1]), parts[2]))
+
+
+def roll_by_floor(way: Way, caster: RayCaster, track: float) -> Way:
+    """The way with the roll of the floor under the wheels of a robot ``track`` metres wide.
+
+    Rays go down on either side of the way. Where one of them meets no floor near the height of the way, the roll stays
+    what it is.
+    """
+    left = np.column_stack([-np.sin(way.yaw), np.cos(way.yaw), np.zeros_like(way.yaw)])
+    heights = []
+    for side in (0.5, -0.5):
+        begin = way.positions + side * track * left + [0.0, 0.0, _FLOOR_ABOVE]
+        rays = np.hstack([begin, np.broadcast_to([0.0, 0.0, -1.0], begin.shape)])
+        heights.append(begin[:, 2] - caster.ranges(rays))
+    off = np.abs(np.array(heights) - way.positions[:, 2])
+    seen = np.all(off < _FLOOR_OFF, axis=0)  # NaN, where no ray hit, is not less
+    with np.errstate(invalid="ignore"):
+        roll = np.where(seen, np.arctan2(heights[0] - heights[1], track), way.roll)
+    return replace(way, roll=roll)
+
+
+def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> Motion:
+    """The motion of a robot that drives through a world on its way; see :func:`drive`."""
+    way = sample_way(world.route())
+    if caster is not None:
+        way = roll_by_floor(way, caster, config.track)
+    return Motion(smooth_way(way, config.wheelbase), world.speed, config)
+
+
+def drive(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> Trajectory:
+    """Drive through a world: ``T_world_base(t)``, the base on the floor between the wheels.
+
+    Straight lines and arcs over the waypoints, smoothed over the wheelbase; from rest to rest, more slowly where the
+    way turns sharply. Pitch follows the way; roll follows the floor where a ray caster shows it.
+
+    Parameters
+    ----------
+    world : World
+    config : DriveConfig
+    caster : RayCaster, optional
+        Of the world's mesh.
+
+    Returns
+    -------
+    Trajectory
+        In the frame of the world, ``config.rate`` poses a second.
+
+    Raises
+    ------
+    GeometryError, DataError
+        A way or a speed that cannot be driven.
+    """
+    return drive_motion(world, config, caster).trajectory()
