@@ -123,6 +123,16 @@ class Ancestry:
             out[k] = self._poses[k][row]
         return out
 
+    def recent(self, steps: int) -> Array:
+        """As :meth:`paths`, of the last ``steps`` steps only: ``(steps, N, width)``."""
+        out = np.empty((min(steps, len(self)), self._n, self._width))
+        for k, row in self._backwards():
+            j = k - (len(self) - len(out))
+            if j < 0:
+                break
+            out[j] = self._poses[k][row]
+        return out
+
     def path(self, particle: int) -> Array:
         """Poses of one particle's past ``(steps, width)``."""
         out = np.empty((len(self), self._width))

@@ -38,6 +38,8 @@ def test_ancestry_equals_the_slow_twin(seed: int, prune_every: int) -> None:
     assert fast.survivors().tolist() == slow.survivors()
     assert fast.coalescence() == slow.coalescence()
     assert np.array_equal(fast.path(n - 1), slow.paths()[:, n - 1])
+    for late in (1, 9, 40, 99):
+        assert np.array_equal(fast.recent(late), slow.paths()[-late:])
     edges, alive = fast.links()
     assert {tuple(e) for e in edges[alive].tolist()} == slow.living_edges()
     assert {tuple(e) for e in edges.tolist()} <= set(slow.edges)

@@ -1,0 +1,76 @@
+"""The look-ahead window: beams of the next seconds, seen from where the body stands now (SegSLAM section 3.2).
+
+The filter runs a few seconds behind the sensors. What lies between is placed by dead reckoning, which is good enough
+for so short a time, and serves twice: a map that predicts it badly has ended (A8), and an older map that explains it
+may be the same place (A9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frontends.grid_weights import spread
+from frontends.segslam.poses import group_of
+from frontends.segslam.segmentation import Window, gather_window
+from frontends.steps import Steps
+from graphslam.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ahead:
+    """What lies ahead of a step.
+
+    Parameters
+    ----------
+    step : int
+        The step of now.
+    last : int
+        The last step whose beams are in the window; ``step`` where there is none.
+    full : bool
+        The log reaches to the end of the window. A match of less is not to be believed: with half of its surroundings
+        a place looks like others.
+    window : Window
+    """
+
+    step: int
+    last: int
+    full: bool
+    window: Window
+
+    def source(self, most: int, radius: float) -> Array:
+        """Points ``(k, dim)`` that beams met within a radius of the body, at most so many, evenly spread."""
+        p = self.window.points
+        rows = np.flatnonzero(np.linalg.norm(p, axis=1) <= radius)
+        return p[rows[spread(len(rows), most)]]
+
+
+def look_ahead(steps: Steps, step: int, seconds: float, *, most: int = 0) -> Ahead:
+    """The window ahead of a step: what beams met in the steps after it, up to so many seconds later.
+
+    Parameters
+    ----------
+    steps : Steps
+    step : int
+    seconds : float
+        W.
+    most : int
+        Beams in it, evenly thinned; 0 = all.
+    """
+    slack = 1e-6  # half a step's rounding of the clock takes no step off
+    until = float(steps.times[step]) + seconds
+    last = int(np.searchsorted(steps.times, until + slack, side="right")) - 1
+    rows = range(step + 1, last + 1)
+    window = gather_window(
+        steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range, most=most
+    )
+    return Ahead(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
+
+
+def bring_up_to_date(steps: Steps, poses: Array, step: int, target: int) -> Array:
+    """Poses ``(n, 7)`` or ``(n, 3)`` at a later step, by dead reckoning from where the filter is."""
+    group, out = group_of(poses), np.asarray(poses)
+    for k in range(step + 1, target + 1):
+        out = group.compose(out, np.broadcast_to(steps.odometry.increments[k], out.shape))
+    return out
