@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from graphslam.core.errors import ConfigError
+from graphslam.registration.config import RegistrationConfig
 
 
 def _check(config: Any, part: str, *, positive: tuple[str, ...] = (), unit: tuple[str, ...] = ()) -> None:
@@ -105,8 +106,8 @@ class WinnowConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SearchConfig:
-    """The correlative search that brings registration within its reach, and the registration itself."""
+class CandidateSearch:
+    """Where a candidate is searched, and with what: drift at a closure exceeds what registration can capture."""
 
     grid: float = 0.4
     """Steps of the search in position [m]."""
@@ -130,16 +131,12 @@ class SearchConfig:
     """Points of the look-ahead window, at most."""
     cloud_level: int = 1
     """Cells of 2**level voxels, in which a map's occupied voxels are gathered for matching."""
-    coarse: float = 1.0
-    """First radius of the registration [m]."""
-    fine: float = 0.5
-    """Second one [m]."""
 
     def __post_init__(self) -> None:
         _check(
             self,
             "search",
-            positive=("grid", "yaw_step", "max_radius", "starts", "source_radius", "source_points", "coarse", "fine"),
+            positive=("grid", "yaw_step", "max_radius", "starts", "source_radius", "source_points"),
         )
 
     def yaw_width(self, length: float) -> float:
@@ -153,12 +150,6 @@ class ChoiceConfig:
 
     every: float = 4.0
     """Time between attempts [s]; each needs a full look-ahead window."""
-    fitness: float = 0.85
-    """A match explains at least this share of the points."""
-    degeneracy: float = 0.006
-    """Least over greatest eigenvalue of the translational Hessian: below, the place does not fix the position."""
-    tilt: float = math.radians(4.0)
-    """The z axes enclose no more than this [rad]."""
     height: float = 1.6
     """The match is no farther above or below the prediction [m]."""
     shift: float = 2.5
@@ -175,12 +166,10 @@ class ChoiceConfig:
     """Weight of the spread of localisation [m], in the same way."""
     null_weight: float = 0.05
     """Weight of no match at all, which is always in the draw."""
-    registration_sigma: float = 0.1
+    position_sigma: float = 0.1
     """Standard deviations of an accepted match: position [m] …"""
-    registration_angle: float = 0.012
+    angle_sigma: float = 0.012
     """… and angles [rad], added to the registration's own covariance."""
-    registration_scale: float = 10.0
-    """Factor on the registration's own covariance: points of one window are not independent."""
     method: Literal["registration", "localisation", "both"] = "registration"
     """What judges a match (eq. 18, eq. 19)."""
 
@@ -189,10 +178,10 @@ class ChoiceConfig:
             self,
             "choice",
             positive=(
-                "every", "shift", "fitness_sigma", "error_sigma", "spread_sigma", "null_weight",
-                "registration_sigma", "registration_angle", "registration_scale",
+                "every", "shift", "fitness_sigma", "error_sigma", "spread_sigma", "null_weight", "position_sigma",
+                "angle_sigma",
             ),
-            unit=("fitness", "margin"),
+            unit=("margin",),
         )  # fmt: skip
         if self.method not in ("registration", "localisation", "both"):
             raise ConfigError(f"choice.method = {self.method!r}; known: registration, localisation, both")
@@ -248,8 +237,10 @@ class SegSlamConfig:
     """When a segment ends."""
     winnowing: WinnowConfig = field(default_factory=WinnowConfig)
     """Which segments are tried."""
-    search: SearchConfig = field(default_factory=SearchConfig)
-    """How a match is searched and registered."""
+    search: CandidateSearch = field(default_factory=CandidateSearch)
+    """How a match is searched."""
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    """How it is registered, with the gates of fitness, degeneracy and tilt."""
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
     """Which matches are believed."""
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)

@@ -19,7 +19,8 @@ import numpy.typing as npt
 from frontends.segslam.poses import SE2, SE3, Group, normalised
 from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment
 from frontends.segslam.store import Maps, Table
-from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.errors import CovarianceError, DataError, GeometryError
+from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
@@ -321,23 +322,7 @@ class SegMap:
         """Intervals, segments and counts, ready for JSON; the same for the same seed."""
         t = self.table
         return {
-            "segments": [
-                {
-                    "index": int(i),
-                    "interval": [int(t.start[i]), int(t.end[i])],
-                    "seconds": [float(self.times[t.start[i]]), float(self.times[t.end[i]])],
-                    "kind": KINDS[t.kind[i]],
-                    "source": int(t.source[i]),
-                    "previous": int(t.previous[i]),
-                    "entry": t.entry[i].tolist(),
-                    "exit": t.exit[i].tolist(),
-                    "weight": float(t.weight[i]),
-                    "fitness": None if np.isnan(t.fitness[i]) else float(t.fitness[i]),
-                    "map": int(t.map[i]),
-                    "locked": self.maps.locked[t.map[i]],
-                }
-                for i in self.alive
-            ],
+            "segments": [t.row(i, self.times) | {"locked": self.maps.locked[t.map[i]]} for i in self.alive.tolist()],
             "intervals": self.intervals().tolist(),
             "closed": len(self),
             "pruned": self.pruned,
@@ -395,6 +380,10 @@ class SegMap:
         if e.kind == NEW:
             return self.group.identity
         self._alive(e.source)
+        if e.kind == MATCH:  # it becomes a factor some day, and none goes without
+            if e.covariance is None:
+                raise CovarianceError(f"particle {p} enters segment {e.source} by a match without a covariance")
+            check_covariance(e.covariance, what=f"covariance of a match into segment {e.source}", dim=self.group.dof)
         return np.array(self.table.T_map[e.source])
 
     def _check_path(self, p: int, step: int, path: Any) -> Array:

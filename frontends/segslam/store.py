@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from frontends.segslam.poses import Group
+from frontends.segslam.segment import KINDS
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
@@ -75,6 +76,22 @@ class Table:
         self.covariances.append(covariance)
         self.count += 1
         return i
+
+    def row(self, i: int, times: Array) -> dict[str, Any]:
+        """A segment in words and numbers, ready for JSON; ``times (n,)`` of the steps [s]."""
+        return {
+            "index": i,
+            "interval": [int(self.start[i]), int(self.end[i])],
+            "seconds": [float(times[self.start[i]]), float(times[self.end[i]])],
+            "kind": KINDS[self.kind[i]],
+            "source": int(self.source[i]),
+            "previous": int(self.previous[i]),
+            "entry": self.entry[i].tolist(),
+            "exit": self.exit[i].tolist(),
+            "weight": float(self.weight[i]),
+            "fitness": None if np.isnan(self.fitness[i]) else float(self.fitness[i]),
+            "map": int(self.map[i]),
+        }
 
 
 class Maps:

@@ -1,0 +1,214 @@
+"""Which match is believed (A9): gates, weights, and a draw that always holds the null match.
+
+A false match does more harm than ten right ones do good, and nothing on top repairs it; so the gates are strict. What
+passes them is still drawn, not decided: particles hold several topologies at once, and those that chose wrongly lose
+their weight later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.config import ChoiceConfig
+from frontends.segslam.localisation import Localisation
+from frontends.segslam.poses import group_of
+from frontends.segslam.segmap import MATCH, Entry
+from graphslam.core.geometry import Array
+from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.register import Registration, gate
+
+NULL = -1
+"""The draw's answer for no match."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """One registration of what a particle sees into an older map.
+
+    Parameters
+    ----------
+    segment : int
+        The older segment.
+    registration : Registration
+        ``T_map_body`` with its quality.
+    T_prior : (7,) or (3,)
+        Where the map sample puts the body in that map.
+    sigma : float
+        σ of the path-length model at that place [m].
+    localisation : Localisation or None
+        What the throw-away particle filter says of it.
+    """
+
+    segment: int
+    registration: Registration
+    T_prior: Array
+    sigma: float
+    localisation: Localisation | None = None
+
+    @property
+    def T(self) -> Array:
+        """The match, ``T_map_body``; of the localisation where there is one."""
+        return self.registration.T_target_source if self.localisation is None else self.localisation.pose
+
+    @property
+    def fitness(self) -> float:
+        """Share of the points it explains."""
+        return self.registration.best_fitness
+
+    @property
+    def shift(self) -> float:
+        """From the prediction to the match, horizontally [m]."""
+        return float(np.hypot(*(self.T[:2] - np.asarray(self.T_prior)[:2])))
+
+    @property
+    def height(self) -> float:
+        """From the prediction to the match, vertically [m]; 0 in two dimensions."""
+        return float(abs(self.T[2] - self.T_prior[2])) if len(self.T) == 7 else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """What became of the proposals of one particle.
+
+    Parameters
+    ----------
+    proposals : tuple of m Proposal
+    why : tuple of m str
+        The gates each fails, in words; empty for those that may be drawn.
+    weights : (m,)
+        Unnormalised (eq. 18, 19); 0 of those that fail.
+    margins : (m,)
+        Fitness less that of the best other place in the same map; 1 where there is none.
+    null : float
+        Weight of no match.
+    """
+
+    proposals: tuple[Proposal, ...]
+    why: tuple[str, ...]
+    weights: Array
+    margins: Array
+    null: float
+
+    @property
+    def accepted(self) -> npt.NDArray[np.int64]:
+        """Those that may be drawn."""
+        return np.flatnonzero(self.weights > 0).astype(np.int64)
+
+    @property
+    def probabilities(self) -> Array:
+        """Of the proposals, and last of no match ``(m + 1,)``."""
+        p = np.append(self.weights, self.null)
+        return np.asarray(p / p.sum())
+
+    def counts(self) -> dict[str, int]:
+        """How many proposals failed each gate (one may fail several), and how many were accepted."""
+        names = Counter(t.split()[0].rstrip(":") for text in self.why for t in text.split("; ") if t)
+        return {**dict(sorted(names.items())), "accepted": len(self.accepted)}
+
+    def draw(self, uniform: float) -> int:
+        """The proposal that a uniform number in [0, 1) chooses, or `NULL`."""
+        k = int(np.searchsorted(np.cumsum(self.probabilities), uniform, side="right"))
+        # rounding of the sum must not choose one without weight
+        return k if k < len(self.proposals) and self.weights[k] > 0 else NULL
+
+    def entry(self, k: int, config: ChoiceConfig) -> Entry:
+        """How a particle that drew proposal ``k`` enters the older segment."""
+        p = self.proposals[k]
+        return Entry(
+            T_entry=p.T,
+            kind=MATCH,
+            source=p.segment,
+            covariance=match_covariance(p, config),
+            fitness=p.fitness,
+        )
+
+
+def judge(
+    proposals: Sequence[Proposal], config: ChoiceConfig, registration: RegistrationConfig | None = None
+) -> Judgement:
+    """Gate and weigh the proposals of one particle at one time (A9).
+
+    Gates: those of the registration (fitness, degeneracy, tilt), a finite result, height and shift against the
+    prediction, and a margin to the second place in the same map, whether that passes its own gates or not.
+    Weights: ``exp(-½ ((1 - fitness)/σ_f)²) exp(-½ (shift/σ)²)``, σ of the path-length model (eq. 18); with a
+    localisation ``exp(-½ err_X/σ_e²) exp(-½ |Σ_X|/σ_s²)`` in place of, or beside, the fitness (eq. 19).
+
+    Parameters
+    ----------
+    proposals : sequence of Proposal
+    config : ChoiceConfig
+    registration : RegistrationConfig, optional
+        Whose gates are asked; default the standard ones.
+    """
+    rules = RegistrationConfig() if registration is None else registration
+    margins = second_modes(proposals, config.mode_distance)
+    why, weights = [], np.zeros(len(proposals))
+    for k, p in enumerate(proposals):
+        fails = _fails(p, float(margins[k]), config, rules)
+        why.append("; ".join(fails))
+        if not fails:
+            weights[k] = math.exp(_log_weight(p, config))
+    return Judgement(
+        proposals=tuple(proposals), why=tuple(why), weights=weights, margins=margins, null=config.null_weight
+    )
+
+
+def second_modes(proposals: Sequence[Proposal], apart: float) -> Array:
+    """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``.
+
+    1 where there is no other. Results that are no results do not compete.
+    """
+    m = len(proposals)
+    out = np.ones(m)
+    if m < 2:
+        return out
+    segment = np.array([p.segment for p in proposals])
+    fitness = np.array([p.fitness if p.registration.converged else -np.inf for p in proposals])
+    dim = group_of(proposals[0].T).dim
+    at = np.stack([p.registration.T_target_source[:dim] for p in proposals])
+    rival = (segment[:, None] == segment[None]) & (np.linalg.norm(at[:, None] - at[None], axis=2) >= apart)
+    best = np.where(rival, fitness[None], -np.inf).max(axis=1)
+    some = np.isfinite(best) & np.isfinite(fitness)
+    out[some] = fitness[some] - best[some]
+    return out
+
+
+def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
+    """Covariance of ``T_map_body`` of a match ``(d, d)``, right tangent: its own, and what no registration knows."""
+    g = group_of(p.T)
+    floor = np.full(g.dof, config.angle_sigma**2)
+    floor[g.position] = config.position_sigma**2
+    own = p.registration.covariance if p.localisation is None else p.localisation.covariance
+    return np.asarray(own + np.diag(floor))
+
+
+def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
+    r = p.registration
+    if not r.converged or not np.all(np.isfinite(p.T)):
+        return ["nothing: " + (r.why or "the result is not finite").replace("; ", ", ")]
+    fails = [text] if (text := gate(r, rules)) else []
+    if p.height > c.height:
+        fails.append(f"height {p.height:.2f} m > {c.height:g}")
+    if p.shift > c.shift * p.sigma:
+        fails.append(f"shift {p.shift:.2f} m > {c.shift:g} σ of {p.sigma:.2f} m")
+    if margin < c.margin:
+        fails.append(f"margin {margin:.3f} < {c.margin:g}")
+    if c.method != "registration" and p.localisation is None:
+        fails.append("localisation: there is none")
+    return fails
+
+
+def _log_weight(p: Proposal, c: ChoiceConfig) -> float:
+    total = -0.5 * (p.shift / p.sigma) ** 2  # p(‖τ_m‖²)
+    if c.method != "localisation":
+        total += -0.5 * ((1.0 - p.fitness) / c.fitness_sigma) ** 2  # p(err_ICP | T_m), eq. 18
+    if c.method != "registration" and p.localisation is not None:
+        total += -0.5 * p.localisation.error / c.error_sigma**2  # p(err_X), eq. 19
+        total += -0.5 * (p.localisation.spread / c.spread_sigma) ** 2  # p(|Σ_X|)
+    return total

@@ -1,0 +1,158 @@
+"""Trying a place with a throw-away particle filter: how sharply does the scan fit, and how well? (SegSLAM eq. 19)
+
+Unlike a registration it needs no surface normals and no correspondences, and it says in one answer how good the place
+is (the range error) and how well it is determined (the spread that is left).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from frontends.segslam.config import LocalisationConfig
+from frontends.segslam.poses import group_of, pose_mean, pose_scatter
+from frontends.segslam.segmentation import Window
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, ArrayLike
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
+from graphslam.evidence.queries import cast_grids
+
+_SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Localisation:
+    """Where a scan lies in a map.
+
+    Parameters
+    ----------
+    pose : (7,) or (3,)
+        ``T_map_body``, mean of the cloud.
+    covariance : (d, d)
+        Of the cloud, right tangent. Roll and pitch were not searched and have none.
+    error : float
+        err_X: mean squared difference of measured and expected ranges at ``pose``, each clipped [m²].
+    spread : float
+        ``|Σ_X|`` of the position as a length: the 2·dim-th root of its determinant [m].
+    effective : float
+        Smallest N_eff / N of the rounds.
+    """
+
+    pose: Array
+    covariance: Array
+    error: float
+    spread: float
+    effective: float
+
+
+def localise(
+    grid: EvidenceGrid,
+    T_start: ArrayLike,
+    window: Window,
+    max_range: float,
+    rng: np.random.Generator,
+    config: LocalisationConfig,
+    *,
+    threads: int = 1,
+) -> Localisation:
+    """Draw poses around a start, weigh and resample them a few times, and say what is left.
+
+    The likelihood is spent in equal parts, one a round, so that all rounds together count the scan once; between them
+    the cloud is blurred so that its mean and covariance stay (Liu & West 2001).
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        The map; not written to.
+    T_start : (7,) or (3,)
+        ``T_map_body``. Roll and pitch stay as they are there.
+    window : Window
+    max_range : float
+        [m]
+    rng : numpy Generator
+    config : LocalisationConfig
+    threads : int
+        The result is the same for any number.
+
+    Raises
+    ------
+    DataError
+        The window has no beam.
+    """
+    if not len(window):
+        raise DataError("nothing to localise by", got="a window without beams that met something", wanted="some")
+    T = np.asarray(T_start, dtype=np.float64)
+    g, n = group_of(T), config.particles
+    sigma = np.zeros(g.dof)
+    sigma[g.position], sigma[g.heading] = config.position, config.angle
+    free = np.flatnonzero(sigma)
+    likelihood = EndpointLikelihood(exponent=config.effective_beams / (len(window) * config.rounds))
+    # offsets about the start, in its axes; roll and pitch stay zero, as a turn about the vertical through the body does
+    # not change them where the start is level
+    x = sigma * rng.standard_normal((n, g.dof))
+    w, effective = np.full(n, 1.0 / n), 1.0
+    for round in range(config.rounds):
+        if round:
+            x = _blurred(x[systematic_resample(w, float(rng.random()))], free, rng)
+        poses = _placed(T, x)
+        w = normalise_log_weights(
+            log_weights([grid] * n, poses, window.points, likelihood, origin=window.origins, threads=threads)
+        )
+        effective = min(effective, effective_sample_size(w) / n)
+    poses = _placed(T, x)
+    mean = pose_mean(poses, w)
+    covariance = pose_scatter(poses, mean, w)
+    P = covariance[g.position, g.position]
+    spread = max(float(np.linalg.det(P)), 0.0) ** (0.5 / g.dim)
+    return Localisation(
+        pose=mean,
+        covariance=0.5 * (covariance + covariance.T),
+        error=range_error(grid, mean, window, max_range, clip=config.clip * config.cast_sigma),
+        spread=spread,
+        effective=effective,
+    )
+
+
+def range_error(grid: EvidenceGrid, pose: Array, window: Window, max_range: float, *, clip: float) -> float:
+    """Mean squared difference of measured and expected ranges [m²], each at most ``clip`` [m]; eq. 19's err_X.
+
+    Where the map expects nothing, the difference is ``clip``. NaN without any beam.
+    """
+    if not len(window):
+        return math.nan
+    rays = window.points - window.origins
+    c = cast_grids([grid], np.asarray(pose)[None], window.origins, rays, max_range + clip)
+    with np.errstate(invalid="ignore"):
+        d = np.abs(c.ranges[0] - np.linalg.norm(rays, axis=1))
+    d = np.where(c.hit[0], np.minimum(d, clip), clip)
+    return float(np.mean(d * d))
+
+
+def _placed(T: Array, x: Array) -> Array:
+    """Poses ``(n, 7|3)`` at offsets ``(n, d)``: positions along the axes of the map, heading about its z axis."""
+    g = group_of(T)
+    if g.dim == 2:
+        return T + x
+    half = 0.5 * x[:, g.heading]
+    turn = np.zeros((len(x), 7))
+    turn[:, 5], turn[:, 6] = np.sin(half), np.cos(half)
+    still = np.concatenate([np.zeros(3), T[3:]])
+    out = g.compose(turn, np.broadcast_to(still, turn.shape))
+    out[:, :3] = T[:3] + x[:, g.position]
+    return out
+
+
+def _blurred(x: Array, free: npt.NDArray[np.intp], rng: np.random.Generator) -> Array:
+    """Shrink the cloud to its mean and blur it, so that mean and covariance stay."""
+    out = x.copy()
+    y = x[:, free]
+    mean = y.mean(axis=0)
+    P = np.cov(y.T, bias=True) + 1e-12 * np.eye(len(free))
+    noise = rng.standard_normal(y.shape) @ np.linalg.cholesky(P).T
+    out[:, free] = mean + _SHRINK * (y - mean) + math.sqrt(1.0 - _SHRINK**2) * noise
+    return out

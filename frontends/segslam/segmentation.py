@@ -1,0 +1,294 @@
+"""When a segment ends: motion error (A7), predictive score (A8), period; between a minimum and a maximum size.
+
+The predictive score asks how well the particles' maps foretell what the robot sees in the next seconds. It is a
+property of the place far more than of the particle (it falls at doors, corners, ramps), so one decision for the whole
+filter is the default; and it is low in a fresh map, so the first seconds of a segment do not count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.config import SegmentationConfig
+from frontends.segslam.poses import group_of, normalised
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array, ArrayLike
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.likelihood import CastLikelihood
+from graphslam.evidence.queries import cast_grids
+
+Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
+"""Points, origins and returns of one step, in the base frame at its stamp."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """Beams of the look-ahead window in the frame of the body before it, carried there by dead reckoning (A8).
+
+    Parameters
+    ----------
+    points, origins : (n, dim)
+        Of beams that met something within range [m].
+    beams : int
+        Beams of the window, those that met nothing included.
+    """
+
+    points: Array
+    origins: Array
+    beams: int
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float, *, most: int = 0) -> Window:
+    """Bring the scans of a window into one frame.
+
+    Parameters
+    ----------
+    increments : (w, 7) or (w, 3)
+        Dead reckoning from each step of the window to the next, the first from the body's frame to the first step.
+    scans : sequence of w scans
+    max_range : float
+        Beams longer than this are left out [m].
+    most : int
+        Keep so many, evenly thinned; 0 = all.
+
+    Raises
+    ------
+    DataError
+        Scans and increments differ in number.
+    """
+    u = np.asarray(increments, dtype=np.float64)
+    g = group_of(u)
+    if len(u) != len(scans):
+        raise DataError("a window needs one increment for each scan", got=len(u), wanted=len(scans))
+    T = g.identity
+    points, origins, beams = [np.zeros((0, g.dim))], [np.zeros((0, g.dim))], 0
+    for step, (p, o, returns) in zip(u, scans):
+        T = g.compose(T, step)
+        beams += len(p)
+        ranges = np.linalg.norm(p - o, axis=1)
+        use = np.asarray(returns, dtype=bool) & (ranges < max_range) & (ranges > 0.0)
+        points.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), p[use]))
+        origins.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), o[use]))
+    P, O = np.concatenate(points), np.concatenate(origins)
+    if most and len(P) > most:
+        keep = np.linspace(0, len(P) - 1, most).astype(np.int64)
+        P, O = P[keep], O[keep]
+    return Window(points=P, origins=O, beams=beams)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """How well maps foretell a window.
+
+    Parameters
+    ----------
+    shares : (P,)
+        Share of the beams that a particle's map predicts; NaN without any beam.
+    log_likelihoods : (P,)
+        Mean log-likelihood a beam, 0 = perfect (eq. 15–17, clipped); NaN likewise.
+    share, log_likelihood : float
+        Weighted means over the particles.
+    beams : int
+    """
+
+    shares: Array
+    log_likelihoods: Array
+    share: float
+    log_likelihood: float
+    beams: int
+
+
+def predictive_score(
+    grids: Sequence[EvidenceGrid],
+    poses: ArrayLike,
+    window: Window,
+    max_range: float,
+    *,
+    weights: ArrayLike | None = None,
+    tolerance: float = 0.6,
+    sigma: float = 0.3,
+    clip: float = 3.0,
+    threads: int = 1,
+) -> Score:
+    """Cast the beams of a look-ahead window in the particles' maps (A8).
+
+    Parameters
+    ----------
+    grids : sequence of P EvidenceGrid
+    poses : (P, 7) or (P, 3)
+        ``T_map_body`` before the window.
+    window : Window
+    max_range : float
+        [m]
+    weights : (P,), optional
+    tolerance : float
+        A beam is predicted if the map expects a range within this [m]; where it expects nothing, it is not.
+    sigma, clip : float
+        Of the log-likelihood [m], [σ].
+    threads : int
+        The result is the same for any number.
+    """
+    n = len(grids)
+    w = normalised(weights, n)
+    if not len(window):
+        nan = np.full(n, np.nan)
+        return Score(shares=nan, log_likelihoods=nan, share=math.nan, log_likelihood=math.nan, beams=0)
+    rays = window.points - window.origins
+    measured = np.linalg.norm(rays, axis=1)
+    # a wall somewhat beyond the beam must still count as met, or the tolerance would be one-sided at the limit
+    reach = max_range + tolerance
+    c = cast_grids(grids, poses, window.origins, rays, reach, threads=threads)
+    with np.errstate(invalid="ignore"):
+        near = c.hit & (np.abs(c.ranges - measured) <= tolerance)
+    shares = near.mean(axis=1)
+    log_p = CastLikelihood(exponent=1.0, sigma=sigma, clip=clip).beams(c.ranges, c.status, measured, reach).mean(axis=1)
+    return Score(
+        shares=shares,
+        log_likelihoods=log_p,
+        share=float(w @ shares),
+        log_likelihood=float(w @ log_p),
+        beams=len(window),
+    )
+
+
+def motion_error(lengths: ArrayLike, turns: ArrayLike, translation: ArrayLike, rotation: ArrayLike) -> Array:
+    """Motion error that has gathered since a segment began, after each step ``(n,)`` (A7, eq. 13).
+
+    Parameters
+    ----------
+    lengths, turns : (n,)
+        Metres driven and radians turned in each step, the segment's own.
+    translation, rotation : float or (n,)
+        α1 [1/m] and α2 [1/rad]; arrays of them make the error depend on the state (eq. 14).
+    """
+    d, a = np.abs(np.asarray(lengths, dtype=np.float64)), np.abs(np.asarray(turns, dtype=np.float64))
+    per_metre, per_radian = np.asarray(translation, dtype=np.float64), np.asarray(rotation, dtype=np.float64)
+    return np.asarray(np.cumsum(per_metre * d + per_radian * a))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """Whether a segment ends here.
+
+    Parameters
+    ----------
+    ends : bool
+    why : str
+        "score", "relative-score", "motion-error", "period", "max-length", "max-seconds"; else what keeps it: "young",
+        "short", "" if nothing asks for an end.
+    score, best_score : float
+        The score, NaN if there is none, and its maximum since the segment began, NaN before the first that counts.
+    seconds, length : float
+        Age and way of the segment [s], [m].
+    error : float
+        Motion error.
+    """
+
+    ends: bool
+    why: str
+    score: float
+    best_score: float
+    seconds: float
+    length: float
+    error: float
+
+
+@dataclass(slots=True)
+class Segmenter:
+    """Decides for one filter (or one particle) when its segment ends.
+
+    Parameters
+    ----------
+    config : SegmentationConfig
+    time : float
+        When the segment began [s].
+    length : float
+        Way by odometry up to there [m].
+    turned : float
+        Radians turned up to there, all turns counted positive.
+    """
+
+    config: SegmentationConfig
+    time: float
+    length: float = 0.0
+    turned: float = 0.0
+    best: float = field(default=math.nan, init=False)
+    last: float = field(default=-math.inf, init=False)
+
+    def begin(self, time: float, length: float, turned: float = 0.0) -> None:
+        """A new segment begins here."""
+        self.time, self.length, self.turned = time, length, turned
+        self.best, self.last = math.nan, -math.inf
+
+    def copy(self) -> Segmenter:
+        """An equal one, for a resampled particle."""
+        twin = Segmenter(self.config, self.time, self.length, self.turned)
+        twin.best, twin.last = self.best, self.last
+        return twin
+
+    def due(self, time: float) -> bool:
+        """Is it time for a decision? Half a step's rounding of the clock does not put it off."""
+        return time - max(self.last, self.time) >= self.config.every - 1e-6
+
+    def wants_score(self, time: float) -> bool:
+        """Would a score say anything now? Else it need not be cast."""
+        c = self.config
+        return not c.period and bool(c.score or c.relative_score) and time - self.time >= c.excluded - 1e-6
+
+    def decide(self, time: float, length: float, turned: float = 0.0, score: float = math.nan) -> Decision:
+        """Does the segment end here?
+
+        Parameters
+        ----------
+        time, length, turned : float
+            Now, on the same scales as those of the beginning.
+        score : float
+            Predictive score of the window ahead; NaN: there is none.
+
+        Raises
+        ------
+        GeometryError
+            Time or way run backwards, or are not finite.
+        """
+        c = self.config
+        seconds, way = time - self.time, length - self.length
+        if not (seconds >= 0.0 and way >= -1e-9 and math.isfinite(seconds) and math.isfinite(way)):
+            raise GeometryError("a segment runs backwards", got=f"{seconds} s, {way} m", wanted="≥ 0")
+        self.last = time
+        error = float(motion_error([way], [turned - self.turned], c.motion_translation, c.motion_rotation)[-1])
+        counts = not math.isnan(score) and seconds >= c.excluded - 1e-6
+        if counts:  # the maximum that a drop is measured against includes the score of now
+            self.best = score if math.isnan(self.best) else max(self.best, score)
+        why = self._why(seconds, way, error, score if counts else math.nan)
+        ends = bool(why)
+        if ends and not why.startswith("max"):
+            if seconds < c.min_seconds - 1e-6 and why != "period":
+                ends, why = False, "young"
+            elif way < c.min_length:
+                ends, why = False, "short"
+        return Decision(ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=way, error=error)
+
+    def _why(self, seconds: float, way: float, error: float, score: float) -> str:
+        c = self.config
+        if way >= c.max_length:
+            return "max-length"
+        if seconds >= c.max_seconds and way >= c.min_length:
+            return "max-seconds"
+        if c.period:
+            return "period" if seconds >= c.period - 1e-6 else ""
+        if (c.motion_translation or c.motion_rotation) and error >= c.motion_limit:
+            return "motion-error"
+        if not math.isnan(score):
+            if score < c.score:
+                return "score"
+            if score < c.relative_score * self.best:
+                return "relative-score"
+        return ""

@@ -1,0 +1,329 @@
+"""From settled segments to submaps: what SegSLAM hands to the graph.
+
+The base of a submap is the body at its entry, levelled where gravity is known, also where the segment worked in the
+frame of an older map; so the exit of each is the base of the next. Matches go along as hypotheses with their support:
+also those that the particles of the chain itself did not take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.config import HandoverConfig
+from frontends.segslam.covariance import Drift as LengthDrift
+from frontends.segslam.covariance import exit_covariance
+from frontends.segslam.poses import frame_between, group_of, level, pose_scatter
+from frontends.segslam.sampling import nearest_step
+from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, rotation2
+from graphslam.core.submap import Match, Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
+
+Ints = npt.NDArray[np.int64]
+
+KNOTS = 9
+"""Places along a segment at which the drift model is asked; between them its covariance is interpolated."""
+
+
+class Drift(Protocol):
+    """Covariance ``(d, d)`` of dead reckoning from step ``start`` to step ``end``, right tangent.
+
+    The frame at the start is level where frames are; that at the end if ``level_end``.
+    """
+
+    def __call__(self, start: int, end: int, *, level_end: bool) -> Array: ...
+
+
+class _Errors(Protocol):
+    def between(
+        self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
+    ) -> tuple[Array, Array]: ...
+
+
+def drift_by_length(path_length: Array, model: LengthDrift) -> Drift:
+    """A drift that knows the length of the path only: ``model(metres)`` gives ``(d, d)``."""
+
+    def drift(start: int, end: int, *, level_end: bool) -> Array:
+        return np.asarray(model(float(path_length[end] - path_length[start])), dtype=np.float64)
+
+    return drift
+
+
+def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
+    """The drift that the source of the motion states over any interval (`frontends.steps.PathErrors`)."""
+
+    def drift(start: int, end: int, *, level_end: bool) -> Array:
+        return errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
+
+    return drift
+
+
+def settled_chain(segmap: SegMap, last: int) -> Ints:
+    """Segments from the first to ``last``, each beginning where the one before ends.
+
+    The particle's own history as far as it is there, else the heaviest segment that fits (A6).
+
+    Parameters
+    ----------
+    segmap : SegMap
+    last : int
+    """
+    t = segmap.table
+    chain = [segmap[last].index]
+    while True:
+        i = chain[-1]
+        before = int(t.previous[i])
+        if before < 0 or not t.alive[before]:
+            fits = segmap.ending_at(int(t.start[i]))
+            if not len(fits):
+                return np.array(chain[::-1], np.int64)
+            before = int(fits[np.argmax(t.weight[fits])])
+        chain.append(before)
+
+
+def settle(
+    segmap: SegMap,
+    chain: Sequence[int] | Ints,
+    drift: Drift,
+    config: HandoverConfig | None = None,
+    *,
+    uses: frozenset[str] = frozenset(),
+    reasons: Mapping[int, str] | None = None,
+    first_key: int = 0,
+    with_grids: bool = True,
+) -> list[Submap]:
+    """Submaps of a chain of segments.
+
+    Parameters
+    ----------
+    segmap : SegMap
+    chain : sequence of int
+        Each begins where the one before ends.
+    drift : Drift
+    config : HandoverConfig, optional
+    uses : frozenset of str
+        Streams of the log that are inside.
+    reasons : mapping of step to str, optional
+        Why the interval that ends there did.
+    first_key : int
+        Key of the first submap; the others follow.
+    with_grids : bool
+        Hand over the maps, in the frames of the submaps' bases.
+
+    Raises
+    ------
+    DataError
+        Segments that do not follow each other, or are not there.
+    CovarianceError
+        The drift model gives no covariance.
+    """
+    config = HandoverConfig() if config is None else config
+    segments = [segmap[int(i)] for i in chain]
+    for a, b in pairwise(segments):
+        if a.interval[1] != b.interval[0]:
+            raise DataError(
+                f"segment {b.index} does not follow segment {a.index}", got=b.interval, wanted=f"({a.interval[1]}, …)"
+            )
+    keys = {s.index: first_key + k for k, s in enumerate(segments)}
+    out = []
+    for s in segments:
+        matches, considered = _matches(segmap, s, segments, keys, config)
+        out.append(_submap(segmap, s, drift, config, matches, considered, keys[s.index], uses, reasons, with_grids))
+    return out
+
+
+def base_of(segmap: SegMap, entry: Array) -> Array:
+    """``T_segment_base``: the body at its entry, level where frames are."""
+    return level(entry) if segmap.gravity else np.array(entry)
+
+
+def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array, Array]:
+    """Exits ``(n, 7|3)`` of all segments of an interval in the frames of their bases, and weights ``(n,)``."""
+    g, t = segmap.group, segmap.table
+    i = segmap.in_interval(interval)
+    entry, exit = t.entry[i], t.exit[i]
+    base = level(entry) if segmap.gravity else entry
+    T = g.between(base, exit)
+    return (level(T) if segmap.gravity else T), t.weight[i]
+
+
+def _submap(
+    segmap: SegMap,
+    s: Segment,
+    drift: Drift,
+    config: HandoverConfig,
+    matches: tuple[Match, ...],
+    considered: dict[str, Any],
+    key: int,
+    uses: frozenset[str],
+    reasons: Mapping[int, str] | None,
+    with_grids: bool,
+) -> Submap:
+    g = segmap.group
+    start, end = s.interval
+    base = base_of(segmap, s.T_entry)
+    exit_pose = g.between(base, s.T_exit)
+    exit_pose = level(exit_pose) if segmap.gravity else exit_pose
+    exits, weights = exits_of_interval(segmap, s.interval)
+    D = drift(start, end, level_end=True)
+    exit = exit_covariance(exits, exit_pose, s.length, lambda _: D, weights=weights, drift_scale=config.drift_scale)
+    report: dict[str, Any] = {
+        "ended": (reasons or {}).get(end, "unknown"),
+        "segment": s.index,
+        "entered": s.kind,
+        "steps": end - start,
+        "length": round(s.length, 3),
+        "segments_of_interval": len(exits),
+        "effective_segments": round(exit.effective, 3),
+        "weight": s.weight,
+        "locked": s.locked,
+        "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
+        "exit_sigma_matched": np.sqrt(np.diag(exit.matched)).tolist(),
+        "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
+        "covariance": "moment-matched" if config.matched_only else "particles+drift",
+        **considered,
+    }
+    poses = g.compose(g.inverse(base), s.path)
+    return Submap(
+        key=key,
+        interval=(s.t_start, s.t_end),
+        exit_pose=exit_pose,
+        exit_covariance=exit.matched if config.matched_only else exit.total,
+        trajectory=Trajectory(
+            segmap.times[start : end + 1], poses, _path_covariances(segmap, s, poses, drift, config.drift_scale)
+        ),
+        grid=_payload(segmap, s.index, base) if with_grids else None,
+        matches=matches,
+        uses=uses,
+        report=report,
+    )
+
+
+def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
+    """The map in the frame of the base; the very map where it is in that frame already."""
+    g = segmap.group
+    grid, T_map = segmap.map_of(index)
+    T_base_map = g.inverse(g.compose(T_map, base))
+    if np.abs(g.log(T_base_map)).max() < 1e-9:
+        return grid.copy()
+    moved = grid.empty()
+    moved.merge(grid, T_base_map)
+    return moved
+
+
+def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, scale: float) -> Array:
+    """Covariances ``(n, d, d)`` along a path, right tangents: particles at every step, drift at knots."""
+    g, t = segmap.group, segmap.table
+    start, end = s.interval
+    n = end - start + 1
+    i = segmap.in_interval(s.interval)
+    w = t.weight[i] / t.weight[i].sum()
+    P = np.zeros((n, g.dof, g.dof))
+    for k, wk in zip(i.tolist(), w.tolist()):
+        path = cast(Array, t.paths[k])
+        base = base_of(segmap, path[0])
+        e = g.log(g.between(poses, g.compose(g.inverse(base), path)))
+        P += wk * e[:, :, None] * e[:, None, :]
+    knots = np.unique(np.linspace(0, n - 1, min(KNOTS, n)).round().astype(np.int64))
+    D = np.stack([drift(start, start + int(k), level_end=False) for k in knots])
+    # in the axes of the base, where neighbours differ by drift alone and not by the turn of the body
+    R = _axes(poses)
+    D = R[knots] @ D @ np.swapaxes(R[knots], 1, 2)
+    along = segmap.path_length[start : end + 1] + 1e-9 * np.arange(n)  # a robot that stands still: by steps
+    j = np.clip(np.searchsorted(knots, np.arange(n), side="right") - 1, 0, len(knots) - 2)
+    a, b = along[knots[j]], along[knots[j + 1]]
+    u = ((along - a) / (b - a))[:, None, None]
+    return P + scale * (np.swapaxes(R, 1, 2) @ ((1.0 - u) * D[j] + u * D[j + 1]) @ R)
+
+
+def _axes(poses: Array) -> Array:
+    """Rotation of tangents from the axes of the body to those of the frame ``(n, d, d)``."""
+    n = len(poses)
+    if poses.shape[1] == 3:
+        out = np.zeros((n, 3, 3))
+        out[:, :2, :2], out[:, 2, 2] = rotation2(poses[:, 2]), 1.0
+        return out
+    out = np.zeros((n, 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = se3.quat_to_matrix(poses[:, 3:])
+    return out
+
+
+def _matches(
+    segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int], config: HandoverConfig
+) -> tuple[tuple[Match, ...], dict[str, Any]]:
+    """Re-entries of all particles of an interval, one for each submap that was entered, heaviest first."""
+    t = segmap.table
+    members = segmap.in_interval(s.interval)
+    total = float(t.weight[members].sum())
+    groups: dict[int, list[tuple[int, Array]]] = {}
+    lost = 0
+    for i in members[t.kind[members] == MATCH].tolist():
+        found = _target(segmap, i, segments)
+        if found is None or keys[found[0].index] >= keys[s.index]:
+            lost += 1
+            continue
+        groups.setdefault(keys[found[0].index], []).append((i, found[1]))
+    out = []
+    for target, entries in groups.items():
+        index = np.array([i for i, _ in entries])
+        weight = t.weight[index]
+        support = float(weight.sum() / total)
+        if support < config.minimum_support:
+            continue
+        # the chain's own match speaks for its group, else the heaviest
+        lead = int(np.argmax(index == s.index)) if s.index in index else int(np.argmax(weight))
+        T = np.stack([T for _, T in entries])
+        scatter = pose_scatter(T, T[lead], weight) if len(T) > 1 else 0.0
+        i = int(index[lead])
+        fitness = float(t.fitness[i])
+        out.append(
+            Match(
+                target=target,
+                T_target_here=T[lead],
+                covariance=_levelled(segmap, t.entry[i], cast(Array, t.covariances[i])) + scatter,
+                fitness=0.0 if np.isnan(fitness) else fitness,
+                support=support,
+            )
+        )
+    out.sort(key=lambda m: (-m.support, m.target))
+    kinds = {KINDS[k]: float(t.weight[members[t.kind[members] == k]].sum() / total) for k in range(len(KINDS))}
+    return tuple(out), {"entered_share": kinds, "matches_without_target": lost}
+
+
+def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Segment, Array] | None:
+    """The segment of the chain that a match leads to, and ``T_target_here`` between the bases; None: there is none."""
+    g, t = segmap.group, segmap.table
+    source = int(t.source[index])
+    if not t.alive[source]:
+        return None
+    T_source_body = g.compose(g.inverse(t.link[index]), t.entry[index])
+    step = nearest_step(segmap, source, T_source_body)
+    # a chain may have another particle's segment there: the two agree where the body was when it passed
+    same = [c for c in segments if c.index == source]
+    at = same or [c for c in segments if c.interval[0] <= step <= c.interval[1]]
+    if not at:
+        return None
+    c = at[0]
+    T_c_source = g.identity
+    if c.index != source:
+        there = cast(Array, t.paths[source])[step - int(t.start[source])]
+        T_c_source = frame_between(c.path[step - c.interval[0]], there, gravity=segmap.gravity)
+    here = g.compose(T_c_source, T_source_body)
+    here = level(here) if segmap.gravity else here
+    return c, g.between(base_of(segmap, c.T_entry), here)
+
+
+def _levelled(segmap: SegMap, entry: Array, covariance: Array) -> Array:
+    """Covariance at the body → at the levelled base in the same place."""
+    g = group_of(entry)
+    A = g.adjoint(g.between(base_of(segmap, entry), entry))
+    C = A @ covariance @ A.T
+    return np.asarray(0.5 * (C + C.T))
