@@ -50,8 +50,9 @@ class GridFilterConfig:
     """End points: probability that a beam has nothing to do with the map."""
     interpolation: Literal["trilinear", "nearest"] = "trilinear"
     """End points: between voxels, so that poses closer to each other than a voxel are told apart; or not."""
-    unknown: float = 0.5
-    """End points: probability of occupancy where the map knows nothing."""
+    unknown: float = 0.3
+    """End points: probability of occupancy where the map knows nothing. Below one half, so that a particle which finds
+    the surfaces it knows again beats one that puts them where nothing was seen; far above, new ground is a reward."""
     cast_sigma: float = 0.2
     """Casting: σ of a measured range about the expected one [m], a voxel's edge."""
     cast_clip: float = 3.0

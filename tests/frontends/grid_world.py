@@ -15,19 +15,19 @@ from graphslam.core.records import Odometry
 from graphslam.core.se3 import quat_rotate
 from graphslam.core.trajectory import Trajectory
 
-HALL = np.array([[-2.0, -2.0, 0.0], [14.0, 10.0, 2.7]])
-"""Low and high corner of the hall; rays end at its walls from inside."""
+HALL = np.array([[-2.07, -2.11, -0.07], [14.06, 10.09, 2.68]])
+"""Low and high corner of the hall; rays end at its walls from inside. No wall lies between two voxels."""
 BLOCKS = np.array(
     [
-        [[1.2, 1.3, 0.0], [10.8, 6.7, 2.7]],  # the middle: corridors are left around it
-        [[3.0, -2.0, 0.0], [3.6, -1.3, 1.1]],  # cupboards along the walls
-        [[8.0, 0.9, 0.0], [9.1, 1.3, 2.0]],
-        [[13.2, 2.2, 0.0], [14.0, 3.1, 1.6]],
-        [[10.8, 5.0, 0.4], [11.2, 5.5, 1.2]],
-        [[6.3, 9.3, 0.0], [7.7, 10.0, 1.9]],
-        [[2.1, 6.7, 0.0], [2.4, 7.2, 2.3]],
-        [[-2.0, 5.1, 0.0], [-1.2, 6.3, 0.9]],
-        [[0.8, 2.8, 0.0], [1.2, 3.6, 1.5]],
+        [[1.27, 1.28, -0.1], [10.73, 6.71, 2.7]],  # the middle: corridors are left around it
+        [[3.05, -2.2, -0.1], [3.66, -1.27, 1.13]],  # cupboards along the walls
+        [[8.07, 0.93, -0.1], [9.12, 1.3, 2.03]],
+        [[13.27, 2.28, -0.1], [14.1, 3.15, 1.67]],
+        [[10.7, 5.05, 0.45], [11.26, 5.52, 1.27]],
+        [[6.35, 9.27, -0.1], [7.72, 10.1, 1.94]],
+        [[2.14, 6.7, -0.1], [2.43, 7.25, 2.33]],
+        [[-2.1, 5.13, -0.1], [-1.27, 6.32, 0.95]],
+        [[0.87, 2.84, -0.1], [1.3, 3.65, 1.52]],
     ]
 )
 CORNERS = np.array([[0.0, 0.0], [12.0, 0.0], [12.0, 8.0], [0.0, 8.0]])
