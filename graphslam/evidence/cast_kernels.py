@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 
 MAX_RANGE, HIT, INSIDE, LEFT, UNUSABLE, UNKNOWN_SPACE = 0, 1, 2, 3, 4, 5
 

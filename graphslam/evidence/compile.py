@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from graphslam.evidence.kernel import without_garbage_collection
+from graphslam.evidence.kernels import without_garbage_collection
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.mark_kernels import mark_grids
 

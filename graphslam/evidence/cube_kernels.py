@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 from graphslam.evidence.tree_kernels import drop_brick, occupied_lines, release_roots, take_brick, take_node
 
 MIXED, UNSEEN = 1 << 20, 1 << 21  # no value of a voxel

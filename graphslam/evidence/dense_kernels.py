@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 from graphslam.evidence.tree_kernels import find_node
 
 

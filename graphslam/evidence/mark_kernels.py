@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 
 # what a tally counts, per call
 RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS = 0, 1, 2, 3, 4, 5, 6

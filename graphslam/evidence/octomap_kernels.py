@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.evidence.cube_kernels import voxel_state
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 
 # what reading found, and where it stands in a tally
 TRUNCATED, TOO_DEEP, CHILDLESS = 1, 2, 3

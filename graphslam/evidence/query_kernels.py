@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 
 
 @kernel()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
+from graphslam.evidence.kernels import kernel
 
 NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.evidence.kernel import kernel
-from graphslam.evidence.prefetch import prefetch
+from graphslam.evidence.kernels import kernel
+from graphslam.evidence.prefetch_kernels import prefetch
 from graphslam.evidence.tree_kernels import clone_node, drop_brick, set_occupied, take_brick, take_node
 
 AHEAD = 4
