@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from scipy.spatial import cKDTree
 
 from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
 from graphslam.plots import style
 from graphslam.sim.section import mesh_section
 from graphslam.sim.world import World
@@ -80,20 +82,15 @@ def plot_world(
     return ax
 
 
-def _following_sections(world: World, way: np.ndarray, heights: tuple[float, ...], reach: float = 9.0) -> list:
+def _following_sections(world: World, way: Array, heights: tuple[float, ...], reach: float = 9.0) -> list[Array]:
     """Sections at many floor heights, each kept only where the nearest point of the way has that height."""
-    step = 0.25
+    step = 0.5
     bins = np.round(way[:, 2] / step).astype(int)
-    found: list[list[np.ndarray]] = [[] for _ in heights]
+    tree = cKDTree(way[:, :2])
+    found: list[list[Array]] = [[np.zeros((0, 2, 2))] for _ in heights]
     for b in np.unique(bins):
-        floor = step * b
         for lines, height in zip(found, heights):
-            segments = mesh_section(world.vertices, world.triangles, floor + height)
-            middle = segments.mean(axis=1)
-            for part in np.array_split(np.arange(len(middle)), len(middle) // 2000 + 1):
-                if len(part):
-                    d2 = ((middle[part, None, :] - way[None, ::4, :2]) ** 2).sum(axis=2)
-                    near = d2.argmin(axis=1)
-                    keep = (d2[np.arange(len(part)), near] < reach**2) & (bins[::4][near] == b)
-                    lines.append(segments[part[keep]])
-    return [np.concatenate(lines) if lines else np.zeros((0, 2, 2)) for lines in found]
+            segments = mesh_section(world.vertices, world.triangles, step * b + height)
+            distance, nearest = tree.query(segments.mean(axis=1))
+            lines.append(segments[(distance < reach) & (bins[nearest] == b)])
+    return [np.concatenate(lines) for lines in found]

@@ -61,7 +61,7 @@ class MeshBuilder:
         plan = [(a, b), (d, b), (d, e), (a, e)]
         self.hexahedron([(x, y, c) for x, y in plan] + [(x, y, f) for x, y in plan])
 
-    def turned_box(self, centre: Sequence[float], size: Sequence[float], yaw: float, low: float, high: float) -> None:
+    def turned_box(self, centre: ArrayLike, size: ArrayLike, yaw: float, low: float, high: float) -> None:
         """A box turned about the vertical: ``centre`` and ``size`` in the plan ``(2,)``, between two heights."""
         c, s = np.cos(yaw), np.sin(yaw)
         half = 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size, dtype=np.float64)

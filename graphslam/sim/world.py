@@ -13,6 +13,9 @@ from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.sim.route import Route, plan_route
 
+# An earlier visit is followed while the place on it moves by no more than this from one point to the next [m].
+_JUMP = 3.0
+
 Triangles = npt.NDArray[np.int32]
 
 
@@ -107,13 +110,19 @@ def find_revisits(
     match = np.full(len(s), -1)
     for k in range(len(s)):
         d = np.linalg.norm(p[s < s[k] - gap] - p[k], axis=1)
-        if len(d) and d.min() < radius:
-            match[k] = int(d.argmin())
+        near = np.flatnonzero(d < radius)
+        if len(near):
+            before = match[k - 1]
+            # of several earlier visits the one that is being followed, else the nearest
+            follows = near[np.abs(near - before) * spacing <= _JUMP] if before >= 0 else near[:0]
+            match[k] = follows[d[follows].argmin()] if len(follows) else near[d[near].argmin()]
     found: list[dict[str, Any]] = []
     begin = 0
     for k in range(1, len(s) + 1):
         # a stretch ends where the place is new, or where the earlier visit is another one
-        steps_on = k < len(s) and match[k] >= 0 and match[k - 1] >= 0 and abs(match[k] - match[k - 1]) * spacing <= 3.0
+        steps_on = (
+            k < len(s) and match[k] >= 0 and match[k - 1] >= 0 and abs(match[k] - match[k - 1]) * spacing <= _JUMP
+        )
         if steps_on:
             continue
         if match[begin] >= 0 and s[k - 1] - s[begin] >= shortest:

@@ -9,17 +9,21 @@ import pytest
 
 from graphslam.core.errors import GeometryError, UnknownNameError
 from graphslam.sim.garage import garage
+from graphslam.sim.mine import mine
+from graphslam.sim.route import plan_route
+from graphslam.sim.tunnels import surface_nets
 from graphslam.sim.world import World, find_revisits
 from tests.sim.solid import Solid
 
-NAMES = ["garage-A", "garage-B", "garage-C"]
-LENGTH = {"garage-A": (303.0, 10.0), "garage-B": (303.0, 10.0), "garage-C": (303.0, 10.0)}
+GARAGES = ["garage-A", "garage-B", "garage-C"]
+NAMES = [*GARAGES, "mine"]
+LENGTH = {"garage-A": (303.0, 10.0), "garage-B": (303.0, 10.0), "garage-C": (303.0, 10.0), "mine": (1300.0, 15.0)}
 
 
 @functools.cache
 def world(name: str, seed: int = 0) -> World:
     kind, _, layout = name.partition("-")
-    return {"garage": lambda: garage(layout, seed=seed)}[kind]()
+    return {"garage": lambda: garage(layout, seed=seed), "mine": lambda: mine(seed=seed)}[kind]()
 
 
 @functools.cache
@@ -65,7 +69,7 @@ def test_floor_lies_at_the_stated_height(name: str) -> None:
     route = world(name).route()
     p = route.positions(route.every(0.1))
     down = solid(name).cast(p + [0.0, 0.0, 0.5], np.broadcast_to([0.0, 0.0, -1.0], p.shape))
-    assert np.abs(down - 0.5).max() < (0.06 if name == "mine" else 0.01)
+    assert np.abs(down - 0.5).max() < (0.03 if name == "mine" else 0.005)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -102,8 +106,9 @@ def test_loops_are_places_seen_before(name: str) -> None:
 def test_slopes_can_be_driven_and_corners_are_level(name: str) -> None:
     route = world(name).route()
     assert np.abs(np.rad2deg(np.arctan(route.slopes(route.starts[:-1])))).max() < 9.0
-    bends = route.curvature != 0.0
-    assert np.abs(np.diff(route.points[:, 2])[bends]).max() < 1e-9
+    sharp = np.abs(route.curvature * route.plan) > np.deg2rad(25.0)
+    assert sharp.any()
+    assert np.abs(np.diff(route.points[:, 2])[sharp]).max() < 1e-9
 
 
 def walls(w: World) -> set[bytes]:
@@ -131,7 +136,7 @@ def test_garage_layouts_differ() -> None:
 
 
 def test_garage_drives_through_both_levels_and_retraces_its_start() -> None:
-    for name in ("garage-A", "garage-B", "garage-C"):
+    for name in GARAGES:
         w = world(name)
         route = w.route()
         p = route.positions(route.every(0.1))
@@ -159,6 +164,83 @@ def test_garage_levels_look_alike() -> None:
         starts = x[1:][pillar[1:] & ~pillar[:-1]]
         assert np.allclose(np.diff(starts), 8.0, atol=0.11)
     assert np.array_equal(sight[0], sight[1])
+
+
+def test_parallel_galleries_are_apart_and_see_each_other_at_cross_cuts_only() -> None:
+    w, route = world("mine"), world("mine").route()
+    assert len(w.meta["parallel"]) >= 3
+    total = 0.0
+    for (a0, a1), (b0, b1) in w.meta["parallel"]:
+        a = route.positions(np.arange(a0, a1, 1.0))
+        b = route.positions(np.arange(b0, b1, 1.0))
+        gap = np.linalg.norm(a[:, None] - b[None], axis=2)
+        assert gap.min() > 5.0
+        assert gap.min(axis=1).max() < 9.5  # side by side all along
+        total = max(total, a1 - a0)
+        i, j = np.nonzero(gap < 25.0)
+        seen = solid("mine").sees(a[i] + [0.0, 0.0, 1.0], b[j] + [0.0, 0.0, 1.0])
+        assert not seen.any()
+    assert total > 50.0
+    # they do see each other through the cross-cut
+    m, other = np.array([[100.0, 0.0, 2.6]]), np.array([[100.0, 8.0, 2.6]])
+    assert solid("mine").sees(m, other).all()
+
+
+def test_mine_has_loops_within_loops() -> None:
+    w = world("mine")
+    loops = np.array(w.meta["loops"])
+    assert len(loops) >= 5
+    # interlocking: some loop begins inside another and ends outside it
+    a, b = loops[:, None], loops[None]
+    assert ((a[..., 0] < b[..., 0]) & (b[..., 0] < a[..., 1]) & (a[..., 1] < b[..., 1])).any()
+    assert np.ptp(w.waypoints[:, 2]) > 5.0
+
+
+def test_surface_nets_keep_planes_and_balls() -> None:
+    low, cell = np.array([-2.0, -2.0, -2.0]), 0.2
+    p = np.stack(np.meshgrid(*[low[0] + cell * np.arange(21)] * 3, indexing="ij"), -1)
+    ball = (np.linalg.norm(p, axis=-1) - 1.5).astype(np.float32)
+    v, t = surface_nets(ball, low, cell)
+    assert np.abs(np.linalg.norm(v, axis=1) - 1.5).max() < 0.03
+    # closed: every edge belongs to two triangles
+    edges = np.sort(t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).all()
+    normal = np.array([0.1, -0.05, 1.0])
+    v, _ = surface_nets((p @ normal - 0.03).astype(np.float32), low, cell)
+    assert np.abs(v @ normal - 0.03).max() < 1e-5
+
+
+def test_route_is_smooth_and_measures_itself() -> None:
+    waypoints = [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (10.0, 8.0, 0.0), (10.0, 20.0, 1.0), (2.0, 26.0, 1.0)]
+    route = plan_route(waypoints, 2.0)
+    s = np.linspace(0.0, route.length, 20001)
+    p, h = route.positions(s), route.headings(s)
+    step = np.linalg.norm(np.diff(p, axis=0), axis=1)
+    assert np.sum(np.abs(step / s[1] - 1.0) > 1e-5) <= 3  # arc length; three steps span a kink in slope
+    d = np.diff(p, axis=0)
+    middle = route.headings(0.5 * (s[1:] + s[:-1]))
+    assert np.allclose(
+        np.column_stack([np.cos(middle), np.sin(middle)]),
+        d[:, :2] / np.linalg.norm(d[:, :2], axis=1)[:, None],
+        atol=2e-3,
+    )
+    assert np.abs(np.diff(np.unwrap(h))).max() <= s[1] / 2.0 * 1.001  # no turn tighter than the radius
+    straight = 10.0 + 8.0 + np.hypot(12.0, 1.0) + 10.0
+    turned = np.arctan2(6.0, -8.0) - np.pi / 2
+    saved = 2.0 * (2.0 * np.tan(np.pi / 4) - np.pi / 2) + 2.0 * (2.0 * np.tan(turned / 2) - turned)
+    assert route.length == pytest.approx(straight - saved, abs=0.02)  # the last corner cuts a little of the slope
+    assert np.allclose(p[[0, -1]], [waypoints[0], waypoints[-1]])
+    for bad, words in (
+        ([(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)], "same place"),
+        ([(0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.01, 0.0)], "back on itself"),
+        ([(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 3.0, 0.0), (6.0, 3.0, 0.0)], "do not fit"),
+        ([(0.0, 0.0, np.nan), (3.0, 0.0, 0.0)], "impossible"),
+    ):
+        with pytest.raises(GeometryError, match=words):
+            plan_route(bad, 2.0)
+    with pytest.raises(GeometryError, match="outside the way"):
+        route.positions(route.length + 1.0)
 
 
 def test_unknown_layout_is_refused() -> None:
