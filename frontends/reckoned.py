@@ -42,15 +42,25 @@ class LastingErrors:
     """Roll and pitch, the part that lasts [rad]."""
     attitude_walk: float
     """Walk of that part [rad/√s]."""
+    epoch: float
+    """When the biases had the σ above [s]: the first record of the IMU."""
+    filtered: bool = False
+    """Roll and pitch come from the gyro, drawn to gravity over ``attitude_time``: then the gyro's bias tilts them."""
 
-    def covariance(self, since: float) -> Array:
-        """Of the state ``(12, 12)`` of an interval that starts ``since`` seconds after the path did."""
+    def covariance(self, time: float) -> Array:
+        """Of the state ``(12, 12)`` at the start of an interval that begins at ``time`` [s]."""
+        since = max(time - self.epoch, 0.0)
         P = np.zeros(STATES)
         P[GYRO] = self.gyro_bias**2 + self.gyro_walk**2 * since
         P[SCALE] = self.wheel_scale**2
         P[FADING] = self.attitude**2
         P[LASTING] = self.attitude_bias**2 + self.attitude_walk**2 * since
-        return np.diag(P)
+        M = np.eye(STATES)
+        if self.filtered:
+            # the filter's error is T times the gyro's bias, and was the opposite when it started, coming backwards
+            gain = self.attitude_time * (1.0 - 2.0 * np.exp(-since / self.attitude_time))
+            M[FADING.start, GYRO.start] = M[FADING.start + 1, GYRO.start + 1] = gain
+        return (M * P) @ M.T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,10 +121,9 @@ class Reckoned:
         if not 0 <= start <= end < n:
             raise DataError("no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {n}")
         times = self.odometry.times
-        P = np.zeros((STATES + 2, STATES + 2))  # the last two: roll and pitch at the start, kept as they were
-        first = self.lasting.covariance(float(times[start] - self.path.times[0]))
+        # two more states: errors of roll and pitch at the start, kept as they were
         pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING] + np.eye(STATES)[LASTING]])
-        P = pick @ first @ pick.T
+        P = pick @ self.lasting.covariance(float(times[start])) @ pick.T
         F = np.eye(STATES + 2)
         for k in range(start + 1, end + 1):
             F[:STATES, :STATES] = self.transitions[k]

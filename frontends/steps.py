@@ -7,26 +7,16 @@ base stands at the stamp. Front ends on grids see nothing else, so that any robo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from frontends.drift import PathErrors
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.trajectory import Trajectory
-
-
-class PathErrors(Protocol):
-    """Knows how far off dead reckoning may be over an interval of steps, errors that last included."""
-
-    def between(
-        self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
-    ) -> tuple[Array, Array]:
-        """Motion from step ``start`` to step ``end``, and its covariance in the right tangent."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

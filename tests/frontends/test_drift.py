@@ -1,0 +1,106 @@
+"""The drift model: variances that add, sideways and heading together, and parameters found again from samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from frontends.drift import DriftModel, calibrate, fit_drift
+from frontends.recorded import RecordedErrors
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.records import Odometry
+
+PURE = dict.fromkeys(("position_walk", "position_scale", "z_walk", "z_scale", "heading_walk", "heading_scale"), 0.0)
+
+
+def test_each_term_is_what_it_says() -> None:
+    model = DriftModel(**{**PURE, "position_walk": 0.02, "z_scale": 0.004, "heading_scale": 0.001})
+    C = model.covariance(25.0)
+    assert C[3, 3] == pytest.approx(0.01**2 + 0.02**2 * 25)
+    assert C[5, 5] == pytest.approx(0.01**2 + 0.1**2)
+    assert C[2, 2] == pytest.approx(0.002**2 + 0.025**2)
+    assert C[0, 0] == C[1, 1] == pytest.approx(model.tilt**2)
+    np.testing.assert_array_equal(C, model(25.0))
+    np.testing.assert_array_equal(C, np.diag(np.diag(C)))
+
+
+@pytest.mark.parametrize("length", [0.0, 1.0, 40.0, 2000.0])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_covariances_are_positive_definite_and_grow(length: float, dim: int) -> None:
+    model = DriftModel(dim=dim, bend=1.0, heading_walk=0.001)
+    C = model.covariance(length)
+    assert C.shape == ((3, 3) if dim == 2 else (6, 6))
+    np.linalg.cholesky(C)
+    assert np.all(np.diag(model.covariance(length + 1.0)) >= np.diag(C))
+
+
+def straight_errors(rng: np.random.Generator, lengths: np.ndarray, walk: float, scale: float) -> np.ndarray:
+    """Errors ``(m, 3)`` of straight paths whose heading walks and bends, simulated centimetre by centimetre."""
+    out = []
+    for L in lengths:
+        n = 200
+        h = L / n
+        psi = np.cumsum(walk * np.sqrt(h) * rng.normal(size=n)) + rng.normal() * scale * h * np.arange(1, n + 1)
+        along = 0.03 * np.sqrt(L) * rng.normal() + 0.01 * rng.normal()
+        side = h * psi.sum() + 0.03 * np.sqrt(L) * rng.normal() + 0.01 * rng.normal()
+        out.append([along, side, psi[-1] + 0.002 * rng.normal()])
+    return np.array(out)
+
+
+def test_bent_paths_are_as_far_off_as_the_model_says(rng: np.random.Generator) -> None:
+    model = DriftModel(dim=2, position_scale=0.0, heading_walk=0.002, heading_scale=0.001, bend=1.0)
+    for L in (5.0, 40.0):
+        e = straight_errors(rng, np.full(4000, L), 0.002, 0.001)
+        ratio = np.linalg.solve(model.covariance(L), e.T @ e / len(e))
+        np.testing.assert_allclose(np.linalg.eigvals(ratio).real, 1.0, atol=0.1)
+
+
+def test_a_fit_to_samples_of_errors_finds_the_model(rng: np.random.Generator) -> None:
+    lengths = rng.uniform(2.0, 60.0, size=4000)
+    e = straight_errors(rng, lengths, 0.002, 0.001)
+    model = fit_drift(lengths, e[:, :, None] * e[:, None, :])
+    for L in (5.0, 20.0, 60.0):
+        true = DriftModel(dim=2, position_scale=0.0, heading_walk=0.002, heading_scale=0.001, bend=1.0).covariance(L)
+        np.testing.assert_allclose(np.linalg.eigvals(np.linalg.solve(true, model.covariance(L))).real, 1.0, atol=0.3)
+    assert model.bend == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_fit_to_covariances_of_a_model_is_that_model() -> None:
+    true = DriftModel(bend=0.5, heading_walk=0.001)
+    lengths = np.linspace(1.0, 80.0, 30)
+    model = fit_drift(lengths, np.array([true.covariance(L) for L in lengths]))
+    for L in (3.0, 30.0, 80.0):
+        np.testing.assert_allclose(model.covariance(L), true.covariance(L), rtol=0.03, atol=1e-9)
+
+
+def test_calibrated_on_planar_odometry() -> None:
+    """Straight drive, white noise of heading and distance, a constant yaw rate error: every parameter comes back."""
+    n, step = 801, 0.1
+    odometry = Odometry(
+        times=0.1 * np.arange(n),
+        increments=np.vstack([np.zeros(3), np.tile([step, 0, 0], (n - 1, 1))]),
+        covariances=np.tile(np.diag([0.004**2, 0.002**2, 0.0005**2]), (n, 1, 1)),
+    )
+    model = calibrate(RecordedErrors(odometry=odometry, yaw_bias=0.001, scale=0.01), step * np.arange(n))
+    assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(step), rel=0.05)
+    assert model.heading_scale == pytest.approx(0.001, rel=0.02)  # 1 m/s
+    assert model.bend == pytest.approx(1.0, abs=0.02)
+    assert 0.006 < model.position_scale < 0.0101  # along 1 %, to the side nothing: the model has one σ for both
+    assert model.dim == 2
+
+
+def test_refusals() -> None:
+    for bad in ({"dim": 4}, {"z_walk": -1.0}, {"heading_scale": np.nan}, {"heading_start": 0.0}, {"tilt": 0.0}):
+        with pytest.raises(ConfigError, match="drift model"):
+            DriftModel(**bad)
+    DriftModel(dim=2, tilt=0.0, z_start=0.0)
+    for length in (-1.0, np.nan, np.inf):
+        with pytest.raises(DataError, match="length"):
+            DriftModel().covariance(length)
+    with pytest.raises(DataError, match="do not match"):
+        fit_drift([1.0, 2.0], np.zeros((3, 6, 6)))
+    with pytest.raises(DataError, match="too few"):
+        fit_drift([1.0, 1.0, 2.0], np.zeros((3, 6, 6)))
+    two = Odometry(times=np.arange(2.0), increments=np.array([[0, 0, 0], [0.1, 0, 0]]), covariances=np.zeros((2, 3, 3)))
+    with pytest.raises(DataError, match="too short"):
+        calibrate(RecordedErrors(odometry=two), np.array([0.0, 0.1]))
