@@ -90,22 +90,25 @@ def demo(
 
 
 def simulate(
-    world: str = typer.Argument(..., help="landmark-field"),
+    world: str = typer.Argument(..., help="landmark-field, garage, mine or building"),
     out: Path = typer.Option(..., help="Folder for the log, truth included."),
-    seed: int = typer.Option(0),
-    preset: str | None = typer.Option(None, help="A, B, C, demo or quick."),
-    setting: list[str] = typer.Option([], "--set", help="A figure of the world, name=value; may be repeated."),
+    seed: int = typer.Option(0, help="Of every error, and of what can be moved in the world."),
+    layout: str | None = typer.Option(None, help="Of the garage: A, B or C."),
+    preset: str | None = typer.Option(
+        None, help="Landmark field: A, B, C, demo or quick. Other worlds: light, full or two-scanners."
+    ),
+    setting: list[str] = typer.Option([], "--set", help="A figure of the world or robot, name=value; repeatable."),
     as_json: bool = JSON,
 ) -> None:
     """A recorded log of a simulated world, with its truth and every noise figure stated."""
     from graphslam.app.worlds import simulate as make
-    from graphslam.io.log_store import save_log
+    from graphslam.app.worlds import write_simulated
 
     changes: dict[str, Any] = {}
     for text in setting:
         changes |= cfg.parse_setting(text)
-    log = make(world, seed=seed, preset=preset, **changes)
-    save_log(log, out)
+    log = make(world, seed=seed, preset=preset, layout=layout, progress=not as_json, **changes)
+    write_simulated(log, out)
     streams = {name: len(s.times) for name, s in log.streams.items()}
     rows = [{"stream": k, "records": v} for k, v in streams.items()]
     value = {

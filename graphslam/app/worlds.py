@@ -2,40 +2,164 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from graphslam.core.errors import UnknownNameError
+from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
+from graphslam.core.se3 import se3_inverse, se3_transform
+
+if TYPE_CHECKING:
+    from graphslam.core.geometry import Array
+    from graphslam.core.mesh import Triangles
+    from graphslam.sim.world import World
 
 
-def _landmark_field(preset: str, seed: int, **changes: Any) -> SensorLog:
-    return simulate_landmark_field(landmark_field_preset(preset, **changes), seed)
-
-
-# name -> (maker, default preset)
-WORLDS: dict[str, tuple[Callable[..., SensorLog], str]] = {"landmark-field": (_landmark_field, "A")}
-
-
-def simulate(world: str, *, seed: int = 0, preset: str | None = None, **changes: Any) -> SensorLog:
-    """Simulate a world, truth included.
+@dataclass(frozen=True, slots=True)
+class MeshWorld:
+    """A world of triangles that a robot drives through.
 
     Parameters
     ----------
-    world : str
-        ``landmark-field``.
+    module, function : str
+        What builds it; imported when used.
+    layouts : tuple of str
+        Buildings to choose from, the default first; empty where there is one only.
+    """
+
+    module: str
+    function: str
+    layouts: tuple[str, ...] = ()
+
+    def build(self, name: str, layout: str | None, seed: int) -> World:
+        """The world; the seed moves what can be moved in it."""
+        if layout is not None and layout not in self.layouts:
+            if not self.layouts:
+                raise ConfigError(f"world {name!r} has one layout only: leave {layout!r} out")
+            raise UnknownNameError(f"layout of world {name!r}", layout, self.layouts)
+        try:
+            make = getattr(importlib.import_module(self.module), self.function)
+        except ImportError as error:
+            raise GraphSlamError(f"world {name!r} cannot be imported ({error})") from error
+        world: World = make(layout or self.layouts[0], seed=seed) if self.layouts else make(seed=seed)
+        return world
+
+
+MESH_WORLDS: dict[str, MeshWorld] = {
+    "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C")),
+    "mine": MeshWorld("graphslam.sim.mine", "mine"),
+    "building": MeshWorld("graphslam.sim.building", "building"),
+}
+
+
+def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
+    from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
+
+    return simulate_landmark_field(landmark_field_preset(preset or "A", **changes), seed)
+
+
+# name -> what simulates it from a preset, a seed and changed figures
+WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {"landmark-field": _landmark_field}
+
+
+def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
+    """A world of triangles by name.
+
+    Parameters
+    ----------
+    name : str
+        ``garage``, ``mine`` or ``building``.
+    layout : str, optional
+        Of the garage: ``A``, ``B`` or ``C``.
     seed : int
-    preset : str, optional
-        ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard`` confuse an association.
-    **changes
-        Any figure of the world's configuration.
+        Of what can be moved in it.
 
     Raises
     ------
     UnknownNameError, ConfigError
     """
-    if world not in WORLDS:
-        raise UnknownNameError("world", world, WORLDS)
-    make, default = WORLDS[world]
-    return make(preset or default, seed, **changes)
+    if name not in MESH_WORLDS:
+        raise UnknownNameError("world of triangles", name, MESH_WORLDS)
+    return MESH_WORLDS[name].build(name, layout, seed)
+
+
+def simulate(
+    world: str,
+    *,
+    seed: int = 0,
+    preset: str | None = None,
+    layout: str | None = None,
+    world_seed: int | None = None,
+    progress: bool = False,
+    **changes: Any,
+) -> SensorLog:
+    """Simulate a world, truth included.
+
+    Parameters
+    ----------
+    world : str
+        ``landmark-field``, ``garage``, ``mine`` or ``building``.
+    seed : int
+        Of every error, and of what can be moved in the world.
+    preset : str, optional
+        Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard``
+        confuse an association. Of the robot in the other worlds: ``light``, ``full``, ``two-scanners``.
+    layout : str, optional
+        Of the garage: ``A``, ``B`` or ``C``.
+    world_seed : int, optional
+        Of what can be moved in a world of triangles, where it shall not be ``seed``.
+    progress : bool
+        Show a progress bar on stderr.
+    **changes
+        Any figure of the world's or the robot's configuration.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+    """
+    if world in WORLDS:
+        if layout is not None or world_seed is not None:
+            raise ConfigError(f"world {world!r} has neither layout nor world_seed")
+        return WORLDS[world](preset, seed, changes)
+    if world not in MESH_WORLDS:
+        raise UnknownNameError("world", world, [*WORLDS, *MESH_WORLDS])
+    from graphslam.sim.crawler import crawler_preset, simulate_crawler
+
+    config = crawler_preset(preset or "light", **changes)
+    moved = seed if world_seed is None else world_seed
+    for name, value in (("seed", seed), ("world_seed", moved)):
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise ConfigError(f"{name} = {value}; wanted a whole number ≥ 0")
+    log = simulate_crawler(mesh_world(world, layout=layout, seed=moved), seed, config, progress=progress)
+    return replace(log, meta={**log.meta, "made_with": {"name": world, "layout": layout, "seed": moved}})
+
+
+def world_of(log: SensorLog) -> World:
+    """The world that a log of :func:`simulate` was recorded in, made again.
+
+    Raises
+    ------
+    ConfigError
+        A log that was not made so.
+    """
+    made = log.meta.get("made_with")
+    if not isinstance(made, dict):
+        raise ConfigError(f"log {log.name!r} does not say which world it was recorded in")
+    return mesh_world(str(made.get("name")), layout=made.get("layout"), seed=int(made.get("seed", 0)))
+
+
+def mesh_of(log: SensorLog) -> tuple[Array, Triangles]:
+    """Mesh of the world of a log, in the frame of its truth: vertices ``(v, 3)`` [m] and triangles ``(t, 3)``."""
+    world = world_of(log)
+    T_world_frame = log.meta["T_world_frame"]
+    return se3_transform(se3_inverse(T_world_frame), world.vertices), world.triangles
+
+
+def write_simulated(log: SensorLog, folder: str | Path) -> Path:
+    """Write a log of :func:`simulate`, with the mesh of its world if it has one."""
+    from graphslam.io.log_folder import write_log_folder
+
+    return write_log_folder(log, folder, mesh=mesh_of(log) if "made_with" in log.meta else None)

@@ -117,18 +117,21 @@ class CrawlerConfig:
 
     def __post_init__(self) -> None:
         for name in ("mount", "rear_mount", "imu_mount"):  # a configuration file gives lists
-            value = tuple(float(v) for v in getattr(self, name))
+            given = getattr(self, name)
+            numbers = isinstance(given, list | tuple) and all(isinstance(v, int | float) for v in given)
+            value = tuple(float(v) for v in given) if numbers else ()
             unit = len(value) == 7 and all(map(math.isfinite, value)) and abs(math.hypot(*value[3:]) - 1.0) < 1e-6
             self._require(name, unit, "x y z qx qy qz qw with a unit quaternion")
             object.__setattr__(self, name, value)
         for name in (*_POSITIVE, *_NOT_NEGATIVE):
             value = getattr(self, name)
+            self._require(name, isinstance(value, int | float) and not isinstance(value, bool), "a number")
             low = value > 0 if name in _POSITIVE else value >= 0
             self._require(name, math.isfinite(value) and low, "> 0" if name in _POSITIVE else "≥ 0")
         self._require("scanners", self.scanners in (1, 2), "1 or 2")
         self._require("beams", isinstance(self.beams, int) and self.beams >= 2, "a whole number ≥ 2")
         self._require("fan", self.fan <= 2.0 * math.pi, "≤ 2π")
-        self._require("drop_out", 0.0 <= self.drop_out < 1.0, "in [0, 1)")
+        self._require("drop_out", isinstance(self.drop_out, int | float) and 0.0 <= self.drop_out < 1.0, "in [0, 1)")
         self._require("min_range", self.min_range < self.max_range, "< max_range")
         self._require("sweep_time", self.sweep_time <= 1.0 / self.scan_rate, "≤ 1 / scan_rate")
 
@@ -160,7 +163,4 @@ def crawler_preset(name: str = "light", **changes: Any) -> CrawlerConfig:
     for key in changes:
         if key not in known:
             raise ConfigError(f"crawler: unknown figure {key!r}; known: {', '.join(sorted(known))}")
-    try:
-        return CrawlerConfig(**{**PRESETS[name], **changes})
-    except TypeError as error:
-        raise ConfigError(f"crawler: {error}") from None
+    return CrawlerConfig(**{**PRESETS[name], **changes})

@@ -56,9 +56,11 @@ def scan_world(
     )
     exact = np.empty((len(times), c.beams))
     chunk = max(_BEAMS_AT_ONCE // c.beams, 1)
-    for k in tqdm(range(0, len(times), chunk), desc="scans", unit=f"{chunk} scans", disable=not progress):
-        part = slice(k, min(k + chunk, len(times)))
-        exact[part] = caster.ranges(scan_rays(scans, motion, part)).reshape(-1, c.beams)
+    with tqdm(total=len(times), desc="casting beams", unit="scan", disable=not progress) as bar:
+        for k in range(0, len(times), chunk):
+            part = slice(k, min(k + chunk, len(times)))
+            exact[part] = caster.ranges(scan_rays(scans, motion, part)).reshape(-1, c.beams)
+            bar.update(part.stop - part.start)
 
     rng = seeds.generator()
     measured = exact + c.noise_scale * c.range_sigma * rng.standard_normal(exact.shape)
