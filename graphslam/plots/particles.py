@@ -1,14 +1,17 @@
-"""Particles of a submap: where they end, what is left of their paths, and which Gaussian results."""
+"""Particles: where they end, what is left of their paths, who descends from whom, and which Gaussian results."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.ticker import MaxNLocator
 
 from frontends.landmarks.filter import ParticleSet
+from frontends.rbpf_grid import RbpfResult
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import Truth
@@ -195,6 +198,80 @@ def plot_histories(ax: Axes | None, sets: Mapping[str, ParticleSet], *, title: s
     if title:
         ax.set_title(title, fontsize="medium")
     style.legend(ax)
+    return ax
+
+
+def plot_ancestry(
+    result: RbpfResult, ax: Axes | None, segment_boundaries: Sequence[float] | None = None, *, title: str | None = None
+) -> Axes:
+    """Who descends from whom: particles over time, joined to those they went on from (SegSLAM Fig. 2–3).
+
+    Parameters
+    ----------
+    result : RbpfResult
+        Its run must have kept the lineages that died out (``prune_every=0``) for them to be shown.
+    ax : Axes or None
+    segment_boundaries : sequence of float, optional
+        Times [s] at which segments end. Only within a segment does it matter that the particles have met: across a
+        boundary any of them may follow any other.
+    """
+    tree, times = result.ancestry, np.asarray(result.times) - result.times[0]
+    ax = style.new_axes(ax, (8.0, 3.6))
+    edges, alive = tree.links()
+    # from the particle it went on from, one step earlier, to the particle itself
+    lines = np.stack(
+        [np.column_stack([times[edges[:, 0] - 1], edges[:, 2]]), np.column_stack([times[edges[:, 0]], edges[:, 1]])], 1
+    )
+    if not alive.all():
+        ax.add_collection(LineCollection(list(lines[~alive]), colors=style.PALE, linewidths=0.6, zorder=1))
+        ax.plot([], [], color=style.PALE, lw=1.2, label="died out")
+    ax.add_collection(LineCollection(list(lines[alive]), colors=style.ESTIMATE, linewidths=0.9, zorder=2))
+    ax.plot([], [], color=style.ESTIMATE, lw=1.2, label="ancestors of the last")
+    met = tree.coalescence()
+    if met >= 0 and tree.particles > 1:
+        who = int(tree.numbers()[met, 0])
+        ax.plot(times[met], who, "o", color=style.VERMILION, ms=6, mec="white", mew=0.6, zorder=4,
+                label=f"their last common ancestor, {times[-1] - times[met]:.1f} s back")  # fmt: skip
+    for k, t in enumerate(segment_boundaries or ()):
+        ax.axvline(t - result.times[0], color=style.BLACK, lw=0.9, ls="--", zorder=3,
+                   label="segments end" if k == 0 else None)  # fmt: skip
+    ax.set_xlim(0.0, max(float(times[-1]), 1e-9))
+    ax.set_ylim(-0.7, tree.particles - 0.3)
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("particle")
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax, outside=False, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncol=4)
+    return ax
+
+
+def plot_effective(result: RbpfResult, ax: Axes | None, *, title: str | None = None) -> Axes:
+    """How many particles are effective after each scan (SegSLAM eq. 7), when they were resampled, and how many
+    ancestors of each step are left.
+
+    Parameters
+    ----------
+    result : RbpfResult
+    ax : Axes or None
+    """
+    times, n = np.asarray(result.times) - result.times[0], result.ancestry.particles
+    ax = style.new_axes(ax, (8.0, 3.2))
+    ax.plot(times, result.effective, color=style.ESTIMATE, lw=0.8, label="effective, before resampling")
+    at = result.resampled
+    share = float(np.mean(at))
+    ax.plot(times[at], result.effective[at], "o", color=style.VERMILION, ms=2.6, lw=0,
+            label=f"resampled ({at.sum()}, {share:.0%} of the steps)")  # fmt: skip
+    ax.step(times, result.ancestry.survivors(), where="mid", color=style.BLACK, lw=1.0, ls="--",
+            label="ancestors of the last particles")  # fmt: skip
+    ax.axhline(n, color=style.GREY, lw=0.7)
+    ax.set_xlim(0.0, max(float(times[-1]), 1e-9))
+    ax.set_ylim(0.0, 1.06 * n)
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel(f"particles, of {n}")
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax, outside=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncol=3)
     return ax
 
 
