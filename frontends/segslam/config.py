@@ -131,12 +131,25 @@ class CandidateSearch:
     """Points of the look-ahead window, at most."""
     cloud_level: int = 1
     """Cells of 2**level voxels, in which a map's occupied voxels are gathered for matching."""
+    most_searches: int = 12
+    """Searches at one time, of all particles together, at most."""
+    same_start: float = 1.0
+    """Particles that ask for the same map from places closer than about this share one search [m]."""
 
     def __post_init__(self) -> None:
         _check(
             self,
             "search",
-            positive=("grid", "yaw_step", "max_radius", "starts", "source_radius", "source_points"),
+            positive=(
+                "grid",
+                "yaw_step",
+                "max_radius",
+                "starts",
+                "source_radius",
+                "source_points",
+                "most_searches",
+                "same_start",
+            ),
         )
 
     def yaw_width(self, length: float) -> float:

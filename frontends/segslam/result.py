@@ -1,0 +1,151 @@
+"""What a run of SegSLAM came to, and the questions one asks of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.ancestry import Ancestry
+from frontends.grid_filter import Tally
+from frontends.segslam.matching import Attempt
+from frontends.segslam.sampling import MapSample, concatenate, grow, root_of_segment
+from frontends.segslam.segmap import SegMap
+from frontends.segslam.winnowing import Winnowed
+from frontends.steps import Steps
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+from graphslam.core.trajectory import Trajectory
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreLine:
+    """The predictive score at one step (A8)."""
+
+    step: int
+    share: float
+    log_likelihood: float
+    beams: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Boundary:
+    """Where segments ended, why, of how many particles, and how many different ones."""
+
+    step: int
+    why: str
+    particles: int
+    segments: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegSlamResult:
+    """A run of SegSLAM.
+
+    Parameters
+    ----------
+    steps : Steps
+    segmap : SegMap
+        All its segments are closed.
+    closed : (N,) int64
+        The last segment of each particle.
+    weights : (N,)
+    best : int
+        The heaviest particle.
+    effective, resampled : (n,)
+        N_eff of each step before resampling; whether it was resampled.
+    ancestry : Ancestry
+        Poses in the frames of the segments; tags number these.
+    scores, attempts, boundaries : tuples
+        In the order of time; attempts are those that had candidates.
+    winnowed : Winnowed
+    tally : Tally
+    seconds : mapping of str to float
+        Wall time by part.
+    used_bytes : int
+        Memory of all maps at the end.
+    seed : SeedTree
+    """
+
+    steps: Steps
+    segmap: SegMap
+    closed: Ints
+    weights: Array
+    best: int
+    effective: Array
+    resampled: npt.NDArray[np.bool_]
+    ancestry: Ancestry
+    scores: tuple[ScoreLine, ...]
+    attempts: tuple[Attempt, ...]
+    boundaries: tuple[Boundary, ...]
+    winnowed: Winnowed
+    tally: Tally
+    seconds: dict[str, float]
+    used_bytes: int
+    seed: SeedTree
+
+    @property
+    def total_seconds(self) -> float:
+        """Wall time of all parts [s]."""
+        return float(sum(self.seconds.values()))
+
+    def sample(self, number: int = 0, particle: int | None = None) -> MapSample:
+        """A full map sample, grown from the last segment of a particle (default: the best).
+
+        Parameters
+        ----------
+        number : int
+            Samples with different numbers are drawn independently; the same number is the same sample.
+        particle : int, optional
+        """
+        at = int(self.closed[self.best if particle is None else particle])
+        rng = self.seed.child("map-sample", number).generator()
+        weights = self.segmap.table.weight[: len(self.segmap)]
+        return grow(self.segmap, root_of_segment(self.segmap, at), rng, weights=weights)
+
+    def trajectory(self, number: int = 0, particle: int | None = None) -> Trajectory:
+        """The whole path of a map sample in the frame of its first segment (A6)."""
+        s = self.sample(number, particle)
+        path = concatenate(self.segmap, s)
+        group = self.segmap.group
+        first = int(s.in_time[0])
+        return path.transformed(group.inverse(s.poses[first]))
+
+    @property
+    def final_pose(self) -> Array:
+        """Pose of the best particle at the end in the frame of the first segment, by the shortest way of entries and
+        exits between the two."""
+        s = self.sample()
+        group = self.segmap.group
+        exit = self.segmap.table.exit[int(self.closed[self.best])]
+        return np.asarray(group.between(s.poses[int(s.in_time[0])], exit))
+
+    def report(self) -> dict[str, Any]:
+        """The run in figures, ready for JSON."""
+        n = len(self.weights)
+        quantiles = np.quantile(self.effective / n, [0.05, 0.5])
+        t = self.segmap.table
+        return {
+            "steps": len(self.steps),
+            "particles": n,
+            "path_length": float(self.steps.path_length[-1]),
+            "segments": len(self.segmap),
+            "intervals": len(self.segmap.intervals()),
+            "pruned": self.segmap.pruned,
+            "matches": int(np.sum(t.kind[: len(self.segmap)] == 1)),
+            "attempts": len(self.attempts),
+            "searches": sum(a.searches for a in self.attempts),
+            "registrations": sum(a.registrations for a in self.attempts),
+            "resamplings": self.tally.resamplings,
+            "effective_median": float(quantiles[1]),
+            "effective_p05": float(quantiles[0]),
+            "steps_without_beams": self.tally.without_beams,
+            "steps_without_returns": self.tally.without_returns,
+            "beams_dropped": self.tally.dropped_rays,
+            "maps_megabytes": self.used_bytes / 1e6,
+            "seconds": {k: round(v, 6) for k, v in self.seconds.items()},
+        }

@@ -1,0 +1,298 @@
+"""SegSLAM: a particle filter on evidence grids that ends submaps, begins new ones, and enters old ones again.
+
+The state of a particle is its pose *in a submap* (A1–A6). While its map predicts what comes it goes on; when the map
+stops predicting, the segment ends for all particles, and each draws what comes next: an older map that explains the
+window ahead, or a new one. An older map can also be entered while the segment would have gone on; particles that do not
+draw it then carry on with the map they have.
+
+The filter stands at step k and looks at the seconds after it: it runs that far behind the sensors.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from tqdm.auto import tqdm
+
+from frontends.grid_config import GridFilterConfig
+from frontends.grid_filter import GridFilter
+from frontends.segslam.config import SegSlamConfig
+from frontends.segslam.matching import Attempt, Matcher
+from frontends.segslam.poses import group_of, level
+from frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
+from frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
+from frontends.segslam.segmentation import Decision, Segmenter, predictive_score
+from frontends.segslam.window import look_ahead
+from frontends.steps import Steps
+from graphslam.core.errors import DataError
+from graphslam.core.random import SeedTree
+
+Ints = npt.NDArray[np.int64]
+
+
+def run_segslam(
+    steps: Steps,
+    filter: GridFilterConfig,
+    config: SegSlamConfig,
+    seed: SeedTree,
+    *,
+    progress: bool = False,
+    prune_every: int = 32,
+) -> SegSlamResult:
+    """Run SegSLAM over all steps.
+
+    Parameters
+    ----------
+    steps : Steps
+    filter : GridFilterConfig
+        Of the particle filter inside the segments.
+    config : SegSlamConfig
+    seed : SeedTree
+        The same seed gives the same SegMap, with any number of threads.
+    progress : bool
+        Show a progress bar.
+    prune_every : int
+        See :class:`~frontends.ancestry.Ancestry`.
+
+    Raises
+    ------
+    DataError
+        Fewer than two steps: there is no interval.
+    """
+    if len(steps) < 2:
+        raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")
+    run = _Run(steps, filter, config, seed, prune_every)
+    for k in tqdm(range(len(steps)), desc=steps.name, unit="step", disable=not progress):
+        run.step(k)
+    return run.result()
+
+
+@dataclass(slots=True)
+class _Clock:
+    """Wall time of what the filter does not count itself [s]."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: {"score": 0.0, "match": 0.0, "segments": 0.0})
+
+
+class _Run:
+    """A run, step by step."""
+
+    def __init__(
+        self, steps: Steps, filter: GridFilterConfig, config: SegSlamConfig, seed: SeedTree, prune_every: int
+    ) -> None:
+        self.steps, self.config, self.seed = steps, config, seed
+        self.filter = GridFilter(steps, filter, seed.child("filter"), prune_every=prune_every)
+        n = filter.particles
+        self.group = group_of(self.filter.particles.poses)
+        self.path_length = steps.path_length
+        # how far the body turned, all turns counted
+        tangents = self.group.log(steps.odometry.increments)
+        turns = tangents[:, [2]] if steps.dim == 2 else tangents[:, :3]
+        self.turned = np.cumsum(np.linalg.norm(turns, axis=1))
+        self.segmap = SegMap(steps.times, self.path_length, n, dim=steps.dim, gravity=steps.tilt is not None)
+        self.matcher = Matcher(self.segmap, config, steps.max_range, threads=filter.threads)
+        self.segmenters = [self._segmenter(0) for _ in range(n)]
+        self.segmap.open(0, [Entry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
+        self.ids = np.zeros(n, dtype=np.int64)  # of the open segments, counted as they are begun: tags of the ancestry
+        self.begun = 1
+        self.last_attempt = float(steps.times[0])
+        self.effective = np.empty(len(steps))
+        self.resampled = np.zeros(len(steps), dtype=np.bool_)
+        self.scores: list[ScoreLine] = []
+        self.attempts: list[Attempt] = []
+        self.boundaries: list[Boundary] = []
+        self.closed: Ints = np.full(n, -1, dtype=np.int64)
+        self.clock = _Clock()
+
+    # --- one step --------------------------------------------------------------------------------------------
+
+    def step(self, k: int) -> None:
+        """Filter step k, and decide whether segments end there."""
+        f = self.filter
+        f.predict(k)
+        f.weigh(k)
+        f.record(self.ids)
+        self.effective[k] = f.effective
+        ancestors = f.resample_if_needed(k)
+        if ancestors is not None:
+            self.resampled[k] = True
+            self.segmap.resample(ancestors)
+            self.ids = self.ids[ancestors]
+            self.segmenters = [self.segmenters[a].copy() for a in ancestors]
+        f.update(k)
+        if k == len(self.steps) - 1:
+            everybody = np.arange(len(f), dtype=np.int64)
+            self.closed = self._close(k, everybody, "end-of-log")
+        elif k:
+            self._decide(k)
+
+    def _decide(self, k: int) -> None:
+        now = float(self.steps.times[k])
+        ends, why = self._ending(k, now)
+        attempt = self._match(k, now, ends)
+        matched = np.array([e is not None for e in attempt.entries]) if attempt else np.zeros(len(ends), np.bool_)
+        leaving = ends | matched
+        if self.config.segmentation.decide == "filter" and leaving.any():
+            leaving[:] = True
+        if not leaving.any():
+            return
+        begin = time.perf_counter()
+        chosen = np.flatnonzero(leaving).astype(np.int64)
+        closed = self._close(k, chosen, why if ends.any() else "match")
+        entries: list[Entry] = []
+        for p, i in zip(chosen.tolist(), closed.tolist()):
+            entry = attempt.entries[p] if attempt else None
+            entries.append(entry if entry is not None else self._goes_on(p, i, bool(ends[p])))
+        self._enter(k, chosen, entries)
+        self.segmap.prune()
+        if self.config.segments_per_interval:
+            self.segmap.thin(self.config.segments_per_interval)
+        self.matcher.forget()
+        self.clock.seconds["segments"] += time.perf_counter() - begin
+
+    # --- when a segment ends ---------------------------------------------------------------------------------
+
+    def _ending(self, k: int, now: float) -> tuple[npt.NDArray[np.bool_], str]:
+        """Which particles' segments end here, and why those of the first do (A7, A8)."""
+        f, c = self.filter, self.config.segmentation
+        n = len(f)
+        ends = np.zeros(n, dtype=np.bool_)
+        due = [i for i in range(n) if self.segmenters[i].due(now)]
+        if not due:
+            return ends, ""
+        together = c.decide == "filter"
+        wants = any(self.segmenters[i].wants_score(now) for i in due)
+        share, shares = np.nan, np.full(n, np.nan)
+        if wants:
+            begin = time.perf_counter()
+            ahead = look_ahead(self.steps, k, c.window, most=c.score_beams)
+            p = f.particles
+            # half a window at the end of the log would be scored against maxima of whole ones
+            if ahead.full:
+                score = predictive_score(
+                    p.grids, p.poses, ahead.window, self.steps.max_range, weights=p.weights, tolerance=c.tolerance,
+                    sigma=c.score_sigma, threads=f.config.threads,
+                )  # fmt: skip
+                share, shares = score.share, score.shares
+                self.scores.append(
+                    ScoreLine(step=k, share=score.share, log_likelihood=score.log_likelihood, beams=score.beams)
+                )
+            self.clock.seconds["score"] += time.perf_counter() - begin
+        why = ""
+        if together:
+            decision = self._decision(0, k, now, share)
+            for s in self.segmenters[1:]:
+                s.best, s.last = self.segmenters[0].best, self.segmenters[0].last
+            ends[:] = decision.ends
+            why = decision.why if decision.ends else ""
+        else:
+            for i in due:
+                decision = self._decision(i, k, now, float(shares[i]))
+                ends[i] = decision.ends
+                why = why or (decision.why if decision.ends else "")
+        return ends, why
+
+    def _decision(self, i: int, k: int, now: float, score: float) -> Decision:
+        return self.segmenters[i].decide(now, float(self.path_length[k]), float(self.turned[k]), score)
+
+    def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> Attempt | None:
+        """Try to enter older maps: every so often, and wherever a segment ends."""
+        c = self.config
+        if not ends.any() and now - self.last_attempt < c.choice.every - 1e-6:
+            return None
+        if now - max(s.time for s in self.segmenters) < c.choice.every - 1e-6:
+            return None  # a segment of nothing
+        begin = time.perf_counter()
+        ahead = look_ahead(self.steps, k, c.segmentation.window)
+        attempt = None
+        if ahead.full:
+            self.last_attempt = now
+            attempt = self.matcher.attempt(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
+            if attempt.candidates:
+                self.attempts.append(attempt)
+        self.clock.seconds["match"] += time.perf_counter() - begin
+        return attempt
+
+    # --- boundaries ------------------------------------------------------------------------------------------
+
+    def _close(self, k: int, chosen: Ints, why: str) -> Ints:
+        f, segmap = self.filter, self.segmap
+        first = int(segmap.start[chosen].min())
+        recent = f.ancestry.recent(k - first)
+        paths = []
+        for p in chosen.tolist():
+            entry = segmap.entries[p]
+            assert entry is not None
+            paths.append(np.concatenate([entry.T_entry[None], recent[int(segmap.start[p]) - first :, p]]))
+        closed = segmap.close(k, [f.particles.grids[p] for p in chosen], paths, f.particles.weights, chosen.tolist())
+        self.boundaries.append(Boundary(step=k, why=why, particles=len(chosen), segments=len(np.unique(closed))))
+        return closed
+
+    def _goes_on(self, p: int, segment: int, ended: bool) -> Entry:
+        """Into a new map where the old one has ended; else with the map it has."""
+        pose = self.filter.particles.poses[p]
+        if not ended:
+            return Entry(T_entry=pose, kind=SAME, source=segment)
+        frame = level(pose) if self.segmap.gravity else pose
+        return Entry(T_entry=self.group.between(frame, pose), kind=NEW)
+
+    def _enter(self, k: int, chosen: Ints, entries: Sequence[Entry]) -> None:
+        p = self.filter.particles
+        grids = self.segmap.open(k, entries, chosen.tolist())
+        empty = p.grids[0].empty()
+        known: dict[tuple[int, int], int] = {}
+        for i, e, grid in zip(chosen.tolist(), entries, grids):
+            p.grids[i] = empty.copy() if grid is None else grid
+            p.poses[i] = e.T_entry
+            if e.kind == NEW:
+                p.ages[i] = 0
+            elif e.kind == MATCH:
+                p.ages[i] = max(int(p.ages[i]), self.filter.config.young)
+                self._lock(e.source)
+            if e.kind != SAME:
+                self.segmenters[i] = self._segmenter(k)
+            key = (e.kind, e.source)
+            if key not in known:
+                known[key] = self.begun
+                self.begun += 1
+            self.ids[i] = known[key]
+
+    def _lock(self, source: int) -> None:
+        if self.config.lock_after and self.segmap.entered(source) >= self.config.lock_after:
+            self.segmap.lock(source)
+
+    def _segmenter(self, k: int) -> Segmenter:
+        return Segmenter(
+            self.config.segmentation, float(self.steps.times[k]), float(self.path_length[k]), float(self.turned[k])
+        )
+
+    # --- the end ---------------------------------------------------------------------------------------------
+
+    def result(self) -> SegSlamResult:
+        """What it came to; all segments are closed."""
+        f = self.filter
+        seconds: dict[str, Any] = dict(f.tally.seconds)
+        seconds.update(self.clock.seconds)
+        return SegSlamResult(
+            steps=self.steps,
+            segmap=self.segmap,
+            closed=self.closed,
+            weights=f.particles.weights,
+            best=f.particles.best,
+            effective=self.effective,
+            resampled=self.resampled,
+            ancestry=f.ancestry,
+            scores=tuple(self.scores),
+            attempts=tuple(self.attempts),
+            boundaries=tuple(self.boundaries),
+            winnowed=self.matcher.winnowed,
+            tally=f.tally,
+            seconds=seconds,
+            used_bytes=f.pool.used_bytes,
+            seed=self.seed,
+        )
