@@ -1,0 +1,113 @@
+"""Options of a registration and the gates it has to pass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from graphslam.core.errors import ConfigError
+
+
+def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            low = value >= 0 if f.name in zero else value > 0
+            if not (low and math.isfinite(value)):
+                wanted = "a number ≥ 0" if f.name in zero else "a positive number"
+                raise ConfigError(f"registration: {f.name} is {value}; wanted {wanted}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gates:
+    """What a match must have to be accepted. A false one does more harm than ten right ones do good.
+
+    Parameters
+    ----------
+    fitness : float
+        Least share of *all* source points with a neighbour. A source that reaches out of the map fails it.
+    fitness_known : float
+        Least share of the source points in known space with a neighbour; stands for ``fitness`` where the caller says
+        which space is known.
+    fitness_upright : float
+        Least share of the source points on upright surfaces with a neighbour; 0 for frames whose z axis is not up.
+    known_share : float
+        Least share of the source points that fall into known space, where the caller says which that is.
+    degeneracy : float
+        Least ratio of the translational eigenvalues; see :mod:`~graphslam.registration.degeneracy`. Three dimensions.
+    degeneracy_planar : float
+        The same in two dimensions.
+    tilt : float
+        Greatest angle between the z axes of two frames that should both stand upright [rad]; π for frames that do
+        not.
+    """
+
+    fitness: float = 0.85
+    fitness_known: float = 0.85
+    fitness_upright: float = 0.7
+    known_share: float = 0.5
+    degeneracy: float = 0.004
+    degeneracy_planar: float = 0.01
+    tilt: float = math.radians(4.0)
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            zero=(
+                "fitness",
+                "fitness_known",
+                "fitness_upright",
+                "known_share",
+                "degeneracy",
+                "degeneracy_planar",
+                "tilt",
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationConfig:
+    """How a registration is done; see :func:`graphslam.registration.register.register`.
+
+    Parameters
+    ----------
+    radii : tuple of float
+        Greatest distances of a pair, stage by stage [m].
+    iterations : int
+        At most, a stage.
+    rotation_epsilon, translation_epsilon : float
+        A stage ends when a step is smaller [rad, m].
+    near : float
+        A source point has a neighbour if one is nearer than this [m].
+    least_points : int
+        Source and target need so many, and so many pairs must be left.
+    max_shift, max_turn : float
+        A result farther from its start is refused [m, rad]: it is another place than the one asked about.
+    covariance_scale : float
+        Of the inverse Hessian with the noise that the pairs show; calibrated in halls, whatever the noise, the bins and
+        the number of points (docs/registration.md). Three dimensions; ``covariance_scale_planar`` in two.
+    floor_sigma, floor_turn : float
+        σ added to the covariance, per axis [m, rad]: what is wrong with the map itself. The defaults are for maps whose
+        scans are placed to 2 cm and 2 mrad.
+    gates : Gates
+    """
+
+    radii: tuple[float, ...] = (1.0, 0.5)
+    iterations: int = 30
+    rotation_epsilon: float = 1e-4
+    translation_epsilon: float = 1e-4
+    near: float = 0.25
+    least_points: int = 20
+    max_shift: float = 3.0
+    max_turn: float = 0.5
+    covariance_scale: float = 3.0
+    covariance_scale_planar: float = 5.0
+    floor_sigma: float = 0.01
+    floor_turn: float = 0.001
+    gates: Gates = field(default_factory=Gates)
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if not self.radii or not all(math.isfinite(r) and r > 0 for r in self.radii):
+            raise ConfigError(f"registration: radii are {self.radii}; wanted positive numbers, wide to narrow")

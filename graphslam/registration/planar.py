@@ -1,0 +1,83 @@
+"""Generalised ICP in two dimensions (Segal, Haehnel and Thrun 2009, eq. 2), all pairs at once.
+
+In the plane z = 0 of three dimensions the surface through any points is that plane itself, and a matcher made for three
+would hold nothing in it. Here the shape of a point is a line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core import geometry as se2
+from graphslam.core.geometry import Array
+from graphslam.registration.target import Target
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """How an iterative matcher ended.
+
+    Parameters
+    ----------
+    T : (3,) or (7,)
+        ``T_target_source``.
+    hessian : (d, d)
+        Of half the sum of the squared distances, in the right tangent.
+    error : float
+        That half sum.
+    pairs : int
+        Source points that were paired in the last step.
+    """
+
+    T: Array
+    hessian: Array
+    error: float
+    pairs: int
+
+
+def linearise(source: Target, target: Target, T: Array, radius: float) -> tuple[Array, Array, float, int]:
+    """Hessian ``(3, 3)``, gradient ``(3,)``, half squared error and number of pairs nearer than ``radius`` at ``T``.
+
+    ``e = ½ Σ dᵀ M d`` with ``d = T p - q`` and ``M = (C_q + R C_p Rᵀ)⁻¹``; ``M`` is held fixed.
+    """
+    moved = se2.se2_transform(T, source.points)
+    distance, which = target.tree.query(moved, distance_upper_bound=radius)
+    paired = np.flatnonzero(np.isfinite(distance))
+    if not len(paired):
+        return np.zeros((3, 3)), np.zeros(3), 0.0, 0
+    R, which = se2.rotation2(T[2]), which[paired]
+    M = np.linalg.inv(target.covariances[which] + R @ source.covariances[paired] @ R.T)
+    d = moved[paired] - target.points[which]
+    p = source.points[paired]
+    J = np.empty((len(p), 2, 3))
+    J[:, :, :2] = R
+    J[:, :, 2] = np.stack([-p[:, 1], p[:, 0]], 1) @ R.T  # d(R Exp(δ) p)/dδ = R p⊥
+    MJ = M @ J
+    H = np.einsum("mki,mkj->ij", J, MJ)
+    b = np.einsum("mki,mk->i", MJ, d)
+    return H, b, 0.5 * float(np.einsum("mi,mij,mj->", d, M, d)), len(paired)
+
+
+def align_planar(
+    source: Target,
+    target: Target,
+    T: Array,
+    radius: float,
+    iterations: int,
+    rotation_epsilon: float,
+    translation_epsilon: float,
+) -> Aligned:
+    """Gauss-Newton steps from ``T (3,)``, pairs found anew at each; a matrix that is singular ends it."""
+    H, b, error, pairs = linearise(source, target, T, radius)
+    for _ in range(iterations):
+        if not pairs:
+            break
+        # a little damping, so that a direction that is not held at all stays where it is
+        step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(3), b)
+        T = se2.se2_compose(T, se2.se2_exp(step))
+        H, b, error, pairs = linearise(source, target, T, radius)
+        if np.hypot(step[0], step[1]) < translation_epsilon and abs(step[2]) < rotation_epsilon:
+            break
+    return Aligned(T, H, error, pairs)

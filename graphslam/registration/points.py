@@ -1,0 +1,86 @@
+"""Points as a matcher wants them: finite, of one dimension, and not more than are needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from graphslam.core import geometry as se2
+from graphslam.core import se3
+from graphslam.core.errors import GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter
+
+
+def finite_points(points: Any, *, what: str = "points", drops: DropCounter | None = None) -> Array:
+    """Points ``(m, 2 | 3)`` [m] without those that are not finite, which are counted.
+
+    Raises
+    ------
+    GeometryError
+        Of another shape.
+    """
+    p = np.ascontiguousarray(points, dtype=np.float64)
+    if p.ndim != 2 or p.shape[1] not in (2, 3):
+        raise GeometryError(f"{what} have the wrong shape", got=p.shape, wanted="(m, 2) or (m, 3)")
+    good = np.isfinite(p).all(axis=1)
+    if good.all():
+        return p
+    if drops is not None:
+        drops.drop(what, "not finite", int(np.sum(~good)))
+    return p[good]
+
+
+def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
+    """One finite pose, ``(3,)`` in two dimensions and ``(7,)`` in three; its quaternion is made a unit one.
+
+    Raises
+    ------
+    GeometryError
+    """
+    T = np.array(pose, dtype=np.float64)
+    n = 3 if dim == 2 else 7
+    if T.shape != (n,) or not np.all(np.isfinite(T)):
+        raise GeometryError(f"{what} is impossible", got=T, wanted=f"{n} finite numbers")
+    if dim == 3:
+        T[3:] = se3.quat_normalize(T[3:])
+    return T
+
+
+def transform(T_ab: Array, points: Array) -> Array:
+    """Points ``(m, dim)`` of frame b in frame a."""
+    return se2.se2_transform(T_ab, points) if points.shape[1] == 2 else se3.se3_transform(T_ab, points)
+
+
+def thin(points: Array, voxel: float) -> Array:
+    """One point a voxel, the mean of those in it; voxels in the order of their coordinates, x slowest.
+
+    Parameters
+    ----------
+    points : (m, dim)
+        Finite [m].
+    voxel : float
+        Edge [m].
+
+    Returns
+    -------
+    (n, dim)
+    """
+    if not len(points):
+        return points
+    cells = np.floor(points / voxel).astype(np.int64)
+    cells -= cells.min(axis=0)
+    size = cells.max(axis=0) + 1
+    key = cells[:, 0]
+    for a in range(1, points.shape[1]):
+        key = key * size[a] + cells[:, a]
+    _, which, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(which, x) / count for x in points.T], axis=1)
+
+
+def spread(points: Array, most: int) -> Array:
+    """At most ``most`` of the points, evenly from first to last."""
+    if len(points) <= most:
+        return points
+    return points[np.linspace(0, len(points) - 1, most).round().astype(np.int64)]

@@ -1,0 +1,365 @@
+"""Where one cloud lies in another: generalised ICP in two radii, an honest covariance, and reasons to refuse.
+
+A matcher's own word that it converged is worth nothing: it says so of an empty cloud, of a corridor, and of a place one
+pillar too far. What is worth something is measured here instead: which share of the points has a neighbour, which
+directions are held, how far from the start and how tilted the result is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import small_gicp
+
+from graphslam.core import geometry as se2
+from graphslam.core import se3
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.degeneracy import calibrated_covariance, feigned_information, translational_degeneracy
+from graphslam.registration.planar import Aligned, align_planar
+from graphslam.registration.points import check_pose, transform
+from graphslam.registration.target import Target
+
+_LEAST_NOISE = 1e-4  # clouds that are copies of each other show none
+Known = npt.NDArray[np.bool_] | Callable[[Array], npt.NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """What came of a match.
+
+    Parameters
+    ----------
+    T_target_source : (3,) or (7,)
+        The result; the start, where there is none.
+    covariance : (d, d)
+        In the right tangent (3-D: rotation first). NaN where there is no result, so that no graph takes it.
+    fitness : float
+        Share of all source points with a neighbour nearer than ``near``.
+    fitness_known : float
+        The same of the source points in known space; NaN where the caller did not say which that is.
+    fitness_upright : float
+        The same of the source points on upright surfaces, whose normal is more than 45° off the target's z axis. Floors
+        and ceilings match wherever they are level, and are most of many scans. NaN in two dimensions, and where there
+        are fewer than ``least_points`` of them.
+    known_share : float
+        Share of the source points that fall into known space; NaN likewise.
+    rmse : float
+        Of the distances to those neighbours [m]; NaN without any.
+    inliers : int
+        Pairs of the last step.
+    degeneracy : float
+        Least over greatest eigenvalue of the translational part of the Hessian.
+    weakest : (dim,)
+        Direction held least, a unit vector in the source frame; NaN without a result.
+    weakest_sigma : float
+        σ along it [m]; NaN without a result.
+    tilt : float
+        Angle between the z axes of the two frames [rad]; 0 in two dimensions.
+    shift, turn : float
+        From the start to the result [m, rad].
+    converged : bool
+        There is a result: finite, not far from the start, held by enough pairs. It may still be wrong.
+    why : str
+        Why there is no result, or the gates it fails; empty for a match that is accepted.
+    """
+
+    T_target_source: Array
+    covariance: Array
+    fitness: float
+    fitness_known: float
+    fitness_upright: float
+    known_share: float
+    rmse: float
+    inliers: int
+    degeneracy: float
+    weakest: Array
+    weakest_sigma: float
+    tilt: float
+    shift: float
+    turn: float
+    converged: bool
+    why: str
+
+    @property
+    def accepted(self) -> bool:
+        """A result that passes all gates."""
+        return not self.why
+
+    @property
+    def best_fitness(self) -> float:
+        """The fitness in known space where that is known, else the one over all points."""
+        return self.fitness if np.isnan(self.fitness_known) else self.fitness_known
+
+
+def register(
+    source: Any,
+    target: Target,
+    T_target_source: Any,
+    config: RegistrationConfig | None = None,
+    *,
+    known: Known | None = None,
+) -> Registration:
+    """Match a cloud to a target.
+
+    Parameters
+    ----------
+    source : (m, dim) or Target
+        Points in the source frame [m]; what is not finite is left out. Prepare a ``Target`` of it to match it from
+        several starts.
+    target : Target
+    T_target_source : (3,) or (7,)
+        Start.
+    config : RegistrationConfig, optional
+    known : (m,) bool, or function of points (m, dim) to (m,) bool, optional
+        Which of the source points fall into known space; a function is asked for points in the *target* frame, at the
+        result (``EvidenceGrid.known_at`` is one). A mask goes with the points of a source that was not thinned, and
+        without any that are not finite.
+
+    Returns
+    -------
+    Registration
+        Never an exception because a match fails: ``why`` says what is the matter.
+
+    Raises
+    ------
+    GeometryError
+        A start or a shape that is impossible, or clouds of different dimension.
+    DataError
+        A mask of another length than the source.
+
+    Notes
+    -----
+    """
+    config = RegistrationConfig() if config is None else config
+    start = check_pose(T_target_source, target.dim, what="start of a registration")
+    cloud = source if isinstance(source, Target) else Target(source, neighbours=target.neighbours)
+    if cloud.dim != target.dim:
+        raise GeometryError("source and target differ in dimension", got=cloud.dim, wanted=target.dim)
+    if known is not None and not callable(known) and np.shape(known) != (len(cloud),):
+        raise DataError("the mask of known points does not go with the source", got=np.shape(known), wanted=len(cloud))
+    for name, c in (("source", cloud), ("target", target)):
+        if len(c) < config.least_points:
+            return _no_result(start, f"{name} has {len(c)} points, fewer than {config.least_points}")
+    found = _align(cloud, target, start, config)
+    if found.pairs == 0:
+        return _no_result(start, f"no target point within {config.radii[-1]:g} m of any source point")
+    if not (np.all(np.isfinite(found.T)) and np.all(np.isfinite(found.hessian))):
+        return _no_result(start, "the result is not finite")
+    shift, turn = _moved(start, found.T)
+    if found.pairs < config.least_points:
+        why = f"{found.pairs} pairs left, fewer than {config.least_points}"
+        return dataclasses.replace(_no_result(start, why), inliers=found.pairs)
+    if shift > config.max_shift or turn > config.max_turn:
+        why = f"the result is {shift:.2f} m and {turn:.2f} rad from the start; at most {config.max_shift:g}, "
+        why += f"{config.max_turn:g}"
+        return dataclasses.replace(_no_result(start, why), inliers=found.pairs, shift=shift, turn=turn)
+    result = _measure(cloud, target, found, shift, turn, config, known)
+    return dataclasses.replace(result, why=gate(result, config))
+
+
+def register_starts(
+    source: Any,
+    target: Target,
+    starts: Iterable[Any],
+    config: RegistrationConfig | None = None,
+    *,
+    known: Known | None = None,
+    apart: tuple[float, float] = (0.5, 0.1),
+) -> list[Registration]:
+    """Match a cloud from several starts; distinct results, best fitness first.
+
+    Parameters
+    ----------
+    source, target, config, known
+        As for :func:`register`.
+    starts : iterable of (3,) or (7,)
+    apart : (float, float)
+        Results nearer than this to a better one are the same [m, rad].
+
+    Returns
+    -------
+    list of Registration
+        Those with a result, accepted or not; equal fitness in the order of the starts.
+    """
+    cloud = source if isinstance(source, Target) else Target(source, neighbours=target.neighbours)
+    results = [register(cloud, target, T, config, known=known) for T in starts]
+    results = sorted((r for r in results if r.converged), key=lambda r: -r.best_fitness)
+    distinct: list[Registration] = []
+    for r in results:
+        moves = [_moved(b.T_target_source, r.T_target_source) for b in distinct]
+        if all(shift >= apart[0] or turn >= apart[1] for shift, turn in moves):
+            distinct.append(r)
+    return distinct
+
+
+def margin(results: list[Registration], *, apart: float = 1.5) -> float:
+    """Fitness of the best of :func:`register_starts` less that of the next at another place, ``apart`` [m] or more.
+
+    1 where there is no other; NaN where there is none at all.
+    """
+    if not results:
+        return float("nan")
+    best = results[0]
+    others = [r for r in results[1:] if _moved(best.T_target_source, r.T_target_source)[0] >= apart]
+    return best.best_fitness - max((r.best_fitness for r in others), default=best.best_fitness - 1.0)
+
+
+def gate(result: Registration, config: RegistrationConfig) -> str:
+    """The gates that a result fails, in words; empty if none."""
+    g, planar = config.gates, len(result.T_target_source) == 3
+    fails = []
+    if np.isnan(result.fitness_known):
+        if result.fitness < g.fitness:
+            fails.append(f"fitness {result.fitness:.3f} < {g.fitness:g}")
+    else:
+        if result.fitness_known < g.fitness_known:
+            fails.append(f"fitness in known space {result.fitness_known:.3f} < {g.fitness_known:g}")
+        if result.known_share < g.known_share:
+            fails.append(f"share in known space {result.known_share:.3f} < {g.known_share:g}")
+    if result.fitness_upright < g.fitness_upright:  # NaN is not
+        fails.append(f"fitness of upright surfaces {result.fitness_upright:.3f} < {g.fitness_upright:g}")
+    least = g.degeneracy_planar if planar else g.degeneracy
+    if result.degeneracy < least:
+        fails.append(f"degenerate: eigenvalue ratio {result.degeneracy:.4f} < {least:g}")
+    if result.tilt > g.tilt:
+        fails.append(f"tilt {np.degrees(result.tilt):.1f}° > {np.degrees(g.tilt):.1f}°")
+    return "; ".join(fails)
+
+
+def _align(source: Target, target: Target, T: Array, config: RegistrationConfig) -> Aligned:
+    """Both radii."""
+    limits = (config.iterations, config.rotation_epsilon, config.translation_epsilon)
+    if target.dim == 2:
+        found = Aligned(T, np.zeros((3, 3)), 0.0, 0)
+        for radius in config.radii:
+            found = align_planar(source, target, found.T, radius, *limits)
+        return found
+    (cloud, tree), (moving, _) = target.cloud, source.cloud
+    matrix = se3.pose_to_matrix(T)
+    for radius in config.radii:
+        result = small_gicp.align(
+            cloud,
+            moving,
+            tree,
+            init_T_target_source=matrix,
+            registration_type="GICP",
+            max_correspondence_distance=radius,
+            num_threads=1,
+            max_iterations=config.iterations,
+            rotation_epsilon=config.rotation_epsilon,
+            translation_epsilon=config.translation_epsilon,
+        )
+        matrix = np.asarray(result.T_target_source)
+        if not np.all(np.isfinite(matrix)):
+            return Aligned(np.full(7, np.nan), np.full((6, 6), np.nan), float("nan"), int(result.num_inliers))
+    pose = np.concatenate([matrix[:3, 3], se3.matrix_to_quat(matrix[:3, :3])])
+    return Aligned(pose, np.asarray(result.H), float(result.error), int(result.num_inliers))
+
+
+def _measure(
+    source: Target,
+    target: Target,
+    found: Aligned,
+    shift: float,
+    turn: float,
+    config: RegistrationConfig,
+    known: Known | None,
+) -> Registration:
+    """Everything about a result but the verdict."""
+    dim, planar = target.dim, target.dim == 2
+    moved = transform(found.T, source.points)
+    reach = max(config.near, config.radii[-1])
+    distance, which = target.tree.query(moved, distance_upper_bound=reach)
+    near = distance < config.near
+    inside = None if known is None else np.asarray(known(moved) if callable(known) else known, dtype=bool)
+    share = float("nan") if inside is None else float(np.mean(inside))
+    fitness_known = float("nan") if inside is None else float(np.mean(near[inside])) if np.any(inside) else 0.0
+    paired = np.flatnonzero(distance < config.radii[-1])
+    upright = float("nan")
+    if not planar:
+        normals, _ = source.normals(np.arange(len(source)))
+        steep = np.abs(se3.quat_rotate(found.T[3:], normals)[:, 2]) < np.sqrt(0.5)
+        steep &= np.any(normals != 0.0, axis=1)
+        if np.sum(steep) >= config.least_points:
+            upright = float(np.mean(near[steep]))
+    own, partner = source.normals(paired), target.normals(which[paired])
+    rotation = se2.rotation2(found.T[2]) if planar else se3.quat_to_matrix(found.T[3:])
+    feigned = feigned_information(source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1]))
+    information = found.hessian - feigned
+    held = translational_degeneracy(information, dim)
+    # the noise that the pairs show: 1 where the variances of the shapes are right
+    freedom = max(found.pairs - len(found.hessian), 1)
+    noise = max(2.0 * found.error / freedom, _LEAST_NOISE)
+    factor = config.covariance_scale_planar if planar else config.covariance_scale
+    covariance = calibrated_covariance(
+        information,
+        dim=dim,
+        scale=factor * noise,
+        sigma=(config.floor_sigma, config.floor_turn),
+        unknown=(config.max_shift, config.max_turn),
+        threshold=config.gates.degeneracy_planar if planar else config.gates.degeneracy,
+    )
+    move = slice(0, 2) if planar else slice(3, 6)
+    sigma = float(np.sqrt(held.weakest @ covariance[move, move] @ held.weakest))
+    return Registration(
+        T_target_source=found.T,
+        covariance=covariance,
+        fitness=float(np.mean(near)),
+        fitness_known=fitness_known,
+        fitness_upright=upright,
+        known_share=share,
+        rmse=float(np.sqrt(np.mean(distance[near] ** 2))) if np.any(near) else float("nan"),
+        inliers=found.pairs,
+        degeneracy=held.ratio,
+        weakest=held.weakest,
+        weakest_sigma=sigma,
+        tilt=0.0 if planar else tilt_of(found.T),
+        shift=shift,
+        turn=turn,
+        converged=True,
+        why="",
+    )
+
+
+def tilt_of(T: Array) -> float:
+    """Angle between the z axes of the two frames of a pose ``(7,)`` [rad]."""
+    x, y = T[3], T[4]
+    return float(2.0 * np.arctan2(np.hypot(x, y), np.hypot(T[5], T[6])))
+
+
+def _moved(T_a: Array, T_b: Array) -> tuple[float, float]:
+    """Distance between the origins of two poses [m], and angle between them [rad]."""
+    shift = float(np.linalg.norm((T_b - T_a)[: 2 if len(T_a) == 3 else 3]))
+    if len(T_a) == 3:
+        return shift, float(abs(se2.wrap_angle(T_b[2] - T_a[2])))
+    return shift, float(np.linalg.norm(se3.so3_log(se3.se3_between(T_a, T_b)[3:])))
+
+
+def _no_result(start: Array, why: str) -> Registration:
+    planar = len(start) == 3
+    d, nan = (3 if planar else 6), float("nan")
+    return Registration(
+        T_target_source=start,
+        covariance=np.full((d, d), nan),
+        fitness=0.0,
+        fitness_known=nan,
+        fitness_upright=nan,
+        known_share=nan,
+        rmse=nan,
+        inliers=0,
+        degeneracy=0.0,
+        weakest=np.full(2 if planar else 3, nan),
+        weakest_sigma=nan,
+        tilt=nan,
+        shift=nan,
+        turn=nan,
+        converged=False,
+        why=why,
+    )

@@ -1,0 +1,398 @@
+"""Correlative search: every place on a lattice where a cloud may lie in a map, scored; the distinct best are starts.
+
+Drift at a loop closure is larger than what an iterative matcher corrects, and in a place that repeats itself (pillars,
+doors) the nearest optimum is often the wrong one. So all translations and headings within what the drift allows are
+scored (Olson 2009, "Real-time correlative scan matching"), and *several* modes are given, for an iterative matcher and
+its gates to choose from.
+
+Nothing is pruned: for one heading the points are rounded to cells once, after which all translations add up shifted
+rows of the field, a few tenths of a nanosecond for a point and a start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, DataError, GeometryError
+from graphslam.core.geometry import Array, wrap_angle
+from graphslam.registration.points import check_pose, finite_points, spread, thin, transform
+from graphslam.registration.search_kernels import local_maxima, score_block, splat
+
+MOST_CELLS = 200_000_000
+MOST_STARTS = 50_000_000
+
+
+class SearchField:
+    """How near an occupied cell is, everywhere around a map: what a search looks into.
+
+    Parameters
+    ----------
+    points : (m, dim)
+        Of the map, dim 2 or 3: a cloud, or the centres of a grid's occupied voxels [m]. Those that are not finite are
+        left out and counted in ``dropped``.
+    cell : float
+        Edge of a cell [m].
+    sigma : float
+        The field is ``exp(-d² / 2σ²)`` at distance d [m] from the centre of the nearest occupied cell, in 255 steps,
+        and 0 beyond 3 σ. Half the steps of the lattice to be searched, or more: what falls between them is not found.
+
+    Raises
+    ------
+    GeometryError
+        Points of an impossible shape.
+    DataError
+        No finite point, or points so far apart that the field would not fit into memory.
+    ConfigError
+        An impossible number.
+    """
+
+    def __init__(self, points: Any, *, cell: float = 0.2, sigma: float = 0.3) -> None:
+        if not (np.isfinite(cell) and cell > 0 and np.isfinite(sigma) and sigma > 0):
+            raise ConfigError(f"search field: cell {cell}, sigma {sigma}; wanted positive numbers of metres")
+        p = finite_points(points, what="points of the search field")
+        self.dropped = len(points) - len(p)
+        if not len(p):
+            raise DataError("a search field needs points", got=f"{self.dropped} that are not finite, no other")
+        self.dim, self.cell, self.sigma = p.shape[1], float(cell), float(sigma)
+        reach = int(np.floor(3.0 * sigma / cell))
+        low, high = np.floor(p.min(axis=0) / cell) - reach, np.floor(p.max(axis=0) / cell) + reach
+        size = np.ones(3)
+        size[: self.dim] = high - low + 1
+        if not np.prod(size) <= MOST_CELLS:
+            raise DataError(
+                "the points of a search field are too far apart",
+                got=f"{' × '.join(f'{n * cell:.0f}' for n in size)} m in cells of {cell} m",
+                wanted=f"at most {MOST_CELLS} cells: leave out stray points, or choose larger cells",
+            )
+        self._low = np.zeros(3, dtype=np.int64)
+        self._low[: self.dim] = low.astype(np.int64)
+        occupied = np.unique(self._cells(p), axis=0)
+        around = np.arange(-reach, reach + 1)
+        offsets = np.stack(np.meshgrid(around, around, around if self.dim == 3 else [0], indexing="ij"), -1)
+        offsets = offsets.reshape(-1, 3)
+        d2 = np.sum(offsets**2, axis=1) * cell**2
+        near = d2 <= (3.0 * sigma) ** 2
+        values = np.rint(255.0 * np.exp(-0.5 * d2 / sigma**2)).astype(np.uint8)
+        nx, ny, nz = size.astype(np.int64)
+        self.values: npt.NDArray[np.uint8] = np.zeros((nz, ny, nx), np.uint8)
+        splat(occupied, offsets[near].astype(np.int64), values[near], self.values)
+        self._phases: dict[tuple[int, int, int], npt.NDArray[np.uint8]] = {}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the field, and of its copies for the lattices searched so far."""
+        return self.values.nbytes + sum(a.nbytes for a in self._phases.values())
+
+    def _cells(self, points: Array) -> npt.NDArray[np.int64]:
+        """Cells ``(m, 3)`` x, y, z of points, counted from the corner of the field."""
+        out = np.zeros((len(points), 3), dtype=np.int64)
+        out[:, : self.dim] = np.floor(points / self.cell).astype(np.int64)
+        return out - self._low
+
+    def _in_phases(self, steps: tuple[int, int, int]) -> npt.NDArray[np.uint8]:
+        """The field as one array per phase of a lattice; see :func:`~.search_kernels.score_block`."""
+        if steps not in self._phases:
+            sx, sy, sz = steps
+            nz, ny, nx = self.values.shape
+            whole = np.pad(self.values, [(0, -nz % sz), (0, -ny % sy), (0, -nx % sx)])
+            z, y, x = whole.shape
+            split = whole.reshape(z // sz, sz, y // sy, sy, x // sx, sx)
+            self._phases[steps] = np.ascontiguousarray(split.transpose(1, 3, 5, 0, 2, 4))
+        return self._phases[steps]
+
+    def value_at(self, points: Any) -> Array:
+        """The field, 0 … 1, at points ``(m, dim)`` in the frame of the map [m]; 0 outside it."""
+        c = self._cells(finite_points(points))
+        inside = np.all((c >= 0) & (c < self.values.shape[::-1]), axis=1)
+        out = np.zeros(len(c))
+        out[inside] = self.values[tuple(c[inside].T[::-1])] / 255.0
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """A place to start an iterative matcher from.
+
+    Parameters
+    ----------
+    T : (3,) or (7,)
+        ``T_target_source``.
+    score : float
+        Mean of the field under the points, 0 … 1.
+    weight : float
+        Logarithm of what starts are ordered by: ``-½ ((1 - score) / score_sigma)²``, and less where the prior has it
+        unlikely.
+    offset : tuple of float
+        From the pose searched around: x, y[, z] [m] in the target's axes, heading [rad].
+    """
+
+    T: Array
+    score: float
+    weight: float
+    offset: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchConfig:
+    """How a search is done.
+
+    Parameters
+    ----------
+    most_points : int
+        Source points used: one a cell of the field, of these so many, evenly from first to last.
+    apart : float
+        Two starts nearer than this [m], and turned by less than ``turned`` [rad], are one mode.
+    turned : float
+    score_sigma : float
+        What a score may fall short of 1 by at the true place; only matters against a prior.
+    refine : bool
+        Look once more around each of ``4 keep`` modes, at every cell and at quarters of the heading step, and order
+        them by what is found there: the lattice misses some modes by more than others.
+    """
+
+    most_points: int = 300
+    apart: float = 1.5
+    turned: float = 0.35
+    score_sigma: float = 0.15
+    refine: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("most_points", "apart", "turned", "score_sigma"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"search: {name} is {value}; wanted a positive number")
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """Offsets searched, symmetric about zero; each ``(n,)``."""
+
+    x: Array
+    y: Array
+    z: Array
+    yaw: Array
+    steps: tuple[int, int, int] = field(default=(1, 1, 1))
+    """Cells of the field between neighbours along x, y, z."""
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Headings, then z, y, x: the order of the scores."""
+        return len(self.yaw), len(self.z), len(self.y), len(self.x)
+
+    def axes(self) -> list[tuple[int, bool]]:
+        """Of x, y, z: the step in cells, and whether there is more than one offset."""
+        return [(s, len(a) > 1) for s, a in zip(self.steps, (self.x, self.y, self.z))]
+
+    def places(self, index: npt.NDArray[np.int64]) -> Array:
+        """Offsets ``(k, 4)`` x, y, z, heading of elements ``(k, 4)`` of the scores."""
+        return np.stack([self.x[index[:, 3]], self.y[index[:, 2]], self.z[index[:, 1]], self.yaw[index[:, 0]]], 1)
+
+
+def make_lattice(field: SearchField, half_widths: Sequence[float], steps: Sequence[float], reach: float) -> Lattice:
+    """The offsets within ``half_widths``; arguments as for :func:`correlative_search`, ``reach`` for a heading step of
+    0 [m].
+
+    Raises
+    ------
+    ConfigError
+    """
+    n = field.dim + 1
+    names = ("x", "y", "z", "heading")[: n - 1] + ("heading",) if n == 4 else ("x", "y", "heading")
+    half, step = np.array(half_widths, dtype=np.float64), np.array(steps, dtype=np.float64)
+    if half.shape != (n,) or step.shape != (n,) or not np.all(np.isfinite(half) & np.isfinite(step) & (half >= 0)):
+        raise ConfigError(f"search: half widths {half_widths}, steps {steps}; wanted {n} of each: {', '.join(names)}")
+    cells = np.rint(step[:-1] / field.cell)
+    if np.any(cells < 1) or np.any(np.abs(cells * field.cell - step[:-1]) > 1e-6):
+        raise ConfigError(f"search: steps {step[:-1]} m are no multiples of the field's cell, {field.cell} m")
+    if step[-1] < 0:
+        raise ConfigError(f"search: a heading step of {step[-1]} rad; wanted a positive one, or 0 for the field's σ")
+    if step[-1] == 0:
+        step[-1] = float(np.clip(field.sigma / max(reach, 1e-9), 0.005, 0.2))
+    counts = np.floor(half / step + 1e-9)
+    counts[-1] = min(counts[-1], np.floor(np.pi / step[-1]))
+    if not np.prod(2 * counts + 1) <= MOST_STARTS:
+        raise ConfigError(f"search: {np.prod(2 * counts + 1):.3g} starts; wanted at most {MOST_STARTS}")
+    axes = [np.arange(-c, c + 1) * s for c, s in zip(counts, step)]
+    whole = [int(c) for c in cells] + [1]
+    return Lattice(axes[0], axes[1], axes[2] if n == 4 else np.zeros(1), axes[-1], (whole[0], whole[1], whole[2]))
+
+
+def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lattice) -> npt.NDArray[np.uint32]:
+    """Sum of the field, in 255ths, under all points at every offset of a lattice.
+
+    Parameters
+    ----------
+    points : (n, dim)
+        In the source frame, finite [m].
+    field : SearchField
+    around : (3,) or (7,)
+    lattice : Lattice
+
+    Returns
+    -------
+    (headings, z, y, x) uint32
+    """
+    phases = field._in_phases(lattice.steps)
+    scores = np.zeros(lattice.shape, np.uint32)
+    block = np.empty(lattice.shape[1:], np.uint16)
+    first = np.array([lattice.x[0], lattice.y[0], lattice.z[0]])
+    counts, steps = np.array(lattice.shape[:0:-1]), np.array(lattice.steps)
+    # the cell is found at the middle of the lattice, so that it does not depend on how wide that is
+    back = np.rint(first / field.cell).astype(np.int64)
+    for a, yaw in enumerate(lattice.yaw):
+        placed = transform(offset_pose(around, (0.0, 0.0, 0.0, yaw)), points)
+        score_block(field._cells(placed) + back, counts, steps, phases, block, scores[a])
+    return scores
+
+
+def offset_pose(around: Array, offset: Sequence[float]) -> Array:
+    """The pose moved by x, y, z [m] along the target's axes and turned about the vertical through itself [rad]."""
+    x, y, z, yaw = offset
+    if len(around) == 3:
+        return np.array([around[0] + x, around[1] + y, wrap_angle(around[2] + yaw)])
+    turn = np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
+    return np.concatenate([around[:3] + np.array([x, y, z]), se3.quat_normalize(se3.quat_multiply(turn, around[3:]))])
+
+
+def correlative_search(
+    source: Any,
+    field: SearchField,
+    around: Any,
+    half_widths: Sequence[float],
+    steps: Sequence[float] | None = None,
+    keep: int = 6,
+    *,
+    prior: Sequence[float] | None = None,
+    config: SearchConfig | None = None,
+) -> list[Start]:
+    """Distinct places where the source may lie in the map, best first.
+
+    Parameters
+    ----------
+    source : (m, dim)
+        Points in the source frame [m]; what is not finite is left out.
+    field : SearchField
+        Of the map.
+    around : (3,) or (7,)
+        ``T_target_source`` in the middle of the search. Its roll and pitch are kept.
+    half_widths : (x, y, z, heading), in two dimensions (x, y, heading)
+        Of the search, each side [m, rad].
+    steps : as ``half_widths``, optional
+        Of the lattice. Those of x, y, z are multiples of the field's cell; a heading step of 0 moves the farther points
+        by σ of the field. Two cells, and 0, by default.
+    keep : int
+        Modes wanted. There may be fewer.
+    prior : as ``half_widths``, optional
+        σ of the true pose about ``around``: starts are then ordered by score and prior together.
+    config : SearchConfig, optional
+
+    Returns
+    -------
+    list of Start
+        Local maxima of the lattice, of which none is near a better one. Empty without points, and where nothing of
+        the map lies under any point.
+
+    Raises
+    ------
+    ConfigError, GeometryError
+        Impossible numbers or shapes.
+
+    Notes
+    -----
+    The same input gives the same output.
+    """
+    config = SearchConfig() if config is None else config
+    T = check_pose(around, field.dim, what="pose to search around")
+    p = finite_points(source, what="source points")
+    if p.shape[1] != field.dim:
+        raise GeometryError("source and field differ in dimension", got=p.shape[1], wanted=field.dim)
+    if keep < 1:
+        raise ConfigError(f"search: {keep} modes wanted; wanted at least 1")
+    p = spread(thin(p, field.cell), config.most_points)
+    step = (*[2.0 * field.cell] * field.dim, 0.0) if steps is None else steps
+    reach = float(np.quantile(np.hypot(p[:, 0], p[:, 1]), 0.9)) if len(p) else 1.0
+    lattice = make_lattice(field, half_widths, step, reach)
+    sigmas = _prior(prior, field.dim)
+    if not len(p):
+        return []
+    weights, scores = _weigh(score_lattice(p, field, T, lattice), len(p), lattice, sigmas, config)
+    top = local_maxima(weights)
+    places, best = lattice.places(top), tuple(top.T)
+    weight, score = weights[best], scores[best]
+    if config.refine:
+        first = _distinct(places, weight, 4 * keep, config)
+        places, weight, score = _refine(p, field, T, lattice, places[first], sigmas, config)
+    starts = []
+    for s in _distinct(places, weight, keep, config):
+        x, y, z, yaw = (float(v) for v in places[s])
+        shown = (x, y, z, yaw) if field.dim == 3 else (x, y, yaw)
+        starts.append(Start(offset_pose(T, places[s]), float(score[s]), float(weight[s]), shown))
+    return starts
+
+
+def _weigh(
+    sums: npt.NDArray[np.uint32], points: int, lattice: Lattice, sigmas: tuple[float, ...] | None, config: SearchConfig
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Weights and scores of a lattice; see :class:`Start`. The weight is -inf where nothing is met."""
+    scores = sums.astype(np.float32) / np.float32(255.0 * points)
+    weights = -0.5 * ((1.0 - scores) / np.float32(config.score_sigma)) ** 2
+    if sigmas is not None:
+        for axis, (offsets, sigma) in enumerate(zip((lattice.yaw, lattice.z, lattice.y, lattice.x), sigmas)):
+            term = (-0.5 * (offsets / sigma) ** 2).astype(np.float32)
+            weights += term.reshape([-1 if a == axis else 1 for a in range(4)])
+    weights[sums == 0] = -np.inf
+    return weights, scores
+
+
+def _refine(
+    points: Array,
+    field: SearchField,
+    around: Array,
+    lattice: Lattice,
+    places: Array,
+    sigmas: tuple[float, ...] | None,
+    config: SearchConfig,
+) -> tuple[Array, Array, Array]:
+    """The best place within half a step of each of ``places (k, 4)``: places, weights, scores."""
+    turn = lattice.yaw[1] - lattice.yaw[0] if len(lattice.yaw) > 1 else 0.0
+    half: list[Array] = [
+        field.cell * np.arange(-(c // 2), c // 2 + 1.0) if wide else np.zeros(1) for c, wide in lattice.axes()
+    ]
+    headings = np.arange(-2, 3) * 0.25 * turn if turn else np.zeros(1)
+    found, weight, score = places.copy(), np.empty(len(places)), np.empty(len(places))
+    for k, at in enumerate(places):
+        near = Lattice(half[0], half[1], half[2], headings)
+        sums = score_lattice(points, field, offset_pose(around, at), near)
+        whole = Lattice(half[0] + at[0], half[1] + at[1], half[2] + at[2], headings + at[3])
+        weights, scores = _weigh(sums, len(points), whole, sigmas, config)
+        best = np.unravel_index(int(np.argmax(weights)), weights.shape)
+        found[k], weight[k], score[k] = whole.places(np.array([best]))[0], weights[best], scores[best]
+    return found, weight, score
+
+
+def _distinct(places: Array, weights: Array, keep: int, config: SearchConfig) -> list[int]:
+    """Indices of the best of ``places (k, 4)``, best first, leaving out those near a better one."""
+    left = np.argsort(-weights, kind="stable")
+    chosen: list[int] = []
+    while len(left) and len(chosen) < keep:
+        chosen.append(int(left[0]))
+        d = places[left] - places[left[0]]
+        near = np.sum(d[:, :3] ** 2, axis=1) < config.apart**2
+        left = left[~(near & (np.abs(wrap_angle(d[:, 3])) < config.turned))]
+    return chosen
+
+
+def _prior(prior: Sequence[float] | None, dim: int) -> tuple[float, ...] | None:
+    """σ of heading, z, y, x."""
+    if prior is None:
+        return None
+    s = np.array(prior, dtype=np.float64)
+    if s.shape != (dim + 1,) or not np.all(s > 0):
+        raise ConfigError(f"search: prior {prior}; wanted {dim + 1} positive σ")
+    return (s[3], s[2], s[1], s[0]) if dim == 3 else (s[2], np.inf, s[1], s[0])
