@@ -113,9 +113,11 @@ def find_revisits(
         near = np.flatnonzero(d < radius)
         if len(near):
             before = match[k - 1]
-            # of several earlier visits the one that is being followed, else the nearest
+            # of several earlier visits the one that is being followed, else one in the same direction, else the nearest
             follows = near[np.abs(near - before) * spacing <= _JUMP] if before >= 0 else near[:0]
-            match[k] = follows[d[follows].argmin()] if len(follows) else near[d[near].argmin()]
+            alike = near[np.cos(h[near] - h[k]) > 0.0]
+            choice = follows if len(follows) else alike if len(alike) else near
+            match[k] = choice[d[choice].argmin()]
     found: list[dict[str, Any]] = []
     begin = 0
     for k in range(1, len(s) + 1):

