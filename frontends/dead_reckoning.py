@@ -55,7 +55,7 @@ class DeadReckoningNoise:
     vertical: float = 0.005
     """The same upwards [m/√m]."""
     attitude_bias: float = float(np.deg2rad(0.1))
-    """σ of errors of the unit's roll and pitch that last [rad]."""
+    """Part that lasts of the σ of the unit's own roll and pitch [rad]; the rest of it fades."""
     filter_time: float = 5.0
     """Time constant of the complementary filter, where the unit gives no attitude [s]."""
     bridge: float = 2.0
@@ -142,6 +142,7 @@ def reckon(
     times: npt.ArrayLike,
     noise: DeadReckoningNoise | None = None,
     *,
+    since: float | None = None,
     where: str = "log",
     drops: DropCounter | None = None,
 ) -> Reckoned:
@@ -157,6 +158,8 @@ def reckon(
     times : (n,)
         Strictly increasing, inside the IMU's records; none before the first speed. The last speed is held.
     noise : DeadReckoningNoise, optional
+    since : float, optional
+        Start of the path, and its frame; ``times[0]`` by default, else not after it [s].
     where : str
         Name of the log, for messages.
     drops : DropCounter, optional
@@ -181,19 +184,20 @@ def reckon(
     if len(t) == 0:
         raise DataError("no time to dead-reckon at", where=where, wanted="at least one")
     least = max(imu.times[0], wheels.times[0])
-    if t[0] < least or t[-1] > imu.times[-1]:
+    begin = float(t[0]) if since is None else float(since)
+    if not (least <= begin <= t[0] and t[-1] <= imu.times[-1]):
         raise DataError(
             "times outside the records",
             where=where,
-            got=f"[{t[0]:.3f}, {t[-1]:.3f}] s",
+            got=f"[{begin:.3f}, {t[-1]:.3f}] s",
             wanted=f"[{least:.3f}, {imu.times[-1]:.3f}] s",
         )
-    span = (float(t[0]), float(t[-1]))
+    span = (begin, float(t[-1]))
     imu_gaps = find_gaps(imu.times, *span, noise.bridge, where=f"{where}/imu", drops=drops)
     wheel_gaps = find_gaps(wheels.times, *span, noise.bridge, where=f"{where}/wheels", drops=drops)
 
     stamps = np.concatenate([imu.times, wheels.times])
-    knots = np.union1d(stamps[(stamps > t[0]) & (stamps < t[-1])], t)
+    knots = np.union1d(stamps[(stamps > begin) & (stamps < t[-1])], np.append(t, begin))
     middle = 0.5 * (knots[1:] + knots[:-1])
     active = np.searchsorted(wheels.times, middle, side="right") - 1
     speed = wheels.speed[active]
@@ -264,11 +268,12 @@ def _up(imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoi
     if imu.attitude is not None:
         r, p = imu.attitude.T
         up = np.column_stack([-np.sin(p), np.sin(r) * np.cos(p), np.cos(r) * np.cos(p)])
+        lasts = min(noise.attitude_bias, n.attitude)
         lasting = LastingErrors(
             **common,
-            attitude=n.attitude,
+            attitude=float(np.sqrt(n.attitude**2 - lasts**2)),
             attitude_time=max(n.attitude_time, 1e-3),
-            attitude_bias=noise.attitude_bias,
+            attitude_bias=lasts,
             attitude_walk=0.0,
         )
         return se3.quat_rotate(imu.T_base_imu[3:], up), lasting

@@ -73,7 +73,7 @@ class Reckoned:
         Increments ``(n, 7)`` with the covariance of what is new in each step: for filters that sample steps as
         independent. Errors that last are not in it.
     poses : (n, 7)
-        Frame of the path: position and heading of the first pose, level.
+        Frame of the path: position and heading of its start, level.
     path : Trajectory
         Poses at every record of the sensors, same frame.
     tilt : (n, 2)

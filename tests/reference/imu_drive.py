@@ -20,7 +20,7 @@ STATED = ImuNoise(
     accelerometer=5e-3,
     accelerometer_bias=0.03,
     accelerometer_walk=1e-3,
-    attitude=np.deg2rad(0.25),
+    attitude=float(np.hypot(np.deg2rad(0.25), np.deg2rad(0.1))),
     attitude_time=4.0,
 )
 NOISE = DeadReckoningNoise(attitude_bias=float(np.deg2rad(0.1)))
@@ -126,9 +126,10 @@ def drive(
         U = Rs @ M
         tilt = np.column_stack([np.arctan2(U[:, 2, 1], U[:, 2, 2]), -np.arcsin(U[:, 2, 0])])
         error, fade, w = np.empty((n, 2)), np.exp(-h / stated.attitude_time), draw(n, 2)
-        error[0] = stated.attitude * w[0]
+        sigma = np.sqrt(max(stated.attitude**2 - noise.attitude_bias**2, 0.0))
+        error[0] = sigma * w[0]
         for k in range(1, n):
-            error[k] = fade * error[k - 1] + stated.attitude * np.sqrt(1 - fade**2) * w[k]
+            error[k] = fade * error[k - 1] + sigma * np.sqrt(1 - fade**2) * w[k]
         attitude = tilt + error + on * noise.attitude_bias * draw(2)
     imu = Imu(times=t, angular_rate=gyro, specific_force=force, noise=stated, attitude=attitude, T_base_imu=MOUNT)
     every = 5

@@ -1,0 +1,224 @@
+"""Beams of whatever scanner, chosen evenly and moved to where the base stands when their step ends.
+
+Beams are listed first (stamp and step of each, nothing else), then chosen, and only the chosen ones are given a
+position: the thinning costs nothing and the dear part is done a few hundred times a step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.recorded import between
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.log import DropCounter
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LaserScans
+from graphslam.core.trajectory import Trajectory
+
+Index = npt.NDArray[np.int64]
+_AT_ONCE = 1 << 18
+
+
+class BeamSource(Protocol):
+    """Beams of one stream, numbered; the readings that say nothing are left out and counted."""
+
+    times: Array
+    """Stamp of each beam ``(q,)`` [s]."""
+    dim: int
+    max_range: float
+    sigma: float
+
+    def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Origins ``(k, dim)``, ends ``(k, dim)`` in the base at the beam's own time, and whether they met something;
+        of beams with rising numbers."""
+        ...
+
+
+def cut_beams(
+    origins: Array, ends: Array, met: npt.NDArray[np.bool_], max_range: float
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Ends of beams, none farther than ``max_range``: those that go on are cut there and met nothing so far."""
+    along = ends - origins
+    length = np.linalg.norm(along, axis=1)
+    far = length >= max_range
+    scale = np.where(far, max_range / np.where(length > 0, length, 1.0), 1.0)
+    return origins + scale[:, None] * along, np.asarray(met & ~far)
+
+
+@dataclass(slots=True)
+class _Spinning:
+    scans: RangeScans
+    record: Index
+    beam: Index
+    times: Array
+    max_range: float
+    sigma: float
+    dim: int = 3
+
+    def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        s, k, j = self.scans, self.record[chosen], self.beam[chosen]
+        ranges = s.ranges[k, j].astype(np.float64)
+        origins = np.broadcast_to(s.T_base_mount[:3], (len(k), 3))
+        met = ranges < s.max_range
+        reach = np.minimum(ranges, s.max_range)
+        return origins, origins + reach[:, None] * beam_directions(s, k, j), met
+
+
+def beam_directions(scans: RangeScans, record: Index, beam: Index) -> Array:
+    """Unit directions ``(k, 3)`` of single beams in the base at their own time."""
+    assert scans.spin is not None
+    assert scans.spin_rate is not None
+    angle = scans.spin[record] + scans.spin_rate[record] * scans.beam_times[beam]
+    turn = np.zeros((len(angle), 4))
+    turn[:, 0], turn[:, 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    q = se3.quat_multiply(np.broadcast_to(scans.T_base_mount[3:], turn.shape), turn)
+    return se3.quat_rotate(q, scans.directions[beam])
+
+
+@dataclass(slots=True)
+class _Planar:
+    scans: LaserScans
+    record: Index
+    beam: Index
+    times: Array
+    max_range: float
+    sigma: float
+    dim: int = 2
+
+    def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        s, k, j = self.scans, self.record[chosen], self.beam[chosen]
+        ranges = s.ranges[k, j].astype(np.float64)
+        reach, angle = np.minimum(ranges, s.max_range), s.bearings[j] + s.T_base_sensor[2]
+        origins = np.broadcast_to(s.T_base_sensor[:2], (len(k), 2))
+        return origins, origins + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]), ranges < s.max_range
+
+
+@dataclass(slots=True)
+class _Clouds:
+    clouds: PointClouds
+    record: Index
+    row: Index
+    times: Array
+    max_range: float
+    sigma: float
+    dim: int = 3
+
+    def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        c, record, row = self.clouds, self.record[chosen], self.row[chosen]
+        ends = np.empty((len(chosen), 3))
+        bounds = np.flatnonzero(np.append(True, np.diff(record) != 0)) if len(record) else np.zeros(0, dtype=np.int64)
+        for a, b in zip(bounds, np.append(bounds[1:], len(record))):
+            ends[a:b] = c.cloud(int(record[a]))[row[a:b]]
+        origins = np.broadcast_to(se3.se3_transform(c.T_base_sensor, c.origin), ends.shape)
+        return origins, se3.se3_transform(c.T_base_sensor, ends), np.ones(len(ends), dtype=np.bool_)
+
+
+Scanner = RangeScans | PointClouds | LaserScans
+
+
+def beam_source(
+    stream: Scanner, name: str, *, min_range: float, range_sigma: float, cloud_range: float, drops: DropCounter
+) -> BeamSource:
+    """List the beams of a stream that say something.
+
+    Left out and counted: beams without a reading, and what is nearer than ``min_range``. Scans in which no beam met
+    anything are kept, for they say that space is free, and counted.
+    """
+    if isinstance(stream, PointClouds):
+        return _list_clouds(stream, name, min_range, range_sigma, cloud_range, drops)
+    ranges = stream.ranges
+    with np.errstate(invalid="ignore"):
+        nothing = ranges >= stream.max_range
+        good = nothing | (ranges >= min_range)
+    unread = np.isnan(ranges)
+    drops.drop(name, "beam without a reading", int(unread.sum()))
+    drops.drop(name, f"nearer than {min_range:g} m", int(np.sum(~good & ~unread)))
+    drops.drop(name, "scan without a reading", int(np.sum(~good.any(axis=1))))
+    drops.drop(name, "scan that met nothing (kept)", int(np.sum((nothing | ~good).all(axis=1) & good.any(axis=1))))
+    record, beam = (a.astype(np.int64) for a in np.nonzero(good))
+    if isinstance(stream, RangeScans):
+        times = stream.times[record] + stream.beam_times[beam]
+        return _Spinning(stream, record, beam, times, stream.max_range, stream.sigma)
+    return _Planar(stream, record, beam, stream.times[record], stream.max_range, range_sigma)
+
+
+def _list_clouds(
+    clouds: PointClouds, name: str, min_range: float, sigma: float, max_range: float, drops: DropCounter
+) -> BeamSource:
+    rows, near, empty = [], 0, 0
+    for k in range(len(clouds)):
+        length = np.linalg.norm(clouds.cloud(k) - clouds.origin, axis=1)
+        good = np.flatnonzero(length >= max(min_range, 1e-9))
+        near += len(length) - len(good)
+        empty += len(good) == 0
+        rows.append(good)
+    drops.drop(name, f"nearer than {min_range:g} m", near)
+    drops.drop(name, "scan without a reading", empty)
+    record = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+    return _Clouds(clouds, record, row.astype(np.int64), clouds.times[record], max_range, sigma)
+
+
+def spread(n: int, most: int) -> Index:
+    """``most`` of ``n`` numbers, rising, one from each of as many equal stretches; all if there are no more.
+
+    Inside its stretch the number moves by the golden ratio, so that the choice does not fall into step with the beams
+    of a scan (every second beam of each scan, never the others).
+    """
+    if n <= most:
+        return np.arange(n, dtype=np.int64)
+    i = np.arange(most)
+    offset = np.mod(i * 0.6180339887498949 + 0.5, 1.0)
+    edges = (i * n) // most
+    width = ((i + 1) * n) // most - edges
+    return np.asarray(edges + (offset * width).astype(np.int64), dtype=np.int64)
+
+
+def assign(beam_times: Array, step_times: Array, begin: float) -> Index:
+    """Step ``(q,)`` that each beam belongs to: the first that ends at its stamp or after; -1 outside.
+
+    Parameters
+    ----------
+    beam_times : (q,)
+    step_times : (n,)
+    begin : float
+        Start of the first step [s].
+    """
+    step = np.searchsorted(step_times, beam_times, side="left")
+    return np.where((beam_times < begin) | (step == len(step_times)), -1, step).astype(np.int64)
+
+
+def deskew(
+    path: Trajectory, step_poses: Array, step: Index, times: Array, origins: Array, ends: Array
+) -> tuple[Array, Array]:
+    """Move beams from the base at their own time to the base at the end of their step.
+
+    Parameters
+    ----------
+    path : Trajectory
+        ``T_frame_base(t)``, covers ``times``.
+    step_poses : (n, 7) or (n, 3)
+        Same frame.
+    step, times : (q,)
+    origins, ends : (q, dim)
+
+    Returns
+    -------
+    origins, ends : (q, dim)
+    """
+    out_origins, out_ends = np.empty_like(ends), np.empty_like(ends)
+    transform = se2_transform if path.dim == 2 else se3.se3_transform
+    for a in range(0, len(times), _AT_ONCE):
+        part = slice(a, min(a + _AT_ONCE, len(times)))
+        T = between(step_poses[step[part]], path.interpolate(times[part]))
+        out_origins[part], out_ends[part] = transform(T, origins[part]), transform(T, ends[part])
+    if not (np.all(np.isfinite(out_ends)) and np.all(np.isfinite(out_origins))):
+        raise DataError("a beam has no finite position", got=f"beam {np.argwhere(~np.isfinite(out_ends))[:1]}")
+    return out_origins, out_ends

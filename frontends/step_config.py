@@ -1,0 +1,62 @@
+"""Configuration of steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from frontends.dead_reckoning import DeadReckoningNoise
+from frontends.motion import MotionNoise
+from graphslam.core.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepConfig:
+    """How a log becomes steps."""
+
+    period: float | None = 0.4
+    """Length of a step [s]; None: one step for every record of the first scanner, at its stamp."""
+    max_range: float | None = None
+    """Beams are cut at it: what lies behind is not known to be there [m]; None: the sensor's own."""
+    min_range: float = 0.1
+    """Nearer things are the robot itself or dirt: dropped [m]."""
+    most_points: int = 400
+    """Beams kept of a step, spread evenly over it."""
+    range_sigma: float = 0.03
+    """σ of a range, for sensors that do not state theirs [m]."""
+    cloud_range: float = 60.0
+    """Range of lidars whose records are clouds and do not state theirs [m]."""
+    scanners: tuple[str, ...] = ()
+    """Streams of beams; none: all spinning scanners, else all clouds, else all planar scanners."""
+    motion: tuple[str, ...] = ()
+    """Streams of motion: an IMU and wheels, or one of odometry or controls; none: the best the log has."""
+    noise: DeadReckoningNoise = field(default_factory=DeadReckoningNoise)
+    """Of an IMU and wheels; ``noise.bridge`` limits gaps in every stream of rates."""
+    controls: MotionNoise = field(default_factory=MotionNoise)
+    """Of controls in the plane; recorded odometry takes its floors."""
+    yaw_bias: float = 0.0
+    """Deliberate error added to the yaw rate of all motion [rad/s]; named in the steps' name."""
+    lasting_yaw_bias: float = 0.0
+    """σ of an error of the yaw rate of recorded odometry or controls that lasts [rad/s]; ``yaw_bias`` counts too."""
+    lasting_scale: float = 0.0
+    """σ of an error of its distances that lasts, a share of them."""
+    longest_record: float = 20.0
+    """Longest time that one record of odometry may take: it tells the whole motion, not how it went [s]."""
+
+    def __post_init__(self) -> None:
+        positive = {"period": self.period, "max_range": self.max_range}
+        for name in ("range_sigma", "cloud_range", "longest_record"):
+            positive[name] = getattr(self, name)
+        for name, value in positive.items():
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"steps: {name} = {value}; wanted > 0")
+        for name in ("min_range", "lasting_yaw_bias", "lasting_scale"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted ≥ 0")
+        if not np.isfinite(self.yaw_bias):
+            raise ConfigError(f"steps: yaw_bias = {self.yaw_bias}; wanted a finite number")
+        if self.most_points < 1:
+            raise ConfigError(f"steps: most_points = {self.most_points}; wanted ≥ 1")
+        if self.max_range is not None and self.max_range <= self.min_range:
+            raise ConfigError(f"steps: max_range = {self.max_range}; wanted > min_range {self.min_range}")
