@@ -197,6 +197,31 @@ def test_parallel_galleries_are_apart_and_see_each_other_at_cross_cuts_only() ->
     assert solid("mine").sees(m, other).all()
 
 
+@pytest.mark.parametrize("name", ["mine", "building"])
+def test_closed_worlds_leak_no_beam(name: str) -> None:
+    route = world(name).route()
+    p = route.positions(route.every(2.0)) + [0.0, 0.0, 0.8]
+    d = np.random.default_rng(5).normal(size=(len(p), 300, 3))
+    t = solid(name).cast(np.repeat(p, 300, axis=0), d.reshape(-1, 3))
+    assert np.isfinite(t).all()
+
+
+def test_walls_of_the_mine_are_rough_and_differ_from_place_to_place() -> None:
+    w, route = world("mine"), world("mine").route()
+    profiles = []
+    for a, b in w.meta["parallel"][0]:
+        s = a + np.arange(0.0, 50.0, 0.25)
+        assert s[-1] <= b
+        p, h = route.positions(s) + [0.0, 0.0, 1.2], route.headings(s)
+        for side in (1.0, -1.0):
+            t = solid("mine").cast(p, side * np.column_stack([-np.sin(h), np.cos(h), np.zeros(len(s))]))
+            t = np.minimum(t, 3.0)  # into a blind heading
+            assert 0.1 < np.std(t[t < 3.0]) < 0.45
+            profiles.append(t - t.mean())
+    alike = np.corrcoef(profiles)[np.triu_indices(4, 1)]
+    assert np.abs(alike).max() < 0.5
+
+
 def test_mine_has_loops_within_loops() -> None:
     w = world("mine")
     loops = np.array(w.meta["loops"])
