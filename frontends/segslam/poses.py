@@ -83,11 +83,7 @@ def heading_of(poses: ArrayLike) -> Array:
 def level(poses: ArrayLike) -> Array:
     """The same positions and headings without roll and pitch; in 2-D nothing changes."""
     p = np.array(poses, dtype=np.float64)
-    if p.shape[-1] == 7:
-        half = 0.5 * heading_of(p)
-        p[..., 3:5] = 0.0
-        p[..., 5], p[..., 6] = np.sin(half), np.cos(half)
-    return p
+    return p if p.shape[-1] == 3 else upright(p[..., :3], heading_of(p))
 
 
 def frame_between(T_a_body: ArrayLike, T_b_body: ArrayLike, *, gravity: bool) -> Array:
@@ -102,13 +98,20 @@ def frame_between(T_a_body: ArrayLike, T_b_body: ArrayLike, *, gravity: bool) ->
         body's roll and pitch is error, and would tilt everything that comes after. The position of the body is kept.
     """
     group = group_of(T_a_body)
-    T = group.compose(T_a_body, group.inverse(T_b_body))
     if group.dim == 2 or not gravity:
-        return T
-    T = level(T)
-    moved = se3.quat_rotate(T[..., 3:], np.asarray(T_b_body, dtype=np.float64)[..., :3])
-    T[..., :3] = np.asarray(T_a_body, dtype=np.float64)[..., :3] - moved
-    return T
+        return group.compose(T_a_body, group.inverse(T_b_body))
+    a, b = np.asarray(T_a_body, dtype=np.float64), np.asarray(T_b_body, dtype=np.float64)
+    turn = upright(np.zeros(a.shape[:-1] + (3,)), heading_of(a) - heading_of(b))
+    turn[..., :3] = a[..., :3] - se3.quat_rotate(turn[..., 3:], b[..., :3])
+    return turn
+
+
+def upright(positions: ArrayLike, headings: ArrayLike) -> Array:
+    """Level poses ``(..., 7)`` at positions ``(..., 3)`` [m] with headings ``(...)`` [rad]."""
+    half = 0.5 * geometry.wrap_angle(headings)
+    zero = np.zeros_like(half)
+    turn = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
+    return np.concatenate([np.asarray(positions, dtype=np.float64), turn], axis=-1)
 
 
 def normalised(weights: ArrayLike | None, n: int) -> Array:

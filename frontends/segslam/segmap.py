@@ -29,6 +29,8 @@ Ints = npt.NDArray[np.int64]
 
 __all__ = ["KINDS", "MATCH", "NEW", "SAME", "Entry", "SegMap", "Segment"]
 
+_NOBODY: Ints = np.zeros(0, np.int64)
+
 
 class SegMap:
     """All segments of one filter.
@@ -220,13 +222,11 @@ class SegMap:
 
     def ending_at(self, step: int) -> Ints:
         """Viable segments that end at a boundary, ascending: those that may come before what begins there."""
-        t = self.table
-        return np.flatnonzero(t.alive & (t.end == step)).astype(np.int64)
+        return self.table.fitting[1].get(int(step), _NOBODY)
 
     def beginning_at(self, step: int) -> Ints:
         """Viable segments that begin at a boundary, ascending: those that may follow what ends there."""
-        t = self.table
-        return np.flatnonzero(t.alive & (t.start == step)).astype(np.int64)
+        return self.table.fitting[0].get(int(step), _NOBODY)
 
     def intervals(self) -> Ints:
         """Intervals ``(k, 2)`` of the viable segments, ascending."""
@@ -348,8 +348,7 @@ class SegMap:
 
     def _release(self, dead: Ints) -> int:
         for i in dead.tolist():
-            self.table.alive[i] = False
-            self.table.paths[i] = None
+            self.table.kill(i)
             self.maps.drop(int(self.table.map[i]))
         self.pruned += len(dead)
         return len(dead)

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.poses import Group
+from frontends.segslam.poses import Group, heading_of
 from frontends.segslam.segment import KINDS
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -27,7 +27,7 @@ class Table:
     """
 
     _COLUMNS = ("start", "end", "kind", "source", "previous", "map", "weight", "fitness", "alive", "entry", "exit",
-                "link", "T_map")  # fmt: skip
+                "headings", "link", "T_map")  # fmt: skip
 
     def __init__(self, size: int) -> None:
         self.count = 0
@@ -43,10 +43,12 @@ class Table:
         self.alive: npt.NDArray[np.bool_] = np.zeros(n, bool)
         self.entry: Array = np.zeros((n, size))
         self.exit: Array = np.zeros((n, size))
+        self.headings: Array = np.zeros((n, 2))  # at entry and exit [rad]
         self.link: Array = np.zeros((n, size))  # T_segment_source: between the frames, of those with a source
         self.T_map: Array = np.zeros((n, size))  # T_map_segment
         self.paths: list[Array | None] = []
         self.covariances: list[Array | None] = []
+        self._fitting: tuple[dict[int, Ints], dict[int, Ints]] | None = None
 
     def append(
         self,
@@ -72,10 +74,26 @@ class Table:
         self.kind[i], self.source[i], self.previous[i], self.map[i] = kind, source, previous, map
         self.weight[i], self.fitness[i], self.alive[i] = 0.0, fitness, True
         self.entry[i], self.exit[i], self.link[i], self.T_map[i] = entry, path[-1], link, T_map
+        self.headings[i] = heading_of(np.stack([entry, path[-1]]))
+        self._fitting = None
         self.paths.append(path)
         self.covariances.append(covariance)
         self.count += 1
         return i
+
+    def kill(self, i: int) -> None:
+        """The segment is not viable any more."""
+        self.alive[i] = False
+        self.paths[i] = None
+        self._fitting = None
+
+    @property
+    def fitting(self) -> tuple[dict[int, Ints], dict[int, Ints]]:
+        """Viable segments by the step they begin at, and by the step they end at, each ascending."""
+        if self._fitting is None:
+            alive = np.flatnonzero(self.alive).astype(np.int64)
+            self._fitting = _by_value(self.start, alive), _by_value(self.end, alive)
+        return self._fitting
 
     def row(self, i: int, times: Array) -> dict[str, Any]:
         """A segment in words and numbers, ready for JSON; ``times (n,)`` of the steps [s]."""
@@ -92,6 +110,12 @@ class Table:
             "fitness": None if np.isnan(self.fitness[i]) else float(self.fitness[i]),
             "map": int(self.map[i]),
         }
+
+
+def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
+    order = rows[np.argsort(column[rows], kind="stable")]
+    values, first = np.unique(column[order], return_index=True)
+    return dict(zip(values.tolist(), np.split(order, first[1:])))
 
 
 class Maps:

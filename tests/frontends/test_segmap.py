@@ -259,7 +259,7 @@ OPS = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(ops=st.lists(OPS, min_size=1, max_size=25), seed=st.integers(0, 2**16))
 def test_any_history_gives_what_the_plain_twin_has(ops: list[tuple], seed: int) -> None:  # type: ignore[type-arg]
     rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from frontends.segslam.sampling import Root, grow_by
+from frontends.segslam.sampling import Root, grow_by, probabilities
 from frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
@@ -102,7 +102,8 @@ class PlainSegMap:
 class _Script:
     """Answers choices by a script; beyond its end it takes the first option and notes how many there were."""
 
-    def __init__(self, script: list[int]) -> None:
+    def __init__(self, script: list[int], weights: np.ndarray | None) -> None:
+        self.weights = weights
         self.script, self.options, self.chance = script, list[int](), Fraction(1)
 
     def _answer(self, options: int) -> int:
@@ -117,29 +118,32 @@ class _Script:
             self.chance /= len(left) + 1
         return out
 
-    def choose(self, p: np.ndarray) -> int:
+    def choose(self, fits: np.ndarray) -> int:
+        p = probabilities(fits, self.weights)
         k = self._answer(len(p))
         self.chance *= Fraction(float(p[k])).limit_denominator(10**6)
         return k
 
 
-def all_samples(segmap: SegMap, root: Root, **options: Any) -> dict[tuple[int, ...], Fraction]:
+def all_samples(
+    segmap: SegMap, root: Root, weights: np.ndarray | None = None, **options: Any
+) -> dict[tuple[int, ...], Fraction]:
     """Every map sample, as the sorted tuple of its segments, with its probability, by trying every choice there is."""
     found: dict[tuple[int, ...], Fraction] = {}
-    for script in _scripts(segmap, root, options):
+    for script in _scripts(segmap, root, weights, options):
         sample = grow_by(segmap, root, script.order, script.choose, **options)
         key = tuple(sorted(sample.segments.tolist()))
         found[key] = found.get(key, Fraction(0)) + script.chance
     return found
 
 
-def _scripts(segmap: SegMap, root: Root, options: dict[str, Any]) -> Iterator[_Script]:
+def _scripts(segmap: SegMap, root: Root, weights: np.ndarray | None, options: dict[str, Any]) -> Iterator[_Script]:
     """Scripts that between them make every choice: an odometer over choices whose number depends on the ones before."""
     digits: list[int] = []
     while True:
-        probe = _Script(digits)
+        probe = _Script(digits, weights)
         grow_by(segmap, root, probe.order, probe.choose, **options)
-        yield _Script(digits)
+        yield _Script(digits, weights)
         digits = (digits + [0] * len(probe.options))[: len(probe.options)]
         while digits and digits[-1] + 1 >= probe.options[len(digits) - 1]:
             digits.pop()

@@ -1,0 +1,264 @@
+"""Map samples: who is in them, how often, and where their frames are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from frontends.segslam.poses import frame_between, level
+from frontends.segslam.sampling import (
+    OPEN,
+    concatenate,
+    grow,
+    nearest_step,
+    root_of_particle,
+    root_of_segment,
+)
+from frontends.segslam.segmap import Entry, SegMap
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import se2_compose, se2_inverse
+from tests.reference.segmap_twin import all_samples, flat_grid, match_entry, small_segmap, straight
+
+ZERO = np.zeros(3)
+
+
+def square(particles: int = 2) -> SegMap:
+    """Four intervals of two steps, each 2 m and a quarter turn; then a match into segment 0, as particle 0 has it.
+
+    Particle 1's segments are 0.1 m longer. Segment 2 k + p is that of particle p in interval k.
+    """
+    m = small_segmap(12, particles)
+    for k in range(4):
+        m.open(2 * k, [Entry(T_entry=ZERO)] * particles)
+        paths = []
+        for p in range(particles):
+            path = straight(ZERO, 2.0 + 0.1 * p, 2)
+            path[-1, 2] = np.pi / 2
+            paths.append(path)
+        m.close(2 * k + 2, [flat_grid() for _ in range(particles)], paths)
+    m.open(8, [match_entry(np.array([0.2, 0.0, 0.0]), 0), *[Entry(T_entry=ZERO)] * (particles - 1)])
+    return m
+
+
+def test_a_sample_holds_one_segment_of_each_interval_in_its_place() -> None:
+    m = square()
+    sample = grow(m, root_of_segment(m, 6), np.random.default_rng(0))
+    assert len(sample) == 4
+    assert sorted(map(tuple, sample.intervals.tolist())) == [(0, 2), (2, 4), (4, 6), (6, 8)]
+    assert sample.segments[sample.in_time].tolist() == [
+        int(i) for i in sorted(sample.segments, key=lambda i: int(m.table.start[i]))
+    ]
+    # A6: frames follow from exits and entries alone
+    for k in range(1, 4):
+        before, after = int(sample.segments[k]), int(sample.segments[sample.via[k]])
+        T = se2_compose(sample.poses[sample.via[k]], m[after].T_entry)
+        np.testing.assert_allclose(se2_compose(sample.poses[k], m[before].T_exit), T, atol=1e-12)
+        assert m[before].interval[1] == m[after].interval[0]
+    assert sample.depth.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(sample.travelled, [0.0, 2.0, 4.0, 6.0])
+    assert sample.anchor.tolist() == [8, 6, 4, 2]
+
+
+def test_a_match_places_older_segments_where_the_closure_says() -> None:
+    m = square()
+    step = 10
+    sample = grow(m, root_of_particle(m, 0, step), np.random.default_rng(1))
+    assert sample.segments[0] == OPEN
+    k = sample.segments.tolist().index(0)
+    # one link away, in the very frame of the particle, not at the end of a chain of four
+    assert sample.depth[k] == 1
+    np.testing.assert_allclose(sample.poses[k], 0.0)
+    # it came in at x = 0.2 m, nearest to step 0: 2 m driven since, and no more
+    assert sample.anchor[k] == 0
+    assert sample.travelled[k] == pytest.approx(2.0)
+    # the interval after it hangs from it or from the other side, both two links away; particle 1 goes the long way
+    assert sample.depth.max() == 2 + 0
+    other = grow(m, root_of_particle(m, 1, step), np.random.default_rng(1))
+    assert other.depth.max() == 4
+    assert other.travelled.max() == pytest.approx(2.0 + 6.0)
+
+
+@pytest.mark.parametrize("root", ["open", "closed"])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_samples_come_as_often_as_enumeration_says(root: str, weighted: bool) -> None:
+    m = square()
+    r = root_of_particle(m, 0, 9) if root == "open" else root_of_segment(m, 4)
+    weights = np.array([1.0, 3.0, 2.0, 2.0, 0.0, 5.0, 1.0, 1.0]) if weighted else None
+    table = all_samples(m, r, weights=weights)
+    assert sum(table.values()) == Fraction(1)
+    rng = np.random.default_rng(7)
+    n = 3000
+    seen = Counter(tuple(sorted(grow(m, r, rng, weights=weights).segments.tolist())) for _ in range(n))
+    keys = sorted(k for k, v in table.items() if v > 0)
+    assert set(seen) <= set(keys)
+    assert stats.chisquare([seen[k] for k in keys], [n * float(table[k]) for k in keys]).pvalue > 1e-3
+
+
+def test_enumeration_on_a_chain_is_the_product_of_the_choices() -> None:
+    m = square()
+    table = all_samples(m, root_of_segment(m, 6))
+    assert len(table) == 8
+    assert set(table.values()) == {Fraction(1, 8)}
+    # weights 1 : 3 in the first interval
+    weights = np.array([1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    table = all_samples(m, root_of_segment(m, 6), weights=weights)
+    assert sum(v for k, v in table.items() if 1 in k) == Fraction(3, 4)
+
+
+def test_ties_are_broken_at_random() -> None:
+    """Interval (2, 4) is two links from a re-entered map and two from the other side: each way is taken."""
+    m = square()
+    ways = set()
+    for seed in range(40):
+        s = grow(m, root_of_particle(m, 0, 9), np.random.default_rng(seed))
+        place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
+        middle = place[(2, 4)]
+        ways.add(tuple(s.intervals[s.via[middle]].tolist()))
+        assert s.depth[middle] == 2
+        assert s.depth[place[(4, 6)]] == 2
+    assert ways == {(0, 2)}  # (4, 6) is on the same level, from the other side
+    # three matches deep, a tie that can be seen: the middle of five intervals
+    m = small_segmap(14, 1)
+    for k in range(5):
+        m.open(2 * k, [Entry(T_entry=ZERO)])
+        m.close(2 * k + 2, [flat_grid()], [straight(ZERO, 1.0, 2)])
+    m.open(10, [match_entry(ZERO, 1)])
+    ways = set()
+    for seed in range(40):
+        s = grow(m, root_of_particle(m, 0, 11), np.random.default_rng(seed))
+        place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
+        for q in ((4, 6), (6, 8)):
+            ways.add((q, tuple(s.intervals[s.via[place[q]]].tolist())))
+    assert ways == {((4, 6), (2, 4)), ((6, 8), (8, 10))}
+
+
+def test_the_same_generator_gives_the_same_sample() -> None:
+    m = square()
+    a, b = (grow(m, root_of_particle(m, 1, 9), np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(a.segments, b.segments)
+    np.testing.assert_array_equal(a.poses, b.poses)
+
+
+def test_local_samples_stop_at_their_reach() -> None:
+    m = square()
+    root = root_of_particle(m, 1, 10)
+    near = grow(m, root, np.random.default_rng(0), local_length=3.0)
+    # 2 m to the entry, 4 m to that of the segment before: from there it does not grow on
+    assert sorted(map(tuple, near.intervals.tolist())) == [(4, 6), (6, 8), (8, 10)]
+    assert len(grow(m, root, np.random.default_rng(0), local_depth=1)) == 2
+    assert len(grow(m, root, np.random.default_rng(0))) == 5
+
+
+def test_a_pruned_source_is_no_link() -> None:
+    m = square()
+    m._release(np.array([0]))
+    s = grow(m, root_of_particle(m, 0, 9), np.random.default_rng(0))
+    assert 0 not in s.segments
+    assert s.depth.max() == 4
+
+
+def test_the_path_of_a_sample_is_one_trajectory() -> None:
+    m = square(1)
+    m.resample([0])
+    open_path = straight(np.array([0.2, 0.0, 0.0]), 1.0, 2)
+    s = grow(m, root_of_particle(m, 0, 10), np.random.default_rng(0))
+    path = concatenate(m, s, open_path)
+    assert path.times.tolist() == list(range(11))
+    np.testing.assert_allclose(path.poses[9:], open_path[1:], atol=1e-12)
+    # segment 0 is in the frame of the root: the closure is exact at the entered map
+    np.testing.assert_allclose(path.poses[0], 0.0, atol=1e-12)
+    # a chain without a closure is the product of its increments
+    s = grow(m, root_of_segment(m, 3), np.random.default_rng(0))
+    path = concatenate(m, s)
+    first = se2_compose(se2_inverse(path.poses[0]), path.poses)
+    assert path.times.tolist() == list(range(9))
+    np.testing.assert_allclose(first[[2, 4, 6, 8], :2], [[2, 0], [2, 2], [0, 2], [0, 0]], atol=1e-12)
+    with pytest.raises(DataError, match="wrong length"):
+        concatenate(m, grow(m, root_of_particle(m, 0, 10), np.random.default_rng(0)), open_path[:2])
+    single = small_segmap(4, 1)
+    single.open(0, [Entry(T_entry=ZERO)])
+    with pytest.raises(DataError, match="without any path"):
+        concatenate(single, grow(single, root_of_particle(single, 0, 2), np.random.default_rng(0)))
+    with pytest.raises(DataError, match="in no segment"):
+        root_of_particle(square(), 5, 9)
+
+
+def test_segments_that_overlap_in_time_are_never_in_one_sample() -> None:
+    """Particles that cut at different times: 0 at 2 and 4, 1 at 3; only chains without gap or overlap come."""
+    m = small_segmap(8, 2)
+    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    m.close(2, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[0])  # 0: (0, 2)
+    m.open(2, [Entry(T_entry=ZERO)], which=[0])
+    m.close(3, [flat_grid()], [straight(ZERO, 3.0, 3)], which=[1])  # 1: (0, 3)
+    m.open(3, [Entry(T_entry=ZERO)], which=[1])
+    m.close(4, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[0])  # 2: (2, 4)
+    m.close(4, [flat_grid()], [straight(ZERO, 1.0, 1)], which=[1])  # 3: (3, 4)
+    m.open(4, [Entry(T_entry=ZERO)] * 2)
+    table = all_samples(m, root_of_particle(m, 0, 5))
+    assert table == {(-1, 0, 2): Fraction(1, 2), (-1, 1, 3): Fraction(1, 2)}
+
+
+def test_frames_stay_level_whatever_particles_think_of_gravity() -> None:
+    """Two particles differ in roll and pitch at the boundary: the body is in one place, and no frame is tilted."""
+    rng = np.random.default_rng(5)
+
+    def body(x: float, y: float, z: float, heading: float) -> np.ndarray:
+        turn = se3.quat_multiply(se3.so3_exp(np.array([0, 0, heading])), se3.so3_exp([*(0.02 * rng.normal(size=2)), 0]))
+        return np.concatenate([[x, y, z], turn])
+
+    m = SegMap(np.arange(6.0), np.arange(6.0), 2, dim=3, gravity=True)
+    m.open(0, [Entry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
+    starts = [e.T_entry for e in m.entries if e is not None]
+    m.close(
+        2,
+        [flat_grid(dim=3) for _ in range(2)],
+        [np.stack([s, body(1, 0, 0, 0.3), body(2, 0, 0.1, 0.7)]) for s in starts],
+    )
+    # a match far from the origin of its frame, where a tilt would be a long lever
+    source_entry = body(40.0, 30.0, 1.0, 2.0)
+    cov = np.eye(6) * 1e-4
+    m.open(2, [Entry(T_entry=source_entry, kind=1, source=0, covariance=cov, fitness=0.9)] * 2)
+    # the sample's own arithmetic against whole poses; another particle's segment may come before the match
+    seen = set()
+    for seed in range(8):
+        s = grow(m, root_of_particle(m, 0, 3), np.random.default_rng(seed))
+        i = int(s.segments[1])
+        T = frame_between(source_entry, m[i].T_exit, gravity=True)
+        np.testing.assert_array_equal(level(T), T)
+        linked = s.poses[1][:3].any()
+        seen.add((i, bool(linked)))
+        if linked:
+            np.testing.assert_allclose(s.poses[1], T, atol=1e-12)
+            np.testing.assert_allclose(se3.se3_compose(T, m[i].T_exit)[:3], source_entry[:3], atol=1e-12)
+    assert seen == {(0, True), (1, True), (0, False)}
+    loose = frame_between(source_entry, m[0].T_exit, gravity=False)
+    np.testing.assert_allclose(se3.se3_compose(loose, m[0].T_exit)[:3], source_entry[:3], atol=1e-12)
+    assert np.abs(loose[3:5]).max() > 1e-3  # what levelling took out
+
+
+def test_nearest_step_is_that_of_the_nearest_pose() -> None:
+    m = square(1)
+    assert nearest_step(m, 1, np.array([1.2, 5.0, 0.0])) == 3
+    assert nearest_step(m, 0, np.array([-3.0, 0.0, 0.0])) == 0
+
+
+def test_frames_without_gravity_are_whole_poses() -> None:
+    rng = np.random.default_rng(2)
+    m = SegMap(np.arange(9.0), np.arange(9.0), 1, dim=3, gravity=False)
+    for k in range(3):
+        m.open(2 * k, [Entry(T_entry=np.array([0.0, 0, 0, 0, 0, 0, 1]))])
+        path = se3.se3_exp(np.cumsum(rng.normal(0.0, 0.5, (3, 6)), axis=0) * [[0], [1], [1]])
+        path[0] = [0, 0, 0, 0, 0, 0, 1]
+        m.close(2 * k + 2, [flat_grid(dim=3)], [path])
+    s = grow(m, root_of_segment(m, 2), np.random.default_rng(0))
+    path = concatenate(m, s)
+    whole = se3.se3_compose(se3.se3_compose(m[0].T_exit, m[1].T_exit), m[2].T_exit)
+    np.testing.assert_allclose(
+        se3.pose_to_matrix(se3.se3_between(path.poses[0], path.poses[-1])), se3.pose_to_matrix(whole), atol=1e-12
+    )
+    np.testing.assert_allclose(path.poses[-1], m[2].T_exit, atol=1e-12)
