@@ -8,21 +8,24 @@ covariance of dead reckoning over the path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from tqdm.auto import tqdm
 
 from frontends.ancestry import Ancestry
+from frontends.drift import DriftModel
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter, GridParticles, Tally
 from frontends.segslam.covariance import Drift, exit_covariance
 from frontends.segslam.poses import group_of
-from frontends.steps import Steps
+from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -109,7 +112,7 @@ class RbpfResult:
         quantiles = np.quantile(self.effective / n, [0.05, 0.5])
         last = self.ancestry.coalescence()
         return {
-            "steps": len(self.times),
+            "scans": len(self.times),
             "particles": n,
             "path_length": float(self.path_length[-1]),
             "resamplings": self.tally.resamplings,
@@ -215,3 +218,38 @@ def rbpf_submap(result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: 
         uses=result.uses,
         report=report,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfGridConfig:
+    """The front end ``rbpf-grid``."""
+
+    steps: StepConfig = field(default_factory=StepConfig)
+    """How the log becomes steps."""
+    filter: GridFilterConfig = field(default_factory=GridFilterConfig)
+    """Particles, motion, weights."""
+    drift: DriftModel = field(default_factory=DriftModel)
+    """Errors that all particles share, by the length of the path; its dimension is that of the log."""
+    drift_scale: float = 1.0
+    """Factor on the drift model's covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class RbpfGrid:
+    """The front end ``rbpf-grid``: the whole log as one submap with an evidence grid.
+
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion.
+    """
+
+    config: RbpfGridConfig = field(default_factory=RbpfGridConfig)
+    name: ClassVar[str] = "rbpf-grid"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        if after is None:
+            steps = make_steps(log, self.config.steps, drops=drops)
+            result = run_rbpf(steps, self.config.filter, seed.child(0))
+            drift = replace(self.config.drift, dim=steps.dim)
+            yield rbpf_submap(result, drift, drift_scale=self.config.drift_scale)

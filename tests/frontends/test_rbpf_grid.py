@@ -8,13 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from frontends.base import FrontEnd
 from frontends.grid_config import GridFilterConfig
 from frontends.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
 from frontends.segslam.poses import group_of, level
 from frontends.steps import Steps
-from graphslam.core.errors import CovarianceError, DataError
+from graphslam.app.front_ends import make_front_end
+from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.records import LaserScans
+from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.memory import memory
 from tests.frontends.grid_world import ring, true_end
 
@@ -138,3 +143,38 @@ def test_too_little_for_a_submap_and_no_covariance_are_refused(run: tuple[Steps,
     assert len(short) == 1
     with pytest.raises(DataError, match="one step"):
         rbpf_submap(run_rbpf(short, CONFIG, SeedTree(0)), flat_drift)
+
+
+def planar_log(seed: int) -> SensorLog:
+    """The drive round the ring as a log of planar scans and recorded odometry."""
+    steps = ring(seed, 2, length=16.0, beams=90)
+    n = len(steps)
+    beams = np.linspace(-np.pi, np.pi, 90, endpoint=False)
+    ranges = np.linalg.norm(steps.points.reshape(n, 90, 2), axis=2)
+    ranges = np.where(steps.returns.reshape(n, 90), ranges, steps.max_range)
+    ranges[3, 5] = np.nan
+    scans = LaserScans(times=steps.times, ranges=ranges, bearings=beams, max_range=steps.max_range)
+    return SensorLog(name="ring", streams={"laser": scans, "odometry": steps.odometry})
+
+
+def test_front_end_gives_one_submap_and_nothing_after_it() -> None:
+    log, drops = planar_log(0), DropCounter()
+    front = make_front_end(
+        "rbpf-grid", {"filter": {"particles": 6, "voxel_size": 0.1}, "drift": {"heading_scale": 0.01}}
+    )
+    assert isinstance(front, FrontEnd)
+    (submap,) = front.submaps(log, seed=SeedTree(1), drops=drops)
+    assert submap.dim == 2
+    assert submap.exit_covariance[2, 2] > (0.01 * 15.0) ** 2
+    assert submap.report["particles"] == 6
+    assert submap.uses == {"laser", "odometry"}
+    assert submap.trajectory is not None
+    assert isinstance(submap.grid, EvidenceGrid)
+    assert submap.grid.dim == 2
+    assert submap.grid.voxel_counts().occupied > 100
+    assert any("laser" in what for what in drops.counts)  # the reading that was none
+    assert list(front.submaps(log, seed=SeedTree(1), after=submap)) == []
+    (again,) = front.submaps(log, seed=SeedTree(1))
+    assert again.exit_pose.tobytes() == submap.exit_pose.tobytes()
+    with pytest.raises(ConfigError, match="likelihood"):
+        make_front_end("rbpf-grid", {"filter": {"likelihood": "guess"}})
