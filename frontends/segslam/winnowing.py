@@ -132,6 +132,7 @@ def winnow(
         T = g.compose(T_map, T_seg_body[k])
         half = np.full(g.dim, 0.5 * config.near)
         half[:2] += config.sigmas * sigma[best[k]]
+        half[2:] += config.height
         count = int(box_query(grid, (T[: g.dim] - half)[None], (T[: g.dim] + half)[None]).known[0])
         if count < config.known:
             tally.unknown += 1
