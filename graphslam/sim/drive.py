@@ -115,7 +115,7 @@ def smooth_way(way: Way, width: float) -> Way:
 
 
 class Motion:
-    """Position, attitude and their derivatives along a way, at any time between 0 and ``duration``.
+    """Position, attitude and their derivatives along a way of ``length`` [m], at any time from 0 to ``duration`` [s].
 
     Parameters
     ----------
@@ -135,6 +135,7 @@ class Motion:
         if not (np.isfinite(speed) and speed > 0):
             raise DataError("speed is impossible", got=speed, wanted="> 0 m/s")
         self.config = config
+        self.length = float(np.sum(np.linalg.norm(np.diff(way.positions, axis=0), axis=1)))
         u = np.arange(len(way.yaw)) * way.step
         columns = np.column_stack([way.positions, way.yaw, way.pitch, way.roll])
         self._way: BSpline = make_interp_spline(u, columns, k=5)
@@ -152,7 +153,7 @@ class Motion:
         self._cruise = float(tau[-1])
         self._along: BSpline = make_interp_spline(tau, u, k=3)
         self._along1, self._along2 = self._along.derivative(1), self._along.derivative(2)
-        self.length = float(u[-1])
+        self._end = float(u[-1])
         self._ramp = min(config.ramp, self._cruise)
         self.duration = config.stand + self._cruise + self._ramp
 
@@ -178,7 +179,7 @@ class Motion:
         tau, d1, d2 = self._clock(np.asarray(t, dtype=np.float64))
         tau = np.clip(tau, 0.0, self._cruise)
         e1 = self._along1(tau)
-        return np.clip(self._along(tau), 0.0, self.length), e1 * d1, self._along2(tau) * d1**2 + e1 * d2
+        return np.clip(self._along(tau), 0.0, self._end), e1 * d1, self._along2(tau) * d1**2 + e1 * d2
 
     def poses(self, t: ArrayLike) -> Array:
         """``T_world_base`` ``(n, 7)`` at times ``(n,)`` [s]."""

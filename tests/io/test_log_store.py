@@ -12,7 +12,10 @@ import pytest
 
 from graphslam.core.atomic import atomic_open, write_npz
 from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import (
     AckermannGeometry,
     Gps,
@@ -42,6 +45,22 @@ def full_log(rng: np.random.Generator) -> SensorLog:
     ranges = rng.uniform(0, 80, (5, 7)).astype(np.float32)
     ranges[2, 3] = np.nan
     bearings = np.linspace(-1.5, 1.5, 7)
+    d = rng.normal(size=(7, 3))
+    spinning: dict[str, Any] = {
+        "times": t,
+        "ranges": ranges.astype(np.float64),
+        "directions": d / np.linalg.norm(d, axis=1, keepdims=True),
+        "beam_times": np.sort(rng.uniform(0, 0.01, 7)),
+        "max_range": 0.1 + 0.2,
+        "sigma": 0.025,
+    }
+    noise = ImuNoise(**{f.name: float(rng.uniform(0, 1)) for f in dataclasses.fields(ImuNoise)})
+    inertia: dict[str, Any] = {
+        "times": t,
+        "angular_rate": rng.normal(size=(5, 3)),
+        "specific_force": rng.normal(size=(5, 3)),
+    }
+    mount = [0.1, 0.2, 0.3, *(d[0] / np.linalg.norm(d[0])), 0.0]
     car = AckermannGeometry(wheelbase=2.83, encoder_offset=0.76, model="rear-axle")
     return SensorLog(
         name="every kind ±",
@@ -59,6 +78,20 @@ def full_log(rng: np.random.Generator) -> SensorLog:
             "trees-known": LandmarkObservations(
                 **obs, ids=[3, -1, 2**60, 0], max_range=30.0, field_of_view=(-1.0, 2.0), T_base_sensor=[1.0, 0.0, 0.0]
             ),
+            "scanner": RangeScans(
+                **{**spinning, "ranges": ranges},
+                T_base_mount=mount,
+                spin=rng.normal(size=5),
+                spin_rate=rng.normal(size=5),
+            ),
+            "scanner-still": RangeScans(**spinning),
+            "imu": Imu(**inertia, noise=noise, attitude=rng.normal(size=(5, 2)), T_base_imu=mount),
+            "imu-blind": Imu(**inertia, noise=noise),
+            "clouds": PointClouds.from_arrays(
+                t, rng.normal(size=(4, 3)), [0, 0, 1, 1, 4, 4], origin=[1.0, 2.0, 3.0], T_base_sensor=mount
+            ),
+            "path": Trajectory(t, rng.normal(size=(5, 3)), rng.normal(size=(5, 3, 3))),
+            "path3": Trajectory(t, poses3),
             "silent": Gps(times=np.zeros(0), positions=np.zeros((0, 2)), sigma=np.zeros(0), lever=[0.0, 0.0]),
         },
         truth=Truth(
@@ -91,6 +124,24 @@ def assert_same(a: Any, b: Any, where: str = "") -> None:
 
 def test_every_kind_comes_back_bit_for_bit(full_log: SensorLog, tmp_path: Path) -> None:
     assert_same(full_log, load_log(save_log(full_log, tmp_path / "log")))
+
+
+def test_clouds_that_are_a_part_of_a_source_are_stored_alone(rng: np.random.Generator, tmp_path: Path) -> None:
+    whole = PointClouds.from_arrays(np.arange(4.0), rng.normal(size=(10, 3)), [0, 3, 3, 8, 10])
+    part = whole.take([0, 2])
+    back = load_log(save_log(SensorLog(name="part", streams={"clouds": part}), tmp_path / "log"))["clouds"]
+    assert [c.tobytes() for c in back] == [c.tobytes() for c in part]
+    assert len(back.source.points) == 8
+    assert_same(back.times, part.times)
+
+
+def test_a_kind_that_cannot_be_stored_is_refused(full_log: SensorLog, tmp_path: Path) -> None:
+    class Sonar(Gps):
+        pass
+
+    odd = Sonar(**{f.name: getattr(full_log["gps"], f.name) for f in dataclasses.fields(Gps)})
+    with pytest.raises(FormatError, match="Sonar"):
+        save_log(dataclasses.replace(full_log, streams={"odd": odd}), tmp_path / "log")
 
 
 def test_a_simulated_log_comes_back_and_has_stable_bytes(tmp_path: Path) -> None:
@@ -212,6 +263,31 @@ def test_impossible_records_in_a_file_are_the_files_fault(
     with pytest.raises(FormatError, match=what) as error:
         load_log(root)
     assert "gps.npz" in str(error.value)
+
+
+def test_impossible_records_of_every_further_kind(full_log: SensorLog, tmp_path: Path) -> None:
+    root = save_log(full_log, tmp_path / "log")
+    changes: list[tuple[str, str, Any]] = [
+        ("scanner", "directions", np.zeros((7, 3))),
+        ("scanner", "sigma", -1.0),
+        ("scanner", "spin", np.zeros(4)),
+        ("imu", "noise_gyro", -1.0),
+        ("imu", "attitude", np.zeros((5, 3))),
+        ("imu", "specific_force", np.full((5, 3), np.inf)),
+        ("clouds", "offsets", [0, 0, 1, 1, 4, 5]),
+        ("clouds", "points", np.full((4, 3), np.nan)),
+        ("path", "poses", np.zeros((5, 4))),
+        ("velocity", "yaw_rate", np.zeros(3)),
+    ]
+    for name, array, value in changes:
+        path = root / f"{name}.npz"
+        good = path.read_bytes()
+        write_npz(path, {**dict(np.load(path)), array: np.asarray(value)})
+        with pytest.raises(FormatError) as error:
+            load_log(root)
+        assert path.name in str(error.value), array
+        path.write_bytes(good)
+    assert_same(full_log, load_log(root))
 
 
 @pytest.mark.parametrize("name", ["../gps", "a/b", "", "truth", ".hidden", "log.json/.."])
