@@ -1,0 +1,428 @@
+"""Logs become steps: deskewed, thinned, complete; bad input is counted or refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frontends.deskew import assign, beam_directions, cut_beams, spread
+from frontends.reckoned import Reckoned
+from frontends.steps import StepConfig, Steps, make_steps
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
+from graphslam.core.geometry import se2_between, se2_transform
+from graphslam.core.log import DropCounter, SensorLog, Truth
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LaserScans, Odometry, VelocityControls
+from graphslam.core.trajectory import Trajectory
+from tests.reference.imu_drive import drive
+from tests.reference.plain_steps import deskew_all, room_scans, winding_path
+
+HALF = np.array([6.0, 5.0, 2.0])
+
+
+def odometry_of(path: Trajectory, sigma: float = 1e-3) -> Odometry:
+    steps = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(path), 1)) if path.dim == 3 else np.zeros((len(path), 3))
+    between = se3.se3_between if path.dim == 3 else se2_between
+    steps[1:] = between(path.poses[:-1], path.poses[1:])
+    d = 6 if path.dim == 3 else 3
+    return Odometry(times=path.times, increments=steps, covariances=np.tile(sigma**2 * np.eye(d), (len(path), 1, 1)))
+
+
+@pytest.fixture(scope="module")
+def room() -> SensorLog:
+    path = winding_path()
+    streams = {"scanner": room_scans(path, HALF), "odometry": odometry_of(path)}
+    return SensorLog(name="room", streams=streams, truth=Truth(path))
+
+
+def test_equals_deskewing_beam_by_beam(room: SensorLog) -> None:
+    steps = make_steps(room, StepConfig(period=0.4))
+    plain = deskew_all(room["scanner"], room.truth.trajectory, steps.times, 0.0)
+    assert len(plain) == len(steps) == 10
+    for k, beams in enumerate(plain):
+        points, origins, met = steps.scan(k)
+        assert len(points) == len(beams) > 60
+        np.testing.assert_allclose(origins, [b[0] for b in beams], atol=1e-9)
+        np.testing.assert_allclose(points, [b[1] for b in beams], atol=1e-9)
+        np.testing.assert_array_equal(met, [b[2] for b in beams])
+
+
+def test_with_perfect_motion_every_return_is_on_a_wall(room: SensorLog) -> None:
+    steps = make_steps(room)
+    poses = steps.truth.interpolate(steps.times)
+    on, without = 0.0, 0.0
+    for k in range(len(steps)):
+        points, _, met = steps.scan(k)
+        world = se3.se3_transform(poses[k], points[met])
+        assert np.all(np.abs(world) < HALF + 0.02)
+        on = max(on, np.abs(np.abs(world) - HALF).min(axis=1).max())
+    assert on < 1e-2  # the path between its records is interpolated
+    # and were the motion within a step ignored, it would not be so
+    frozen = replace(room["scanner"], beam_times=np.zeros(15))
+    still = SensorLog(name="still", streams={"scanner": frozen, "odometry": room["odometry"]})
+    for k, (a, b) in enumerate(zip(steps.offsets[:-1], steps.offsets[1:])):
+        skewed, _, met = make_steps(still).scan(k)
+        if len(met) == b - a and np.any(met):
+            world = se3.se3_transform(poses[k], skewed[met])
+            without = max(without, np.abs(np.abs(world) - HALF).min(axis=1).max())
+    assert without > 3.0 * on
+
+
+def test_odometry_chains_to_the_path(room: SensorLog) -> None:
+    steps = make_steps(room, StepConfig(period=0.3))
+    path = room.truth.trajectory
+    T = path.interpolate(steps.times[:1])[0]
+    for step in steps.odometry.increments[1:]:
+        T = se3.se3_compose(T, step)
+    np.testing.assert_allclose(T, path.interpolate(steps.times[-1:])[0], atol=1e-9)
+    np.testing.assert_array_equal(steps.odometry.increments[0], [0, 0, 0, 0, 0, 0, 1])
+    # 0.3 s at 50 Hz: 15 records of 1 mm each, and a little more sideways by the lever of the turns
+    sigma = np.sqrt(np.diagonal(steps.odometry.covariances[3]))
+    np.testing.assert_allclose(sigma, np.sqrt(15) * 1e-3, rtol=0.05)
+    assert steps.path_length[-1] == pytest.approx(steps.times[-1] - steps.times[0], rel=0.02)  # 1 m/s, in chords
+    assert steps.uses == {"scanner", "odometry"}
+    assert steps.range_sigma == 0.02
+    assert steps.max_range == 8.0
+    assert steps.tilt is None
+
+
+def test_thinning_is_spread_and_always_the_same(room: SensorLog) -> None:
+    drops = DropCounter()
+    full, thin = make_steps(room), make_steps(room, StepConfig(most_points=20), drops=drops)
+    assert np.all(np.diff(thin.offsets) == 20)
+    assert drops.counts["scanner: beam left out, 20 a step are kept"] == len(full.points) - len(thin.points)
+    for k in range(len(full)):
+        chosen = spread(int(full.offsets[k + 1] - full.offsets[k]), 20)
+        for a, b in zip(thin.scan(k), full.scan(k)):
+            np.testing.assert_array_equal(a, b[chosen])
+    again = make_steps(room, StepConfig(most_points=20))
+    np.testing.assert_array_equal(again.points, thin.points)
+
+
+@pytest.mark.parametrize(("n", "most"), [(0, 5), (5, 5), (6, 5), (1000, 400), (905, 60), (2715, 400), (800, 400)])
+def test_spread(n: int, most: int) -> None:
+    chosen = spread(n, most)
+    assert len(chosen) == min(n, most)
+    assert np.all(np.diff(chosen) > 0)
+    assert np.all((chosen >= 0) & (chosen < n))
+    if n > most:
+        gaps = np.diff(np.concatenate([[-1], chosen, [n]]))
+        assert gaps.max() <= 2 * int(np.ceil(n / most))
+
+
+def test_spread_does_not_fall_into_step_with_scans() -> None:
+    """Half of the beams of scans of 60: every beam of the fan gets its turn, none twice as often as another."""
+    counts = np.bincount(spread(6000, 3000) % 60, minlength=60)
+    assert counts.min() > 35
+    assert counts.max() < 65
+
+
+def test_directions_equal_those_of_whole_scans(room: SensorLog, rng: np.random.Generator) -> None:
+    scans = room["scanner"]
+    k, j = rng.integers(len(scans.times), size=50), rng.integers(15, size=50)
+    np.testing.assert_allclose(beam_directions(scans, k, j), scans.head_rays()[1][k, j], atol=1e-12)
+
+
+def test_beams_belong_to_the_step_they_end_in() -> None:
+    steps = np.array([1.0, 2.0])
+    beams = np.array([0.4, 0.5, 1.0, 1.0 + 1e-12, 2.0, 2.1])
+    np.testing.assert_array_equal(assign(beams, steps, 0.5), [-1, 0, 0, 1, 1, -1])
+
+
+def test_long_beams_are_cut_and_met_nothing(room: SensorLog) -> None:
+    full, cut = make_steps(room), make_steps(room, StepConfig(max_range=3.0))
+    length = np.linalg.norm(full.points - full.origins, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(cut.points - cut.origins, axis=1), np.minimum(length, 3.0), atol=1e-9)
+    np.testing.assert_array_equal(cut.returns, length < 3.0)
+    assert np.any(cut.returns)
+    assert not np.all(cut.returns)
+    assert cut.max_range == 3.0
+    ends, met = cut_beams(np.zeros((2, 3)), np.array([[0, 0, 2.0], [0, 0, 1.0]]), np.array([True, False]), 1.5)
+    np.testing.assert_allclose(ends, [[0, 0, 1.5], [0, 0, 1.0]])
+    np.testing.assert_array_equal(met, [False, False])
+
+
+def spoiled(room: SensorLog, **changes: object) -> SensorLog:
+    streams = {**room.streams, **changes}
+    return SensorLog(name="spoiled", streams=streams, truth=room.truth)
+
+
+def test_readings_that_say_nothing_are_counted(room: SensorLog) -> None:
+    scans, clean = room["scanner"], make_steps(room)
+    ranges = scans.ranges.copy()
+    ranges[3, 4] = np.nan
+    ranges[5] = np.nan
+    ranges[7, :2] = [0.01, -1.0]
+    ranges[9] = 8.0
+    ranges[11, 0] = np.inf
+    drops = DropCounter()
+    steps = make_steps(spoiled(room, scanner=replace(scans, ranges=ranges)), drops=drops)
+    assert drops.counts == {
+        "scanner: beam without a reading": 16,
+        "scanner: scan without a reading": 1,
+        "scanner: nearer than 0.1 m": 2,
+        "scanner: scan that met nothing (kept)": 1,
+    }
+    assert len(steps.points) == len(clean.points) - 18
+    assert np.sum(~steps.returns) >= np.sum(~clean.returns) + 10
+    assert np.all(np.isfinite(steps.points))
+
+
+@pytest.mark.parametrize("value", [np.nan, 8.0])
+def test_a_scanner_that_sees_nothing_gives_steps_all_the_same(room: SensorLog, value: float) -> None:
+    scans = replace(room["scanner"], ranges=np.full_like(room["scanner"].ranges, value))
+    drops = DropCounter()
+    steps = make_steps(spoiled(room, scanner=scans), drops=drops)
+    assert len(steps) == 10
+    assert not np.any(steps.returns)
+    if np.isnan(value):
+        assert len(steps.points) == 0
+        assert drops.counts["steps: step without a beam (kept)"] == 10
+    else:
+        np.testing.assert_allclose(np.linalg.norm(steps.points - steps.origins, axis=1), 8.0)
+        assert drops.counts["scanner: scan that met nothing (kept)"] == len(scans.times)
+
+
+def test_a_pause_of_the_scanner_leaves_empty_steps(room: SensorLog) -> None:
+    scans = room["scanner"]
+    drops = DropCounter()
+    steps = make_steps(spoiled(room, scanner=scans.take((scans.times < 1.0) | (scans.times > 2.6))), drops=drops)
+    assert len(steps) == 10
+    assert drops.counts["steps: step without a beam (kept)"] == 3
+    assert np.all(np.linalg.norm(steps.odometry.increments[1:, :3], axis=1) > 0.1)
+    points, origins, met = steps.scan(4)
+    assert points.shape == origins.shape == (0, 3)
+    assert met.shape == (0,)
+
+
+def test_gaps_and_jumps_of_recorded_odometry(room: SensorLog) -> None:
+    o, path = room["odometry"], room.truth.trajectory
+    keep = (path.times < 1.01) | (path.times > 2.99)
+    sparse = odometry_of(Trajectory(path.times[keep], path.poses[keep]))
+    drops = DropCounter()
+    steps = make_steps(spoiled(room, odometry=sparse), drops=drops)
+    assert drops.counts == {"spoiled/odometry: gap bridged": 1}
+    doubt = np.sqrt(steps.odometry.covariances[:, 3, 3])
+    assert doubt[5] > 0.1  # 20 % of a metre a second, over a fifth of the gap, which is white in it
+    assert doubt[1] < 0.01
+    whole = steps.errors.between(1, 8)[1]
+    assert 0.35 < np.sqrt(whole[3, 3]) < 0.6  # 20 % of some 2 m
+    with pytest.raises(DataError, match=r"gap without records: 2\.\d+ s after record 50.*at most 1.5 s"):
+        make_steps(spoiled(room, odometry=sparse), StepConfig(longest_record=1.5))
+    late = replace(o, times=o.times + 3600.0 * (o.times > 2.0))
+    scans = room["scanner"]
+    jumped = replace(scans, times=scans.times + 3600.0 * (scans.times > 2.0))
+    with pytest.raises(DataError, match="gap without records: 3600"):
+        make_steps(spoiled(room, odometry=late, scanner=jumped))
+    never = replace(o, times=o.times + 1e9 * (o.times > 2.0))
+    jumped = replace(scans, times=scans.times + 1e9 * (scans.times > 2.0))
+    with pytest.raises(DataError, match="gap without records"):
+        make_steps(spoiled(room, odometry=never, scanner=jumped))
+
+
+def test_clocks_that_differ(room: SensorLog) -> None:
+    scans = room["scanner"]
+    drops = DropCounter()
+    steps = make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 1.0)), drops=drops)
+    assert drops.counts["scanner: beam outside the motion"] > 150
+    assert len(steps) == 8
+    with pytest.raises(DataError, match="are the clocks the same"):
+        make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 100.0)))
+
+
+def test_two_scanners_share_the_beams_of_a_step(room: SensorLog) -> None:
+    other = replace(room["scanner"], max_range=4.0, ranges=np.minimum(room["scanner"].ranges, 4.0))
+    steps = make_steps(spoiled(room, scanner2=other), StepConfig(most_points=40))
+    assert np.all(np.diff(steps.offsets) == 40)
+    assert steps.uses == {"scanner", "scanner2", "odometry"}
+    length = np.linalg.norm(steps.points - steps.origins, axis=1)
+    assert steps.max_range == 8.0
+    assert np.all(length[~steps.returns] > 3.999)
+    one = make_steps(spoiled(room, scanner2=other), StepConfig(scanners=("scanner",)))
+    np.testing.assert_array_equal(one.points, make_steps(room).points)
+
+
+def test_one_step_a_record(room: SensorLog) -> None:
+    scans = room["scanner"]
+    steps = make_steps(room, StepConfig(period=None))
+    np.testing.assert_allclose(steps.times, scans.times + 0.04)
+    assert np.all(np.diff(steps.offsets) == 15)
+
+
+def test_degraded_by_a_stated_bias(room: SensorLog) -> None:
+    clean, off = make_steps(room), make_steps(room, StepConfig(yaw_bias=0.005))
+    assert "0.005 rad/s" in off.name
+    assert clean.name == "room"
+    seconds = clean.times[-1] - clean.times[0]
+    T, P = clean.errors.between(0, 9)
+    U, C = off.errors.between(0, 9)
+    xi = se3.se3_log(se3.se3_between(U, T))  # true in estimated: the bias itself, hardly anything else
+    assert xi[2] == pytest.approx(-0.005 * seconds, rel=0.1)
+    assert np.sqrt(C[2, 2] - P[2, 2]) == pytest.approx(0.005 * seconds, rel=0.1)
+    assert 0.8 < xi @ np.linalg.solve(C, xi) < 1.2  # one σ of one lasting error
+    with pytest.raises(DataError, match="where level is"):
+        off.errors.between(0, 9, level_start=True)
+
+
+def test_motion_of_an_imu_and_wheels() -> None:
+    d = drive(np.random.default_rng(0), seconds=8.0)
+    scans = room_scans(d.truth, np.array([40.0, 40.0, 4.0]), beams=7, max_range=12.0)
+    log = SensorLog(name="crawler", streams={"imu": d.imu, "wheels": d.wheels, "scanner": scans}, truth=Truth(d.truth))
+    steps = make_steps(log)
+    assert steps.dim == 3
+    assert steps.tilt.shape == (len(steps), 2)
+    assert steps.tilt_sigma == pytest.approx(d.imu.noise.attitude)
+    assert steps.tilt_time == d.imu.noise.attitude_time
+    assert isinstance(steps.errors, Reckoned)
+    assert steps.uses == {"imu", "wheels", "scanner"}
+    # moved by the estimated motion inside a step only: within centimetres of the truth
+    exact = make_steps(SensorLog(name="exact", streams={"scanner": scans, "odometry": odometry_of(d.truth)}))
+    assert np.array_equal(exact.offsets, steps.offsets)
+    assert np.linalg.norm(exact.points - steps.points, axis=1).max() < 0.15
+    assert np.linalg.norm(exact.points - steps.points, axis=1).mean() < 0.02
+    biased = make_steps(log, StepConfig(yaw_bias=0.02))
+    turned = se3.so3_log(se3.se3_between(biased.errors.poses[-1], steps.errors.poses[-1])[3:])
+    assert turned[2] == pytest.approx(-0.02 * (steps.times[-1]), rel=0.05)
+
+
+def planar_log(**more: object) -> SensorLog:
+    """A square room of 8 m, seen by a laser at 5 Hz from a base that turns and drives."""
+    n = 41
+    t = 0.2 * np.arange(n)
+    wheels = VelocityControls(times=t, speed=np.full(n, 0.5), yaw_rate=np.full(n, 0.4))
+    heading = 0.4 * t
+    xy = 0.5 / 0.4 * np.column_stack([np.sin(heading), 1 - np.cos(heading)])
+    truth = Trajectory(t, np.column_stack([xy, np.arctan2(np.sin(heading), np.cos(heading))]))
+    bearings = np.linspace(-np.pi / 2, np.pi / 2, 91)
+    laser = np.array([0.2, 0.0, 0.1])
+    p = se2_transform(truth.poses, laser[:2])
+    angle = heading[:, None] + laser[2] + bearings
+    d = np.stack([np.cos(angle), np.sin(angle)], -1)
+    ranges = np.min((np.copysign(4.0, d) - p[:, None]) / d, axis=2)
+    scans = LaserScans(times=t, ranges=ranges, bearings=bearings, max_range=5.0, T_base_sensor=laser)
+    streams = {"laser": scans, "wheels": wheels, **more}
+    return SensorLog(name="square", streams=streams, truth=Truth(truth))
+
+
+@pytest.mark.parametrize("period", [0.05, 0.2, 0.7, None])
+@pytest.mark.parametrize("recorded", [True, False])
+def test_in_the_plane(period: float | None, recorded: bool) -> None:
+    """Several scans a step or several steps a scan: with true motion every return is on a wall."""
+    log = planar_log()
+    streams = {"laser": log["laser"], "odometry": odometry_of(log.truth.trajectory)} if recorded else log.streams
+    drops = DropCounter()
+    steps = make_steps(replace(log, streams=streams), StepConfig(period=period), drops=drops)
+    assert steps.dim == 2
+    truth = steps.truth.interpolate(steps.times)
+    for k in range(len(steps)):
+        points, _, met = steps.scan(k)
+        if np.any(met):
+            world = se2_transform(truth[k], points[met])
+            assert np.abs(np.abs(world).max(axis=1) - 4.0).max() < (2e-2 if period in (0.05, 0.7) else 1e-5)
+    empty = np.sum(np.diff(steps.offsets) == 0)
+    assert empty == drops.counts["steps: step without a beam (kept)"]
+    assert (empty > 100) if period == 0.05 else (empty == 0)
+    T, C = steps.errors.between(0, len(steps) - 1)
+    np.testing.assert_allclose(T, se2_between(truth[0], truth[-1]), atol=2e-3)
+    np.linalg.cholesky(C)
+
+
+def test_planar_gap_of_controls() -> None:
+    log = planar_log()
+    wheels = log["wheels"]
+    hole = wheels.take((wheels.times < 3.1) | (wheels.times > 4.5))
+    drops = DropCounter()
+    make_steps(replace(log, streams={**log.streams, "wheels": hole}), drops=drops)
+    assert drops.counts["square/wheels: gap bridged"] == 1
+    hole = wheels.take((wheels.times < 3.1) | (wheels.times > 6.5))
+    with pytest.raises(DataError, match=r"square/wheels: gap without records.*3\.000 to 6\.600"):
+        make_steps(replace(log, streams={**log.streams, "wheels": hole}))
+
+
+def test_clouds_keep_their_order_and_origin(rng: np.random.Generator) -> None:
+    path = winding_path()
+    points = rng.uniform(-3.0, 3.0, size=(600, 3))
+    points[10] = [0.5, 0, 0.001]
+    mount = np.array([0.1, 0, 0.3, 0, 0, np.sin(0.2), np.cos(0.2)])
+    times = path.times[[20, 50, 90, 130]]
+    offsets = np.array([0, 200, 200, 350, 600])
+    clouds = PointClouds.from_arrays(times, points, offsets, origin=np.array([0.5, 0.0, 0.0]), T_base_sensor=mount)
+    log = SensorLog(name="lidar", streams={"clouds": clouds, "odometry": odometry_of(path)})
+    drops = DropCounter()
+    steps = make_steps(log, StepConfig(period=None, most_points=1000, max_range=2.5), drops=drops)
+    assert len(steps) == 4
+    np.testing.assert_array_equal(np.diff(steps.offsets), [199, 0, 150, 250])
+    assert drops.counts["clouds: nearer than 0.1 m"] == 1
+    assert drops.counts["clouds: scan without a reading"] == 1
+    np.testing.assert_allclose(steps.origins, np.tile(se3.se3_transform(mount, [0.5, 0, 0]), (599, 1)), atol=1e-9)
+    kept = steps.returns[199:349]
+    ends = se3.se3_transform(mount, points[200:350])
+    np.testing.assert_allclose(steps.points[199:349][kept], ends[kept], atol=1e-9)
+    far = np.linalg.norm(points[200:350] - [0.5, 0, 0], axis=1) >= 2.5
+    np.testing.assert_array_equal(kept, ~far)
+    assert 0 < far.sum() < 150
+
+
+def test_refusals(room: SensorLog) -> None:
+    scanner, odometry = room["scanner"], room["odometry"]
+    with pytest.raises(MissingDataError, match="no scanner"):
+        make_steps(SensorLog(name="blind", streams={"odometry": odometry}))
+    with pytest.raises(MissingDataError, match="no motion"):
+        make_steps(SensorLog(name="lame", streams={"scanner": scanner}))
+    with pytest.raises(MissingDataError, match="single record"):
+        make_steps(SensorLog(name="one", streams={"scanner": scanner, "odometry": odometry.take(slice(0, 1))}))
+    with pytest.raises(MissingDataError, match="empty"):
+        make_steps(SensorLog(name="none", streams={"scanner": scanner, "odometry": odometry.take(slice(0, 0))}))
+    with pytest.raises(ConfigError, match="3 dimensions, the motion of wheels 2"):
+        make_steps(SensorLog(name="mixed", streams={"scanner": scanner, "wheels": planar_log()["wheels"]}))
+    with pytest.raises(ConfigError, match="holds no beams"):
+        make_steps(room, StepConfig(scanners=("odometry",)))
+    with pytest.raises(ConfigError, match="motion from scanner"):
+        make_steps(room, StepConfig(motion=("scanner",)))
+    with pytest.raises(MissingDataError, match="no stream 'gyro'"):
+        make_steps(room, StepConfig(motion=("gyro",)))
+    for bad in (
+        {"period": 0.0},
+        {"period": np.nan},
+        {"max_range": -1.0},
+        {"most_points": 0},
+        {"yaw_bias": np.inf},
+        {"min_range": -0.1},
+        {"max_range": 0.05},
+        {"longest_record": 0.0},
+    ):
+        with pytest.raises(ConfigError, match="steps: "):
+            StepConfig(**bad)
+
+
+def test_a_scan_with_no_record(room: SensorLog) -> None:
+    empty = room["scanner"].take(slice(0, 0))
+    assert isinstance(empty, RangeScans)
+    steps = make_steps(spoiled(room, scanner=empty))
+    assert len(steps) == 10
+    assert len(steps.points) == 0
+    with pytest.raises(DataError, match="no record of the scanner"):
+        make_steps(spoiled(room, scanner=empty), StepConfig(period=None))
+
+
+def test_steps_check_themselves(room: SensorLog) -> None:
+    steps = make_steps(room)
+    points = steps.points.copy()
+    points[7, 1] = np.nan
+    for error, bad in (
+        (DataError, {"points": points}),
+        (GeometryError, {"points": steps.points[:, :2]}),
+        (DataError, {"offsets": steps.offsets[:-1]}),
+        (DataError, {"offsets": steps.offsets[::-1]}),
+        (GeometryError, {"returns": steps.returns.astype(float)}),
+        (DataError, {"times": steps.times + 1.0}),
+        (DataError, {"max_range": 0.0}),
+        (GeometryError, {"tilt": np.zeros((3, 2))}),
+    ):
+        with pytest.raises(error):
+            replace(steps, **bad)
+    assert isinstance(replace(steps, name="other"), Steps)
