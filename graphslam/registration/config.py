@@ -47,7 +47,7 @@ class Gates:
     fitness_known: float = 0.85
     fitness_upright: float = 0.7
     known_share: float = 0.5
-    degeneracy: float = 0.004
+    degeneracy: float = 0.003
     degeneracy_planar: float = 0.01
     tilt: float = math.radians(4.0)
 

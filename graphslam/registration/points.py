@@ -12,9 +12,12 @@ from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 
+FARTHEST = 1e6
+"""Coordinates beyond this are no measurement [m]."""
+
 
 def finite_points(points: Any, *, what: str = "points", drops: DropCounter | None = None) -> Array:
-    """Points ``(m, 2 | 3)`` [m] without those that are not finite, which are counted.
+    """Points ``(m, 2 | 3)`` [m] without those that are not finite or beyond :data:`FARTHEST`, which are counted.
 
     Raises
     ------
@@ -24,11 +27,11 @@ def finite_points(points: Any, *, what: str = "points", drops: DropCounter | Non
     p = np.ascontiguousarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] not in (2, 3):
         raise GeometryError(f"{what} have the wrong shape", got=p.shape, wanted="(m, 2) or (m, 3)")
-    good = np.isfinite(p).all(axis=1)
+    good = (np.abs(p) < FARTHEST).all(axis=1)  # NaN is not
     if good.all():
         return p
     if drops is not None:
-        drops.drop(what, "not finite", int(np.sum(~good)))
+        drops.drop(what, "not finite, or absurdly far", int(np.sum(~good)))
     return p[good]
 
 
@@ -49,8 +52,8 @@ def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
 
 
 def transform(T_ab: Array, points: Array) -> Array:
-    """Points ``(m, dim)`` of frame b in frame a."""
-    return se2.se2_transform(T_ab, points) if points.shape[1] == 2 else se3.se3_transform(T_ab, points)
+    """Points ``(m, dim)`` of frame b in frame a; poses may have leading axes to broadcast."""
+    return se2.se2_transform(T_ab, points) if points.shape[-1] == 2 else se3.se3_transform(T_ab, points)
 
 
 def thin(points: Array, voxel: float) -> Array:
@@ -72,6 +75,9 @@ def thin(points: Array, voxel: float) -> Array:
     cells = np.floor(points / voxel).astype(np.int64)
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1
+    if np.prod(size.astype(float)) > 2.0**62:  # too many to number
+        cells = np.stack([np.unique(c, return_inverse=True)[1] for c in cells.T], axis=1)
+        size = cells.max(axis=0) + 1
     key = cells[:, 0]
     for a in range(1, points.shape[1]):
         key = key * size[a] + cells[:, a]

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
-from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.geometry import Array, ArrayLike, wrap_angle
 from graphslam.registration.points import check_pose, finite_points, spread, thin, transform
 from graphslam.registration.search_kernels import local_maxima, score_block, splat
 
@@ -240,24 +240,37 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lat
     """
     phases = field._in_phases(lattice.steps)
     scores = np.zeros(lattice.shape, np.uint32)
-    block = np.empty(lattice.shape[1:], np.uint16)
     first = np.array([lattice.x[0], lattice.y[0], lattice.z[0]])
     counts, steps = np.array(lattice.shape[:0:-1]), np.array(lattice.steps)
     # the cell is found at the middle of the lattice, so that it does not depend on how wide that is
     back = np.rint(first / field.cell).astype(np.int64)
-    for a, yaw in enumerate(lattice.yaw):
-        placed = transform(offset_pose(around, (0.0, 0.0, 0.0, yaw)), points)
-        score_block(field._cells(placed) + back, counts, steps, phases, block, scores[a])
+    still = np.zeros_like(lattice.yaw)
+    turned = offset_pose(around, np.stack([still, still, still, lattice.yaw], -1))
+    cells = field._cells(transform(turned[:, None], points).reshape(-1, field.dim)) + back
+    score_block(cells.reshape(len(turned), -1, 3), counts, steps, phases, scores)
     return scores
 
 
-def offset_pose(around: Array, offset: Sequence[float]) -> Array:
-    """The pose moved by x, y, z [m] along the target's axes and turned about the vertical through itself [rad]."""
-    x, y, z, yaw = offset
+def offset_pose(around: Array, offset: ArrayLike) -> Array:
+    """The pose moved by x, y, z [m] along the target's axes and turned about the vertical through itself [rad].
+
+    Parameters
+    ----------
+    around : (3,) or (7,)
+    offset : (..., 4)
+        x, y, z, heading; z means nothing in two dimensions.
+
+    Returns
+    -------
+    (..., 3) or (..., 7)
+    """
+    move = np.asarray(offset, dtype=np.float64)
     if len(around) == 3:
-        return np.array([around[0] + x, around[1] + y, wrap_angle(around[2] + yaw)])
-    turn = np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
-    return np.concatenate([around[:3] + np.array([x, y, z]), se3.quat_normalize(se3.quat_multiply(turn, around[3:]))])
+        return np.concatenate([around[:2] + move[..., :2], wrap_angle(around[2] + move[..., 3:])], -1)
+    half, none = 0.5 * move[..., 3], np.zeros(move.shape[:-1])
+    turn = np.stack([none, none, np.sin(half), np.cos(half)], -1)
+    turned = se3.quat_normalize(se3.quat_multiply(turn, around[3:]))
+    return np.concatenate([around[:3] + move[..., :3], turned], -1)
 
 
 def correlative_search(

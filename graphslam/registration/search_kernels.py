@@ -31,15 +31,15 @@ def splat(cells, offsets, values, field):
 
 
 @numba.njit(cache=True, nogil=True)
-def score_block(cells, counts, steps, phases, block, scores):
-    """Add up the field under all points, for every translation of a lattice; one heading.
+def score_block(cells, counts, steps, phases, scores):
+    """Add up the field under all points, for every heading and every translation of a lattice.
 
     The rows of x are added whole: neighbouring starts read neighbouring bytes, because the field is kept as one array
     per phase of the lattice.
 
     Parameters
     ----------
-    cells : (n, 3) int64
+    cells : (headings, n, 3) int64
         Cells x, y, z of the points at the first translation of the lattice; may lie outside the field.
     counts : (3,) int64
         Translations along x, y, z.
@@ -47,31 +47,31 @@ def score_block(cells, counts, steps, phases, block, scores):
         Cells of the field between translations.
     phases : (steps z, steps y, steps x, nz, ny, nx) uint8
         ``phases[c, b, a, k, j, i]`` is the field at cell ``x = a + i * steps[0]``, and so on.
-    block : (counts z, counts y, counts x) uint16
-        Work space.
-    scores : (counts z, counts y, counts x) uint32
+    scores : (headings, counts z, counts y, counts x) uint32
         Added to; outside the field is 0.
     """
     sizes = phases.shape
-    for first in range(0, cells.shape[0], 256):  # 256 * 255 < 2**16
-        block[:] = 0
-        for p in range(first, min(first + 256, cells.shape[0])):
-            x, y, z = cells[p, 0], cells[p, 1], cells[p, 2]
-            i0, j0, k0 = x // steps[0], y // steps[1], z // steps[2]  # floor, also below zero
-            part = phases[z - k0 * steps[2], y - j0 * steps[1], x - i0 * steps[0]]
-            low, high = max(0, -i0), min(counts[0], sizes[5] - i0)
-            if low >= high:
-                continue
-            for k in range(max(0, -k0), min(counts[2], sizes[3] - k0)):
-                for j in range(max(0, -j0), min(counts[1], sizes[4] - j0)):
-                    row = part[k0 + k, j0 + j, i0 + low : i0 + high]
-                    out = block[k, j, low:high]
-                    for i in range(row.shape[0]):
-                        out[i] += np.uint16(row[i])
-        for k in range(counts[2]):
-            for j in range(counts[1]):
-                for i in range(counts[0]):
-                    scores[k, j, i] += block[k, j, i]
+    block = np.empty((counts[2], counts[1], counts[0]), np.uint16)
+    for a in range(cells.shape[0]):
+        for first in range(0, cells.shape[1], 256):  # 256 * 255 < 2**16
+            block[:] = 0
+            for p in range(first, min(first + 256, cells.shape[1])):
+                x, y, z = cells[a, p, 0], cells[a, p, 1], cells[a, p, 2]
+                i0, j0, k0 = x // steps[0], y // steps[1], z // steps[2]  # floor, also below zero
+                part = phases[z - k0 * steps[2], y - j0 * steps[1], x - i0 * steps[0]]
+                low, high = max(0, -i0), min(counts[0], sizes[5] - i0)
+                if low >= high:
+                    continue
+                for k in range(max(0, -k0), min(counts[2], sizes[3] - k0)):
+                    for j in range(max(0, -j0), min(counts[1], sizes[4] - j0)):
+                        row = part[k0 + k, j0 + j, i0 + low : i0 + high]
+                        out = block[k, j, low:high]
+                        for i in range(row.shape[0]):
+                            out[i] += np.uint16(row[i])
+            for k in range(counts[2]):
+                for j in range(counts[1]):
+                    for i in range(counts[0]):
+                        scores[a, k, j, i] += block[k, j, i]
 
 
 @numba.njit(cache=True, nogil=True)
