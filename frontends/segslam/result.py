@@ -66,6 +66,8 @@ class SegSlamResult:
     tally : Tally
     seconds : mapping of str to float
         Wall time by part.
+    step_seconds : (n,)
+        Wall time of each step, of all parts together.
     used_bytes : int
         Memory of all maps at the end.
     seed : SeedTree
@@ -85,6 +87,7 @@ class SegSlamResult:
     winnowed: Winnowed
     tally: Tally
     seconds: dict[str, float]
+    step_seconds: Array
     used_bytes: int
     seed: SeedTree
 

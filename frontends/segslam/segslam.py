@@ -68,7 +68,9 @@ def run_segslam(
         raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")
     run = _Run(steps, filter, config, seed, prune_every)
     for k in tqdm(range(len(steps)), desc=steps.name, unit="step", disable=not progress):
+        begin = time.perf_counter()
         run.step(k)
+        run.step_seconds[k] = time.perf_counter() - begin
     return run.result()
 
 
@@ -102,6 +104,7 @@ class _Run:
         self.begun = 1
         self.last_attempt = float(steps.times[0])
         self.effective = np.empty(len(steps))
+        self.step_seconds = np.zeros(len(steps))
         self.resampled = np.zeros(len(steps), dtype=np.bool_)
         self.scores: list[ScoreLine] = []
         self.attempts: list[Attempt] = []
@@ -293,6 +296,7 @@ class _Run:
             winnowed=self.matcher.winnowed,
             tally=f.tally,
             seconds=seconds,
+            step_seconds=self.step_seconds,
             used_bytes=f.pool.used_bytes,
             seed=self.seed,
         )
