@@ -74,11 +74,10 @@ def simulate_crawler(world: World, seed: int, config: CrawlerConfig = DEFAULTS, 
 
     choice = seeds.child("drift").generator()
     sign = 1.0 if choice.random() < 0.5 else -1.0
-    missed = (
-        config.drift * motion.length * (1.0 + config.drift_spread * float(np.clip(choice.standard_normal(), -2, 2)))
-    )
-    yaw_bias = yaw_bias_for(motion, missed, sign, config.most_yaw_bias)
-    nominal = abs(yaw_bias_for(motion, config.drift * motion.length, sign, config.most_yaw_bias))
+    spread = 1.0 + config.drift_spread * float(np.clip(choice.standard_normal(), -2.0, 2.0))
+    wanted, most = config.drift * motion.length, config.most_turned / motion.duration
+    yaw_bias = yaw_bias_for(motion, spread * wanted, sign, spread * most)
+    nominal = abs(yaw_bias_for(motion, wanted, sign, most))
 
     streams: dict[str, Stream] = {}
     for k, mount in enumerate([config.mount, config.rear_mount][: config.scanners]):

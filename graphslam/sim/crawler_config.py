@@ -12,7 +12,7 @@ from graphslam.core.errors import ConfigError, UnknownNameError
 Pose = tuple[float, float, float, float, float, float, float]
 
 _POSITIVE = (
-    *("fan", "scan_rate", "max_range", "imu_rate", "wheel_rate", "attitude_time", "most_yaw_bias"),
+    *("fan", "scan_rate", "max_range", "imu_rate", "wheel_rate", "attitude_time", "most_turned"),
     *("wheelbase", "track", "ramp", "most_turn_rate"),
 )
 _NOT_NEGATIVE = (
@@ -67,8 +67,9 @@ class CrawlerConfig:
     off, so one bias would hide in a way that ends near its middle, and ruin another."""
     drift_spread: float = 0.1
     """Relative σ of that error from seed to seed, cut at 2 σ."""
-    most_yaw_bias: float = math.radians(0.15)
-    """Limit of the yaw bias, where the way ends near its middle [rad/s]."""
+    most_turned: float = 1.0
+    """Limit of the yaw bias, as the heading it has turned by at the end [rad]; a way that ends near its middle hides
+    any bias, and gets this one. It varies with the seed as the drift does."""
     gyro: float = 1e-4
     """White noise of the angular rates [rad/s/√Hz]."""
     gyro_bias_across: float = 2e-4

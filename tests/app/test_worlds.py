@@ -106,7 +106,10 @@ def test_every_world_can_be_driven(name: str) -> None:
     log = gs.simulate(name, seed=1, scan_rate=0.2, imu_rate=10.0)
     wanted = 0.03 * log.meta["length"]
     drawn = log.meta["drawn"]
-    within = 0.75 * wanted < drawn["end_error_of_yaw_bias"] < 1.25 * wanted
-    at_limit = abs(drawn["gyro_bias"][2]) >= 0.5 * log.meta["config"]["most_yaw_bias"]
-    assert within or at_limit
+    turned = abs(drawn["gyro_bias"][2]) * log.meta["duration"]
+    assert 0.4 < turned <= 1.2
+    if name == "building":  # a star ends at its middle: its drift is hidden at the end
+        assert turned > 0.75
+    else:
+        assert 0.75 * wanted < drawn["end_error_of_yaw_bias"] < 1.25 * wanted
     assert np.mean(log["scanner"].ranges < 30.0) > 0.6

@@ -290,7 +290,7 @@ def test_the_yaw_bias_brings_about_the_wanted_drift() -> None:
 
 def test_drift_of_logs() -> None:
     """Sign and size change from seed to seed; dead reckoning with the recorded yaw rate ends that far off."""
-    config = CrawlerConfig(scan_rate=0.5, imu_rate=50.0, drift=0.1, most_yaw_bias=0.2)
+    config = CrawlerConfig(scan_rate=0.5, imu_rate=50.0, drift=0.1, most_turned=9.0)
     logs = [simulate_crawler(hall(), s, config) for s in range(12)]
     ends = np.array([log.meta["drawn"]["end_error_of_yaw_bias"] for log in logs])
     biases = np.array([log.meta["drawn"]["gyro_bias"][2] for log in logs])
@@ -299,6 +299,9 @@ def test_drift_of_logs() -> None:
     assert ends.std() > 0.04 * 0.1 * length
     assert {-1.0, 1.0} == set(np.sign(biases))
     assert np.abs(biases).mean() == pytest.approx(logs[0]["imu"].noise.gyro_bias, rel=0.2)
+    hidden = simulate_crawler(hall(), 0, dataclasses.replace(config, drift=1.0, most_turned=0.5))
+    turned = abs(hidden.meta["drawn"]["gyro_bias"][2]) * hidden.meta["duration"]
+    assert 0.4 <= turned <= 0.6  # out of reach: the limit of the heading holds
     for log, end in zip(logs[:4], ends):
         imu, wheels = log["imu"], log["wheels"]
         roll, pitch = imu.attitude.T
