@@ -61,6 +61,7 @@ READERS: dict[str, Reader] = {
         "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
     ),
     "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
+    "carmen": Reader("graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2")),
     "lidar-pack": Reader("graphslam.io.lidar_pack:read_lidar_pack", ("xyz_i16_planar.npy.xz", "xyz_i16_planar.npy")),
 }
 """Readers of folders by name. A pose network is a file: :func:`load` gives its path."""
