@@ -72,7 +72,7 @@ class Way:
 
 def sample_way(route: Route) -> Way:
     """Samples of a route; pitch is its slope, roll is 0."""
-    s = route.every(_STEP)
+    s = route.every(min(_STEP, route.length / 16.0))  # a spline wants some samples of the shortest way, too
     positions = route.positions(s)
     rise = np.gradient(positions[:, 2], s)  # central: a slope that jumps at a sample would be half a sample late
     return Way(

@@ -115,6 +115,15 @@ def test_rate_and_rest() -> None:
     assert path.times[-1] == pytest.approx(drive(hall()).times[-1] + 3.0, abs=0.06)
 
 
+def test_a_way_of_a_hand_is_driven_as_well() -> None:
+    motion = drive_motion(hall([[0, 0, 0], [0.1, 0, 0]]))
+    t = np.linspace(0.0, motion.duration, 50)
+    x = motion.poses(t)[:, 0]
+    assert np.all(np.diff(x) > -1e-9)
+    assert x[[0, -1]] == pytest.approx([0.0, 0.1], abs=1e-6)
+    assert motion.velocities(t)[:, 0].max() <= 0.76
+
+
 def test_impossible_wishes_are_refused(motion: Motion) -> None:
     for t in ([-1.0], [0.0, motion.duration + 1.0], [np.nan]):
         with pytest.raises(DataError, match="outside the drive"):
