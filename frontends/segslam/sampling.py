@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -332,6 +333,29 @@ class _Upright:
         return np.stack([p[:, 0], p[:, 1], wrap_angle(p[:, 3])], axis=1)
 
 
+def seams(segmap: SegMap, sample: MapSample) -> list[tuple[int, int, Array]]:
+    """Where segments follow each other in time that the sample did not link, and what is missing between them.
+
+    Returns
+    -------
+    list of (a, b, T)
+        Places in the sample of the segment before and the one after, and ``T_bodybefore_bodyafter`` at the boundary
+        they share: the identity if all loops closed exactly.
+    """
+    g, t = segmap.group, segmap.table
+    order = sample.in_time.tolist()
+    found = []
+    for a, b in pairwise(order):
+        if sample.intervals[a, 1] != sample.intervals[b, 0] or OPEN in (sample.segments[a], sample.segments[b]):
+            continue
+        if sample.via[a] == b or sample.via[b] == a:
+            continue
+        before = g.compose(sample.poses[a], t.exit[sample.segments[a]])
+        after = g.compose(sample.poses[b], t.entry[sample.segments[b]])
+        found.append((a, b, g.between(before, after)))
+    return found
+
+
 def nearest_step(segmap: SegMap, index: int, T_segment_body: Array) -> int:
     """Step of a segment at which its body stood nearest to a pose in its frame."""
     path = cast(Array, segmap.table.paths[index])
@@ -342,7 +366,8 @@ def nearest_step(segmap: SegMap, index: int, T_segment_body: Array) -> int:
 def concatenate(segmap: SegMap, sample: MapSample, open_path: Array | None = None) -> Trajectory:
     """The path of a sample in the frame of its root (A6, eq. 11–12).
 
-    A boundary stands in two segments; its pose is that of the exit.
+    A boundary stands in two segments; its pose is that of the exit. Where two fronts of the growth met there is a
+    seam, over which the path jumps by what the loops do not close; see :func:`seams`.
 
     Parameters
     ----------

@@ -114,6 +114,7 @@ class Table:
 
 def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
     order = rows[np.argsort(column[rows], kind="stable")]
+    order.flags.writeable = False  # it is handed out
     values, first = np.unique(column[order], return_index=True)
     return dict(zip(values.tolist(), np.split(order, first[1:])))
 

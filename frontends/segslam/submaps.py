@@ -17,7 +17,7 @@ import numpy.typing as npt
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import exit_covariance
-from frontends.segslam.poses import frame_between, group_of, level, pose_scatter
+from frontends.segslam.poses import frame_between, group_of, level, normalised, pose_scatter
 from frontends.segslam.sampling import nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 from graphslam.core import se3
@@ -152,7 +152,12 @@ def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array,
     entry, exit = t.entry[i], t.exit[i]
     base = level(entry) if segmap.gravity else entry
     T = g.between(base, exit)
-    return (level(T) if segmap.gravity else T), t.weight[i]
+    return (level(T) if segmap.gravity else T), _shares(t.weight[i])
+
+
+def _shares(weights: Array) -> Array:
+    """Weights that sum to one; equal where what is left of an interval weighs nothing."""
+    return normalised(weights if weights.sum() > 0 else None, len(weights))
 
 
 def _submap(
@@ -225,7 +230,7 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
     start, end = s.interval
     n = end - start + 1
     i = segmap.in_interval(s.interval)
-    w = t.weight[i] / t.weight[i].sum()
+    w = _shares(t.weight[i])
     P = np.zeros((n, g.dof, g.dof))
     for k, wk in zip(i.tolist(), w.tolist()):
         path = cast(Array, t.paths[k])
@@ -262,7 +267,8 @@ def _matches(
     """Re-entries of all particles of an interval, one for each submap that was entered, heaviest first."""
     t = segmap.table
     members = segmap.in_interval(s.interval)
-    total = float(t.weight[members].sum())
+    share = np.zeros(t.count)
+    share[members] = _shares(t.weight[members])
     groups: dict[int, list[tuple[int, Array]]] = {}
     lost = 0
     for i in members[t.kind[members] == MATCH].tolist():
@@ -274,14 +280,14 @@ def _matches(
     out = []
     for target, entries in groups.items():
         index = np.array([i for i, _ in entries])
-        weight = t.weight[index]
-        support = float(weight.sum() / total)
+        weight = share[index]
+        support = min(float(weight.sum()), 1.0)
         if support < config.minimum_support:
             continue
         # the chain's own match speaks for its group, else the heaviest
         lead = int(np.argmax(index == s.index)) if s.index in index else int(np.argmax(weight))
         T = np.stack([T for _, T in entries])
-        scatter = pose_scatter(T, T[lead], weight) if len(T) > 1 else 0.0
+        scatter = pose_scatter(T, T[lead], _shares(weight)) if len(T) > 1 else 0.0
         i = int(index[lead])
         fitness = float(t.fitness[i])
         out.append(
@@ -294,7 +300,7 @@ def _matches(
             )
         )
     out.sort(key=lambda m: (-m.support, m.target))
-    kinds = {KINDS[k]: float(t.weight[members[t.kind[members] == k]].sum() / total) for k in range(len(KINDS))}
+    kinds = {KINDS[k]: float(share[members[t.kind[members] == k]].sum()) for k in range(len(KINDS))}
     return tuple(out), {"entered_share": kinds, "matches_without_target": lost}
 
 

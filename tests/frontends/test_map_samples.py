@@ -17,6 +17,7 @@ from frontends.segslam.sampling import (
     nearest_step,
     root_of_particle,
     root_of_segment,
+    seams,
 )
 from frontends.segslam.segmap import Entry, SegMap
 from graphslam.core import se3
@@ -262,3 +263,24 @@ def test_frames_without_gravity_are_whole_poses() -> None:
         se3.pose_to_matrix(se3.se3_between(path.poses[0], path.poses[-1])), se3.pose_to_matrix(whole), atol=1e-12
     )
     np.testing.assert_allclose(path.poses[-1], m[2].T_exit, atol=1e-12)
+
+
+def test_a_sample_has_a_seam_where_its_fronts_met() -> None:
+    """The square does not close by 0.1 m a side in particle 1's segments: with them, the seam is what is missing."""
+    m = square()
+    root = root_of_particle(m, 0, 10)
+    seen = set()
+    for seed in range(30):
+        s = grow(m, root, np.random.default_rng(seed))
+        ((a, b, T),) = seams(m, s)
+        assert sorted((s.intervals[a].tolist(), s.intervals[b].tolist())) == [[2, 4], [4, 6]]
+        # the four sides against the match, which says that the last corner is 0.2 m along the first side
+        sides = [2.0 + 0.1 * (s.segments[k] % 2) for k in s.in_time[:4].tolist()]
+        missing = np.hypot(sides[0] - sides[2] - 0.2, sides[1] - sides[3])
+        assert np.hypot(*T[:2]) == pytest.approx(missing, abs=1e-9)
+        path = concatenate(m, s, straight(np.array([0.2, 0.0, 0.0]), 2.0, 2))
+        jump = se2_compose(se2_inverse(path.poses[4]), path.poses[5])[:2] - 0.5 * sides[2] * np.array([1.0, 0.0])
+        np.testing.assert_allclose(np.hypot(*jump), missing, atol=1e-9)
+        seen.add(round(float(missing), 6))
+    assert len(seen) > 2
+    assert seams(m, grow(m, root_of_segment(m, 6), np.random.default_rng(0))) == []

@@ -171,6 +171,14 @@ def test_a_chain_with_gaps_is_refused_and_holes_in_a_history_are_filled() -> Non
         settle(m, [8], drift)
 
 
+def test_an_interval_of_which_nothing_heavy_is_left_is_still_handed_over() -> None:
+    m = loop()
+    m.table.weight[:4] = 0.0
+    s = settle(m, [0], drift)[0]
+    ahead = 0.01 * np.arange(4)
+    np.testing.assert_allclose(s.exit_covariance, 3 * D + np.diag([0.0, np.mean(ahead**2), 0.0]), atol=1e-12)
+
+
 def test_going_on_in_the_same_map_is_no_match() -> None:
     m = small_segmap(5, 1)
     m.open(0, [Entry(T_entry=ZERO)])
