@@ -23,6 +23,7 @@ PAGES = [
     "limits.md",
     "mrclam.md",
     "plaza.md",
+    "simulated-robots.md",
     "without-truth.md",
 ]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
@@ -51,7 +52,9 @@ def test_links_lead_somewhere(name: str) -> None:
             assert part in {anchor(h) for h in headings}, f"{name}: {target}"
 
 
-@pytest.mark.parametrize("name", ["concepts.md", "evidence-grids.md", "how-to.md", "without-truth.md"])
+@pytest.mark.parametrize(
+    "name", ["concepts.md", "evidence-grids.md", "how-to.md", "simulated-robots.md", "without-truth.md"]
+)
 def test_python_of_the_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     """Blocks that name a file are that file; the rest is one script, run in an empty folder."""
     script = []
