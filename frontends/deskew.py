@@ -207,6 +207,7 @@ def deskew(
     step_poses : (n, 7) or (n, 3)
         Same frame.
     step, times : (q,)
+        The step follows from the time, as of :func:`assign`.
     origins, ends : (q, dim)
 
     Returns
@@ -217,7 +218,9 @@ def deskew(
     transform = se2_transform if path.dim == 2 else se3.se3_transform
     for a in range(0, len(times), _AT_ONCE):
         part = slice(a, min(a + _AT_ONCE, len(times)))
-        T = between(step_poses[step[part]], path.interpolate(times[part]))
+        # beams of one stamp share one motion (a cloud has thousands)
+        stamps, first, which = np.unique(times[part], return_index=True, return_inverse=True)
+        T = between(step_poses[step[part][first]], path.interpolate(stamps))[which]
         out_origins[part], out_ends[part] = transform(T, origins[part]), transform(T, ends[part])
     if not (np.all(np.isfinite(out_ends)) and np.all(np.isfinite(out_origins))):
         raise DataError("a beam has no finite position", got=f"beam {np.argwhere(~np.isfinite(out_ends))[:1]}")

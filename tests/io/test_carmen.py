@@ -158,7 +158,7 @@ def test_refusals(tmp_path: Path) -> None:
 )
 def test_recorded_logs_become_steps(data_dir: Path, name: str, scans: int, corrected: int, metres: float) -> None:
     drops = DropCounter()
-    log = load(name)
+    log = load(name)  # reads the corrected log as well
     assert len(log["laser"].times) == scans
     assert len(log["reference"]) == corrected
     steps = make_steps(log, StepConfig(most_points=180), drops=drops)
