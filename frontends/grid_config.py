@@ -25,7 +25,9 @@ class GridFilterConfig:
     voxel_size: float = 0.2
     """Edge of a voxel [m]: smaller ones cost time with the cube, larger ones blur what end points are weighed by."""
     hit: float = 0.7
-    """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's)."""
+    """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's). With a larger one floors outlast
+    the beams that graze them, so that heights drift less; walls get thicker, and the way across them is told less
+    well."""
     miss: float = 0.4
     """The same, given that a beam passed through it (OctoMap's)."""
     clamp: tuple[float, float] = (0.1192, 0.971)
