@@ -1,0 +1,79 @@
+"""The front end ``segslam``: a log of beams and motion as submaps with evidence grids and matches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from frontends.drift import DriftModel
+from frontends.grid_config import GridFilterConfig
+from frontends.segslam.config import SegSlamConfig
+from frontends.segslam.result import SegSlamResult
+from frontends.segslam.segslam import run_segslam
+from frontends.segslam.submaps import drift_by_length, settle, settled_chain
+from frontends.step_config import StepConfig
+from frontends.steps import make_steps
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegSlamFrontEndConfig:
+    """The front end ``segslam``."""
+
+    steps: StepConfig = field(default_factory=StepConfig)
+    """How the log becomes steps."""
+    filter: GridFilterConfig = field(default_factory=GridFilterConfig)
+    """Particles, motion, weights."""
+    segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
+    """Segmentation, matching, what is handed over."""
+    drift: DriftModel = field(default_factory=DriftModel)
+    """Errors that all particles share, by the length of the segment; its dimension is that of the log."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegSlam:
+    """The front end ``segslam``.
+
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. Particles decide late
+    which segment was the right one, so the filter runs over the whole log first, also when a run is resumed; the same
+    seed gives the same submaps.
+    """
+
+    config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
+    name: ClassVar[str] = "segslam"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`frontends.base.FrontEnd`: the settled chain of the best particle, segment by segment."""
+        c = self.config
+        steps = make_steps(log, c.steps, drops=drops)
+        result = run_segslam(steps, c.filter, c.segslam, seed.child(0))
+        for submap in settled(result, c.drift, c.segslam):
+            if after is None or submap.key > after.key:
+                yield submap
+
+
+def settled(result: SegSlamResult, drift: DriftModel, config: SegSlamConfig) -> list[Submap]:
+    """Submaps of the best particle's chain.
+
+    Parameters
+    ----------
+    result : SegSlamResult
+    drift : DriftModel
+        Errors that all particles share; its dimension is taken from the result.
+    config : SegSlamConfig
+    """
+    segmap, steps = result.segmap, result.steps
+    model = replace(drift, dim=steps.dim)
+    return settle(
+        segmap,
+        settled_chain(segmap, int(result.closed[result.best])),
+        drift_by_length(steps.path_length, model),
+        config.handover,
+        uses=steps.uses,
+        reasons={b.step: b.why for b in result.boundaries},
+    )
