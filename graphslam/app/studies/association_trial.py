@@ -102,7 +102,8 @@ class Trial:
     log: SensorLog = field(init=False)
 
     def __post_init__(self) -> None:
-        self.log = simulate("landmark-field", seed=self.seed, preset=self.config.world, **dict(self.config.changes))
+        changes: dict[str, Any] = dict(self.config.changes)
+        self.log = simulate("landmark-field", seed=self.seed, preset=self.config.world, **changes)
         self.observations = self.log["landmarks"]
 
     def run(self) -> Iterator[Measurement]:

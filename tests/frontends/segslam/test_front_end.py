@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_it_is_a_front_end_and_its_submaps_follow_each_other(log: SensorLog, sub
     assert isinstance(SegSlam(), FrontEnd)
     assert [s.key for s in submaps] == list(range(len(submaps)))
     assert len(submaps) >= 4
-    for a, b in zip(submaps, submaps[1:]):
+    for a, b in pairwise(submaps):
         assert a.interval[1] == b.interval[0]
     assert (submaps[0].interval[0], submaps[-1].interval[1]) == log.interval
     for s in submaps:
