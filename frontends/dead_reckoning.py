@@ -50,9 +50,9 @@ class DeadReckoningNoise:
     """σ of one reading of the speed, held until the next [m/s]."""
     wheel_scale: float = 0.005
     """σ of the scale of the wheels, which lasts."""
-    lateral: float = 0.005
+    lateral: float = 0.002
     """Side slip after one metre, growing with the root of the distance [m/√m]."""
-    vertical: float = 0.005
+    vertical: float = 0.002
     """The same upwards [m/√m]."""
     attitude_bias: float = float(np.deg2rad(0.1))
     """Part that lasts of the σ of the unit's own roll and pitch [rad]; the rest of it fades."""
