@@ -19,7 +19,7 @@ from frontends.segslam.sampling import (
     root_of_segment,
     seams,
 )
-from frontends.segslam.segmap import Entry, SegMap
+from frontends.segslam.segmap import SAME, Entry, SegMap
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_inverse
@@ -84,8 +84,7 @@ def test_a_match_places_older_segments_where_the_closure_says() -> None:
     assert other.travelled.max() == pytest.approx(2.0 + 6.0)
 
 
-@pytest.mark.parametrize("root", ["open", "closed"])
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("root", "weighted"), [("open", True), ("closed", True), ("closed", False)])
 def test_samples_come_as_often_as_enumeration_says(root: str, weighted: bool) -> None:
     m = square()
     r = root_of_particle(m, 0, 9) if root == "open" else root_of_segment(m, 4)
@@ -153,6 +152,22 @@ def test_local_samples_stop_at_their_reach() -> None:
     assert sorted(map(tuple, near.intervals.tolist())) == [(4, 6), (6, 8), (8, 10)]
     assert len(grow(m, root, np.random.default_rng(0), local_depth=1)) == 2
     assert len(grow(m, root, np.random.default_rng(0))) == 5
+
+
+def test_going_on_in_the_same_map_leads_to_one_segment_before_not_to_two() -> None:
+    m = small_segmap(9, 2)
+    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    m.close(2, [flat_grid(), flat_grid()], [straight(ZERO, 1.0 + p, 2) for p in range(2)])
+    m.open(2, [Entry(T_entry=m[p].T_exit, kind=SAME, source=p) for p in range(2)])
+    seen = set()
+    for seed in range(30):
+        s = grow(m, root_of_particle(m, 0, 3), np.random.default_rng(seed))
+        assert len(s) == 2
+        seen.add(int(s.segments[1]))
+        # whichever it is, the body stands where it stood: 1 m along the frame of the root
+        at = se2_compose(s.poses[1], m[int(s.segments[1])].T_exit)
+        np.testing.assert_allclose(at, [1.0, 0.0, 0.0], atol=1e-12)
+    assert seen == {0, 1}
 
 
 def test_a_pruned_source_is_no_link() -> None:

@@ -50,6 +50,8 @@ def test_a_particle_goes_out_and_comes_back_into_its_first_map() -> None:
     assert m.intervals().tolist() == [[0, 2], [2, 4], [4, 6]]
     assert m.entered(0) == 1
     assert m.entered(1) == 0
+    m.open(6, [Entry(T_entry=m[2].T_exit, kind=SAME, source=2)])  # going on is not entering
+    assert m.entered(2) == 0
 
 
 def test_all_that_end_at_a_boundary_fit_all_that_begin_there() -> None:
@@ -97,6 +99,21 @@ def test_segments_that_lead_nowhere_are_dropped_with_their_maps() -> None:
         m[1]
     with pytest.raises(DataError, match="no such segment"):
         m[7]
+
+
+def test_a_dead_end_of_two_segments_goes_at_once() -> None:
+    """Particle 1 cuts at 3 and at 5 and dies: what ends at 3 leads only to what leads nowhere."""
+    m = small_segmap(9, 2)
+    m.open(0, [_new()] * 2)
+    m.close(2, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[0])
+    m.open(2, [_new()], which=[0])
+    for a, b in ((0, 3), (3, 5)):
+        m.close(b, [flat_grid()], [straight(ZERO, 1.0, b - a)], which=[1])
+        m.open(b, [_new()], which=[1])
+    assert m.prune() == 0
+    m.resample([0, 0])
+    assert m.prune() == 2
+    assert m.alive.tolist() == [0]
 
 
 def test_only_the_heaviest_of_an_interval_are_kept_and_those_lived_through() -> None:
@@ -175,6 +192,21 @@ def test_merging_counts_no_scan_twice() -> None:
     assert m.merge(0, 1) is not None  # 0 … 2, 4 … 6 and 2 … 4: no scan in both
     with pytest.raises(DataError, match="share scans"):
         m.merge(0, 3)
+
+
+def test_maps_of_overlapping_intervals_are_refused_and_of_others_not() -> None:
+    def pair(first: tuple[int, int], second: tuple[int, int]) -> SegMap:
+        m = small_segmap(9, 2)
+        for p, (a, b) in enumerate((first, second)):
+            m.open(a, [_new()], which=[p])
+            m.close(b, [flat_grid()], [straight(ZERO, 1.0, b - a)], which=[p])
+        return m
+
+    for first, second in (((0, 2), (3, 5)), ((3, 5), (0, 2)), ((0, 2), (2, 4)), ((2, 4), (0, 2)), ((0, 3), (0, 3))):
+        pair(first, second).merge(0, 1)
+    for first, second in (((0, 3), (0, 2)), ((0, 2), (0, 3)), ((0, 3), (2, 5)), ((2, 5), (0, 3)), ((1, 2), (0, 5))):
+        with pytest.raises(DataError, match="share scans"):
+            pair(first, second).merge(0, 1)
 
 
 def test_the_map_goes_with_its_last_user() -> None:
@@ -259,7 +291,7 @@ OPS = st.one_of(
 )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(ops=st.lists(OPS, min_size=1, max_size=25), seed=st.integers(0, 2**16))
 def test_any_history_gives_what_the_plain_twin_has(ops: list[tuple], seed: int) -> None:  # type: ignore[type-arg]
     rng = np.random.default_rng(seed)
