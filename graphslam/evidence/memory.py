@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
@@ -94,3 +95,25 @@ def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
             pool.brick_ref, np.zeros(n, np.int32), np.zeros(b, np.int32),
         )  # fmt: skip
     return Memory(int(begins[-1]), found, int(private[0]), int(private[1]))
+
+
+def shared_bricks(grid: EvidenceGrid, others: Sequence[EvidenceGrid]) -> npt.NDArray[np.bool_]:
+    """Which bricks of a grid are bricks of others too, not merely equal ``(n,)``; ordered as its `brick_coordinates`.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    others : sequence of EvidenceGrid
+        Of the same pool.
+
+    Raises
+    ------
+    GridError
+        Grids of different pools.
+    """
+    if any(g.pool is not grid.pool for g in others):
+        raise GridError("grids of different pools share nothing", wanted="one pool")
+    with grid.pool.lock:
+        mine = grid.packed_bricks()[:, 1]
+        theirs = [g.packed_bricks()[:, 1] for g in others if g is not grid]
+    return np.isin(mine, np.concatenate(theirs)) if theirs else np.zeros(len(mine), np.bool_)

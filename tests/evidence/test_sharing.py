@@ -7,12 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from graphslam.core.errors import GridError
 from graphslam.evidence import compile as compiling
 from graphslam.evidence import pool as pool_module
 from graphslam.evidence.aligned import LINE, aligned_empty, aligned_zeros
 from graphslam.evidence.batch import SERIAL_BATCH, update_grids
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.memory import shared_bricks
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_pool import assert_same, check_pool
 from tests.reference.evidence_twin import EvidenceTwin
@@ -78,6 +80,22 @@ def test_marks_decide_and_so_does_what_was_there_before(rng: np.random.Generator
     for g, t in zip(grids, twins):
         assert_same(g, t)
     check_pool(pool, [*grids, first])
+
+
+def test_shared_bricks_are_those_that_no_update_parted(rng: np.random.Generator) -> None:
+    a = EvidenceGrid(0.2, pool=GridPool(levels=4))
+    a.insert_scan(rng.normal(size=(60, 3)) * 5)
+    b, c = a.copy(), a.empty()
+    assert shared_bricks(a, [b, c]).all()
+    assert not shared_bricks(a, [c, a]).any()
+    before = a.brick_values()
+    b.insert_scan([[3.0, 0.1, 0.1]])
+    shared = shared_bricks(a, [b])
+    where = {tuple(x) for x in a.brick_coordinates()[~shared].tolist()}
+    assert where == {(0, 0, 0), (1, 0, 0)}  # 3 m are two bricks of 1.6 m
+    np.testing.assert_array_equal(a.brick_values(), before)
+    with pytest.raises(GridError, match="pools"):
+        shared_bricks(a, [EvidenceGrid(0.2)])
 
 
 def test_where_the_table_is_full_bricks_are_made_and_not_shared(rng: np.random.Generator) -> None:

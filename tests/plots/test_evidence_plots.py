@@ -8,7 +8,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.plots.evidence import plot_heights, plot_section, section
+from graphslam.plots.evidence import plot_heights, plot_section, plot_sharing, section
 
 
 def room() -> EvidenceGrid:
@@ -54,3 +54,17 @@ def test_plots_take_and_return_axes_also_for_an_empty_grid() -> None:
     with pytest.raises(ConfigError, match="no section"):
         section(flat, "x")
     plt.close("all")
+
+
+def test_sharing_shows_what_an_update_parted() -> None:
+    a = EvidenceGrid(0.1)
+    a.insert_scan([[5.03, 0.03, 0.03]], origin=[0.03, 0.03, 0.03])
+    b = a.copy()
+    b.insert_scan([[0.03, 2.03, 0.03]], origin=[0.03, 0.03, 0.03])
+    ax = plot_sharing(b, [a])
+    own = ax.images[1].get_array()
+    assert own.shape == (3, 7)
+    np.testing.assert_array_equal(np.isfinite(own.filled(np.nan))[:, 0], True)  # the beam along y, its start included
+    assert np.isfinite(own.filled(np.nan)).sum() == 3
+    assert ax.get_title() == "3 of 9 bricks its own"
+    assert plot_sharing(EvidenceGrid(0.1), []) is not None
