@@ -23,7 +23,9 @@ PAGES = [
     "limits.md",
     "mrclam.md",
     "plaza.md",
+    "registration.md",
     "simulated-robots.md",
+    "steps.md",
     "without-truth.md",
 ]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
@@ -53,7 +55,16 @@ def test_links_lead_somewhere(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["concepts.md", "evidence-grids.md", "how-to.md", "simulated-robots.md", "without-truth.md"]
+    "name",
+    [
+        "concepts.md",
+        "evidence-grids.md",
+        "how-to.md",
+        "registration.md",
+        "simulated-robots.md",
+        "steps.md",
+        "without-truth.md",
+    ],
 )
 def test_python_of_the_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     """Blocks that name a file are that file; the rest is one script, run in an empty folder."""
