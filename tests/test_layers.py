@@ -31,6 +31,7 @@ CONFINED = {
     "matplotlib": ("graphslam/plots/",),
     "typer": ("graphslam/app/",),
     "open3d": (),
+    "small_gicp": ("graphslam/registration/",),
 }
 FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])
 

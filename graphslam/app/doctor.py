@@ -20,6 +20,7 @@ REQUIRED = {
     "numba": "numba",
     "matplotlib": "matplotlib",
     "pandas": "pandas",
+    "small_gicp": "small_gicp",
 }
 OPTIONAL = {"open3d": "open3d", "kiss-icp": "kiss_icp", "libusb-package": "libusb_package"}
 

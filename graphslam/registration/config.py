@@ -45,7 +45,7 @@ class Gates:
 
     fitness: float = 0.85
     fitness_known: float = 0.85
-    fitness_upright: float = 0.7
+    fitness_upright: float = 0.75
     known_share: float = 0.5
     degeneracy: float = 0.003
     degeneracy_planar: float = 0.01
@@ -93,7 +93,7 @@ class RegistrationConfig:
     gates : Gates
     """
 
-    radii: tuple[float, ...] = (1.0, 0.5)
+    radii: tuple[float, ...] = (2.0, 0.5)
     iterations: int = 30
     rotation_epsilon: float = 1e-4
     translation_epsilon: float = 1e-4

@@ -136,6 +136,16 @@ def register(
 
     Notes
     -----
+    Generalised ICP (Segal, Haehnel and Thrun 2009, eq. 2) in two radii: pairs up to 2 m, then up to 0.5 m. The
+    covariance is ``k s² (H - F)⁻¹`` and a floor: s² the noise that the pairs show, F what of the Hessian is feigned
+    (:func:`~graphslam.registration.degeneracy.feigned_information`), k calibrated; directions that are not held at all
+    are as unknown as ``max_shift`` lets them be.
+
+    Capture, measured in simulated halls of 60 m with pillars every 8 m, bare and with parked cars (share of 20 starts
+    that end within 0.3 m and 2°, the worse of the halls and directions): 0.5 m and 5° off 1.0 in three dimensions and
+    in two, 1 m and 10° 0.9 and 0.95, 2 m and 10° 0.6 and 0.75, 4 m 0. Farther off, search first
+    (:func:`~graphslam.registration.search.correlative_search`). One pillar period off it ends there, sometimes with a
+    fitness that no gate tells from the right one: match several starts, and look at :func:`margin`.
     """
     config = RegistrationConfig() if config is None else config
     start = check_pose(T_target_source, target.dim, what="start of a registration")

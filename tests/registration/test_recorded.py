@@ -10,7 +10,8 @@ import pytest
 from graphslam.core import se3
 from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.registration.config import Gates, RegistrationConfig
-from graphslam.registration.register import register
+from graphslam.registration.register import margin, register, register_starts
+from graphslam.registration.search import SearchField, correlative_search, offset_pose
 from graphslam.registration.target import Target
 
 HAND_HELD = RegistrationConfig(gates=Gates(tilt=np.pi, fitness=0.4, fitness_upright=0.0))
@@ -54,3 +55,31 @@ def test_consecutive_scans_agree_with_the_odometry(
     assert np.quantile(angle, 0.9) < turn
     # the odometry is no truth: the figure is that of two estimates of which one is weighed
     assert nees[0] < np.median(weighted) < nees[1]
+
+
+@pytest.mark.data
+def test_recorded_loop_is_found_from_seven_metres_off(data_dir: Path) -> None:
+    """The last scans of a walk that ends where it began, in the map of the first ones: one place, and no other."""
+    log = read_lidar_pack(data_dir / "lidar3d_hku1", step=0.005)
+    clouds, motions = log.streams["clouds"], log.streams["odometry"].increments
+    poses = [np.array([0.0, 0, 0, 0, 0, 0, 1])]
+    for motion in motions[1:]:
+        poses.append(se3.se3_compose(poses[-1], motion))
+    n, end = len(poses), poses[-1]
+    first = np.concatenate([se3.se3_transform(poses[k], clouds.cloud(k)) for k in range(40)])
+    last = np.concatenate(
+        [se3.se3_transform(se3.se3_between(end, poses[k]), clouds.cloud(k)) for k in range(n - 12, n)]
+    )
+    first, last = (p[np.linalg.norm(p, axis=1) < 25.0] for p in (first, last))
+    start = offset_pose(end, (-6.0, 4.0, -0.4, -0.25))
+    starts = correlative_search(last, SearchField(first), start, (12.0, 12.0, 0.8, 0.3), (0.4, 0.4, 0.4, 0.0))
+    assert starts[0].score > starts[1].score + 0.2
+    config = RegistrationConfig(gates=Gates(tilt=np.radians(8)))
+    results = register_starts(Target(last, voxel=0.3), Target(first, voxel=0.3), [s.T for s in starts], config)
+    assert [r.accepted for r in results].count(True) == 1
+    assert results[0].accepted, results[0].why
+    assert margin(results) > 0.2
+    # the odometry came back with an error of a few centimetres
+    e = se3.se3_log(se3.se3_between(end, results[0].T_target_source))
+    assert np.linalg.norm(e[3:]) < 0.1
+    assert np.linalg.norm(e[:3]) < 0.02
