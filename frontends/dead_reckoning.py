@@ -8,7 +8,7 @@ Gaps in the records are bridged up to a limit, with a covariance that grows, and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from frontends.dead_reckoning_kernels import complementary_kernel
 from frontends.drift import DriftModel
+from frontends.gaps import find_gaps
 from frontends.reckoned import (
     FADING,
     GYRO,
@@ -77,56 +78,6 @@ class DeadReckoningNoise:
             positive = name in ("filter_time", "bridge", "floor_position", "floor_angle")
             if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
                 raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
-
-
-@dataclass(frozen=True, slots=True)
-class Gaps:
-    """Intervals without records."""
-
-    begin: Array = field(default_factory=lambda: np.zeros(0))
-    end: Array = field(default_factory=lambda: np.zeros(0))
-
-    def length_at(self, times: Array) -> Array:
-        """Length of the gap that each of ``times`` lies in, 0 outside [s]."""
-        out = np.zeros(len(times))
-        for a, b in zip(self.begin, self.end):
-            out[(times > a) & (times < b)] = b - a
-        return out
-
-
-def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: str, drops: DropCounter | None) -> Gaps:
-    """Gaps of a stream inside ``[begin, end]``: longer than thrice the usual spacing (and than 50 ms).
-
-    Parameters
-    ----------
-    stamps : (n,)
-    limit : float
-        Longest gap that may be bridged [s].
-    where : str
-        Name of the stream.
-    drops : DropCounter or None
-        Counts each gap.
-
-    Raises
-    ------
-    DataError
-        A gap longer than ``limit``: names it.
-    """
-    known = np.append(stamps, end) if len(stamps) and end > stamps[-1] else stamps
-    spacing = np.diff(known)
-    usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else limit
-    k = np.flatnonzero((spacing > max(3.0 * usual, 0.05)) & (known[1:] > begin) & (known[:-1] < end))
-    if len(k) and spacing[k].max() > limit:
-        worst = int(k[np.argmax(spacing[k])])
-        raise DataError(
-            f"gap without records: {spacing[worst]:.3f} s after record {worst}",
-            where=where,
-            got=f"{known[worst]:.3f} to {known[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s",
-        )
-    if drops is not None:
-        drops.drop(where, "gap bridged", len(k))
-    return Gaps(known[k], known[k + 1])
 
 
 def dead_reckon(

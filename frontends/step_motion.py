@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frontends.dead_reckoning import find_gaps, reckon
+from frontends.dead_reckoning import reckon
 from frontends.drift import PathErrors
+from frontends.gaps import find_gaps
 from frontends.motion import steering_odometry, velocity_odometry
 from frontends.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
 from frontends.step_config import StepConfig
@@ -67,8 +68,15 @@ class MotionSource:
     solve: Callable[[Array, Array, DropCounter | None], StepMotion]
 
 
-def motion_source(log: SensorLog, config: StepConfig) -> MotionSource:
+def motion_source(log: SensorLog, config: StepConfig, dim: int) -> MotionSource:
     """The motion of a log: an IMU with wheels, else recorded odometry, else controls.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : StepConfig
+    dim : int
+        Of the beams: motion of other dimensions is only taken where there is no better, or where it is named.
 
     Raises
     ------
@@ -77,7 +85,7 @@ def motion_source(log: SensorLog, config: StepConfig) -> MotionSource:
     ConfigError
         Named streams that cannot be used together.
     """
-    names = config.motion or _best(log)
+    names = config.motion or _best(log, dim)
     streams = [log[n] for n in names]
     for name, stream in zip(names, streams):
         if len(stream.times) == 0:
@@ -96,17 +104,23 @@ def motion_source(log: SensorLog, config: StepConfig) -> MotionSource:
     )
 
 
-def _best(log: SensorLog) -> tuple[str, ...]:
+def _best(log: SensorLog, dim: int) -> tuple[str, ...]:
     imu, wheels = log.of_type(Imu), log.of_type(VelocityControls)
+    found: list[tuple[int, tuple[str, ...]]] = []  # dimensions, streams; the best first
     if imu is not None and wheels is not None:
-        return imu, wheels
-    for kind in (Odometry, VelocityControls, SteeringControls):
-        name = log.of_type(kind)
-        if name is not None:
-            return (name,)
-    raise MissingDataError(
-        "no motion to make steps of", where=log.name, wanted="Imu with VelocityControls, Odometry, or controls"
-    )
+        found.append((3, (imu, wheels)))
+    for name, stream in log.streams.items():
+        if isinstance(stream, Odometry):
+            found.append((2 if stream.increments.shape[1] == 3 else 3, (name,)))
+    for kind in (VelocityControls, SteeringControls):
+        controls = log.of_type(kind)
+        if controls is not None:
+            found.append((2, (controls,)))
+    if not found:
+        raise MissingDataError(
+            "no motion to make steps of", where=log.name, wanted="Imu with VelocityControls, Odometry, or controls"
+        )
+    return next((names for d, names in found if d == dim), found[0][1])
 
 
 def _inertial(

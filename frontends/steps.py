@@ -167,8 +167,8 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     """
     config = config or StepConfig()
     count = DropCounter()
-    source = motion_source(log, config)
     names = config.scanners or _scanners(log)
+    source = motion_source(log, config, 2 if isinstance(log[names[0]], LaserScans) else 3)
     sources = _beam_sources(log, names, source, config, count)
     beam_times = np.concatenate([s.times for s in sources])
     inside = (beam_times >= source.begin) & (beam_times <= source.end)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from frontends.dead_reckoning import DeadReckoningNoise, dead_reckon, find_gaps, reckon
+from frontends.dead_reckoning import DeadReckoningNoise, dead_reckon, reckon
 from frontends.drift import calibrate
+from frontends.gaps import find_gaps
 from frontends.reckoned import Reckoned, euler, euler_quat, level, tangent_of_state
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError

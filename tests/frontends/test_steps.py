@@ -332,6 +332,19 @@ def test_in_the_plane(period: float | None, recorded: bool) -> None:
     np.linalg.cholesky(C)
 
 
+def test_motion_of_the_beams_dimension_is_taken(room: SensorLog) -> None:
+    """A planar robot with an IMU drives in the plane; a log with both odometries gives each scanner its own."""
+    d, flat = drive(None, seconds=8.2), planar_log()
+    steps = make_steps(planar_log(imu=d.imu))
+    np.testing.assert_array_equal(steps.odometry.increments, make_steps(flat).odometry.increments)
+    both = {"flat": odometry_of(flat.truth.trajectory), **room.streams, "laser": flat["laser"]}
+    log = SensorLog(name="both", streams=both)
+    assert make_steps(log).uses == {"scanner", "odometry"}
+    assert make_steps(log, StepConfig(scanners=("laser",))).uses == {"laser", "flat"}
+    with pytest.raises(ConfigError, match="2 dimensions, the motion of odometry 3"):
+        make_steps(log, StepConfig(scanners=("laser",), motion=("odometry",)))
+
+
 def test_planar_gap_of_controls() -> None:
     log = planar_log()
     wheels = log["wheels"]

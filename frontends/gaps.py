@@ -1,0 +1,61 @@
+"""Gaps in the records of a stream: found, bridged up to a limit, named beyond it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Intervals without records."""
+
+    begin: Array = field(default_factory=lambda: np.zeros(0))
+    end: Array = field(default_factory=lambda: np.zeros(0))
+
+    def length_at(self, times: Array) -> Array:
+        """Length of the gap that each of ``times`` lies in, 0 outside [s]."""
+        out = np.zeros(len(times))
+        for a, b in zip(self.begin, self.end):
+            out[(times > a) & (times < b)] = b - a
+        return out
+
+
+def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: str, drops: DropCounter | None) -> Gaps:
+    """Gaps of a stream inside ``[begin, end]``: longer than thrice the usual spacing (and than 50 ms).
+
+    Parameters
+    ----------
+    stamps : (n,)
+    limit : float
+        Longest gap that may be bridged [s].
+    where : str
+        Name of the stream.
+    drops : DropCounter or None
+        Counts each gap.
+
+    Raises
+    ------
+    DataError
+        A gap longer than ``limit``: names it.
+    """
+    known = np.append(stamps, end) if len(stamps) and end > stamps[-1] else stamps
+    spacing = np.diff(known)
+    usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else limit
+    k = np.flatnonzero((spacing > max(3.0 * usual, 0.05)) & (known[1:] > begin) & (known[:-1] < end))
+    if len(k) and spacing[k].max() > limit:
+        worst = int(k[np.argmax(spacing[k])])
+        raise DataError(
+            f"gap without records: {spacing[worst]:.3f} s after record {worst}",
+            where=where,
+            got=f"{known[worst]:.3f} to {known[worst + 1]:.3f} s",
+            wanted=f"gaps of at most {limit:g} s",
+        )
+    if drops is not None:
+        drops.drop(where, "gap bridged", len(k))
+    return Gaps(known[k], known[k + 1])
