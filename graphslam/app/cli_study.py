@@ -17,7 +17,9 @@ def register(app: typer.Typer) -> None:
 
 
 def study(
-    name: str = typer.Argument(..., help="combined-slam, association-ambiguity, or your own, module:object."),
+    name: str = typer.Argument(
+        ..., help="combined-slam, association-ambiguity, segslam-garage (-mine, -building), or your own, module:object."
+    ),
     trials: int | None = typer.Option(None, help="Trials of each world; default the study's own."),
     workers: int | None = typer.Option(None, help="Processes; default none, the trials run in this one."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler, instead of processes."),

@@ -5,4 +5,7 @@ from __future__ import annotations
 STUDIES: dict[str, str] = {
     "combined-slam": "graphslam.app.studies.combined_slam:STUDY",
     "association-ambiguity": "graphslam.app.studies.association_ambiguity:STUDY",
+    "segslam-garage": "graphslam.app.studies.segslam_garage:STUDY",
+    "segslam-mine": "graphslam.app.studies.segslam_mine:STUDY",
+    "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
 }

@@ -1,0 +1,68 @@
+"""The study ``segslam-building``: which map of three levels of out-and-back corridors is the clearest?
+
+Worlds: ``building``; clutter and every sensor error are drawn anew in each run. Algorithms: ``dead-reckoning``,
+``rbpf-N``, ``segslam-40``.
+
+Quantities, beside errors of the path and times
+-----------------------------------------------
+``entropy_min``: least entropy [nat m³] (SegSLAM eq. 20–22) over at most 20 hypotheses of a run: of SegSLAM its map
+samples, of an RBPF its particles' own paths, the likeliest first, each once (few are left that differ). Of each the
+scans are inserted anew into one map of 0.2 m along its path, the same way for all. ``entropy`` is that of the first,
+``entropy_samples`` how many there were. ``leg_angle``: RMS error of the angles between straight stretches of
+different levels [rad].
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+
+from graphslam.app.studies import segslam_report as tables
+from graphslam.app.studies.segslam_garage import path_figure
+from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
+from graphslam.plots.association import plot_runs
+from graphslam.plots.save import save
+
+_FIGURES: tuple[Figure, ...] = ("matches", "entropy", "legs", "path")
+_ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")
+WORLDS = {"building": GridTrialConfig(world="building", algorithms=_ALGORITHMS, figures=_FIGURES, samples=20)}
+QUICK_WORLDS = {
+    "court-quick": replace(QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-5"), figures=_FIGURES, samples=3),
+}
+DRAWN = {"entropy_min": "least entropy [nat m³]", "ate_aligned": "ATE, aligned [m]", "leg_angle": "angle of legs [rad]"}
+
+
+class SegSlamBuilding(GridStudy):
+    """See the module."""
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """``entropies``, ``paths``, ``matches``, ``seconds`` by part."""
+        champion = "segslam-40" if (table["algorithm"] == "segslam-40").any() else "segslam-5"
+        out = {"entropies": tables.entropy_table(table, champion)}
+        quantities = ("entropy_min", "final_error", "ate_anchored", "ate_aligned", "leg_angle", "maps_megabytes")
+        out["paths"] = tables.means_table(table, quantities)
+        out["matches"] = tables.match_table(table)
+        if not timings.empty:
+            out["seconds"] = tables.seconds_table(timings)
+        return out
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """Entropies, errors and angles of all runs; the path of one run by segments."""
+        made = []
+        for quantity, label in DRAWN.items():
+            rows = tables.whole(table, quantity)
+            if not rows.empty:
+                made.append(save(plot_runs(rows, label=label), folder / f"{quantity}.png"))
+        for world in dict.fromkeys(table["world"].astype(str)):
+            made += path_figure(table, world, folder)
+        return made
+
+
+STUDY = SegSlamBuilding(
+    "segslam-building",
+    "three levels of out-and-back corridors: least map entropy over samples, path and angles of RBPF and SegSLAM",
+    WORLDS,
+    QUICK_WORLDS,
+)

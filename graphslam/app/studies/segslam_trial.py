@@ -1,0 +1,343 @@
+"""One run of a world for grid front ends: the log, its steps, every algorithm on them, and all figures.
+
+Algorithms are named ``dead-reckoning``, ``rbpf-N`` and ``segslam-N`` with N particles. They read the same steps; their
+filters have the same noise, beams and weights.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.drift import DriftModel
+from frontends.grid_config import GridFilterConfig
+from frontends.rbpf_grid import RbpfResult, run_rbpf
+from frontends.segslam.config import CandidateSearch, ChoiceConfig, SegmentationConfig, SegSlamConfig, WinnowConfig
+from frontends.segslam.result import SegSlamResult
+from frontends.segslam.segslam import run_segslam
+from frontends.steps import StepConfig, Steps, make_steps
+from graphslam.app.studies import segslam_judge as judge
+from graphslam.app.threads import one_blas_thread
+from graphslam.app.worlds import mesh_world
+from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.montecarlo import Measurement
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.world import World
+
+Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path"]
+DEAD_RECKONING = "dead-reckoning"
+PATH_POINTS = 100
+"""Points of a path that are kept for the picture."""
+
+
+def family_of(algorithm: str) -> tuple[str, int]:
+    """``rbpf`` or ``segslam``, and the number of particles; ``dead-reckoning`` and 0.
+
+    Raises
+    ------
+    ConfigError
+        Another name.
+    """
+    if algorithm == DEAD_RECKONING:
+        return algorithm, 0
+    found = re.fullmatch(r"(rbpf|segslam)-([1-9]\d*)", algorithm)
+    if not found:
+        raise ConfigError(f"unknown algorithm {algorithm!r}; known: {DEAD_RECKONING}, rbpf-N, segslam-N")
+    return found[1], int(found[2])
+
+
+def drawn_algorithm(names: Iterable[str]) -> str | None:
+    """Whose path is kept for the picture: the last SegSLAM of at most 20 particles, else the last; or None."""
+    found = [a for a in names if family_of(a)[0] == "segslam"]
+    found = [a for a in found if family_of(a)[1] <= 20] or found
+    return found[-1] if found else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridTrialConfig:
+    """A world, who is compared in it, and what is measured."""
+
+    world: str
+    """``garage``, ``mine``, ``building``; ``court``, the small one."""
+    layout: str | None = None
+    """Of the garage."""
+    algorithms: tuple[str, ...] = (DEAD_RECKONING,)
+    """In the order in which they run."""
+    figures: tuple[Figure, ...] = ()
+    """What is measured beside the errors of the path and the times."""
+    samples: int = 1
+    """Map samples, or particles of a filter, whose entropy is taken at most."""
+    crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
+    """The robot."""
+    steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))
+    """How its log becomes steps."""
+    filter: GridFilterConfig = field(default_factory=GridFilterConfig)
+    """Of both families; the number of particles is the algorithm's."""
+    segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
+    """What SegSLAM adds."""
+    drift: DriftModel = field(default_factory=DriftModel)
+    """In the covariance of exits."""
+
+    def __post_init__(self) -> None:
+        for name in self.algorithms:
+            family_of(name)
+        if len(set(self.algorithms)) != len(self.algorithms) or self.samples < 1:
+            raise ConfigError("trial of grids: an algorithm stands twice, or no sample is wanted")
+
+    def make_world(self, seed: int) -> World:
+        """The world of a seed, which moves what can be moved in it."""
+        return court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=self.layout, seed=seed)
+
+
+def run_trial(config: GridTrialConfig, seed: int) -> list[Measurement]:
+    """All figures of one run."""
+    with one_blas_thread():
+        return list(GridTrial(config, seed).run())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an algorithm came to."""
+
+    path: Trajectory
+    final_pose: Array
+    seconds: dict[str, float]
+    result: SegSlamResult | RbpfResult | None = None
+
+
+@dataclass
+class GridTrial:
+    """The steps of one run, and every algorithm on them.
+
+    Parameters
+    ----------
+    config : GridTrialConfig
+    seed : int
+    """
+
+    config: GridTrialConfig
+    seed: int
+    world: World = field(init=False)
+    steps: Steps = field(init=False)
+    truth: Array = field(init=False)
+    """True poses at the steps ``(n, 7)``."""
+    arc: Array = field(init=False)
+    """Arc length of the way at the steps ``(n,)`` [m]."""
+    seconds_steps: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.world = self.config.make_world(self.seed)
+        log = simulate_crawler(self.world, self.seed, self.config.crawler)
+        begin = perf_counter()
+        self.steps = make_steps(log, self.config.steps)
+        self.seconds_steps = perf_counter() - begin
+        assert self.steps.truth is not None
+        self.truth = self.steps.truth.interpolate(self.steps.times)
+        self.arc = judge.steps_of_way(self.steps.truth, self.steps.times, self.world.route().length)
+
+    def run(self) -> Iterator[Measurement]:
+        """Every algorithm in turn; one that gives up has the figure ``failed`` 1 and no other."""
+        yield Measurement("all", "seconds_steps", self.seconds_steps, timing=True)
+        yield Measurement("all", "seconds_recorded", float(self.steps.times[-1] - self.steps.times[0]))
+        yield Measurement("all", "path_length", float(self.steps.path_length[-1]))
+        for name in self.config.algorithms:
+            try:
+                rows = list(self.figures(name, self.outcome(name)))
+            except GraphSlamError:
+                rows = [Measurement(name, "failed", 1.0)]
+            else:
+                rows.append(Measurement(name, "failed", 0.0))
+            yield from rows
+
+    # ---------------------------------------------------------------- algorithms
+
+    def outcome(self, name: str) -> Outcome:
+        """An algorithm on the steps. The seed of a filter is that of the run: all algorithms have the same."""
+        family, particles = family_of(name)
+        if family == DEAD_RECKONING:
+            path = judge.dead_reckoned(self.steps)
+            return Outcome(path, path.poses[-1], {})
+        filter = replace(self.config.filter, particles=particles)
+        seed = SeedTree(self.seed).child("filter", family)
+        begin = perf_counter()
+        if family == "rbpf":
+            rbpf = run_rbpf(self.steps, filter, seed)
+            whole = perf_counter() - begin
+            return Outcome(rbpf.trajectory(), rbpf.final_pose, {**rbpf.tally.seconds, "total": whole}, rbpf)
+        segslam = run_segslam(self.steps, filter, self.config.segslam, seed)
+        whole = perf_counter() - begin
+        seconds = {**segslam.seconds, "total": whole}
+        seconds["step_first_quarter"], seconds["step_last_quarter"] = judge.quarters(segslam.step_seconds)
+        return Outcome(segslam.trajectory(), segslam.final_pose, seconds, segslam)
+
+    # ---------------------------------------------------------------- figures
+
+    def figures(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
+        """All figures of one algorithm."""
+        wanted, result = self.config.figures, outcome.result
+        e = judge.path_errors(outcome.path, self.truth, outcome.final_pose)
+        yield Measurement(name, "final_error", e.final)
+        yield Measurement(name, "final_yaw", e.final_yaw)
+        yield Measurement(name, "ate_anchored", e.anchored)
+        yield Measurement(name, "ate_aligned", e.aligned)
+        for part, seconds in outcome.seconds.items():
+            yield Measurement(name, f"seconds_{part}", seconds, timing=True)
+        if result is not None:
+            effective = result.effective / result.report()["particles"]
+            yield Measurement(name, "effective_median", float(np.median(effective)))
+            yield Measurement(name, "maps_megabytes", result.used_bytes / 1e6)
+        if "legs" in wanted:
+            pieces = judge.legs(self.world.route(), self.arc, 10.0 if self.config.world != "court" else 4.0)
+            yield Measurement(name, "leg_angle", judge.leg_angle_error(outcome.path.poses, self.truth, pieces))
+        if "entropy" in wanted:
+            yield from self._entropy(name, outcome)
+        if "loops" in wanted:
+            yield from self._loops(name, outcome)
+        if "path" in wanted and name == drawn_algorithm(self.config.algorithms):
+            yield from self._path(name, outcome)
+        if isinstance(result, SegSlamResult):
+            yield Measurement(name, "segments", len(result.segmap))
+            yield Measurement(name, "intervals", len(result.segmap.intervals()))
+            if "matches" in wanted:
+                yield from self._matches(name, result)
+            if "exits" in wanted:
+                yield from self._exits(name, result)
+
+    def _matches(self, name: str, result: SegSlamResult) -> Iterator[Measurement]:
+        m = judge.match_errors(result.segmap, self.truth)
+        yield Measurement(name, "matches", len(m.segments))
+        yield Measurement(name, "false_matches", int(m.false.sum()))
+        yield Measurement(name, "false_match_weight", float(m.weights[m.false].max(initial=0.0)))
+        if len(m.offsets):
+            yield Measurement(name, "match_offset_median", float(np.median(m.offsets)))
+            yield Measurement(name, "match_offset_max", float(m.offsets.max()))
+        pairs = self.world.meta["parallel"]
+        if pairs:
+            yield Measurement(name, "merged_parallels", judge.merged_stretches(m, self.arc, pairs))
+
+    def _exits(self, name: str, result: SegSlamResult) -> Iterator[Measurement]:
+        e = judge.exit_errors(result, self.truth, replace(self.config.drift, dim=self.steps.dim))
+        for k, length in enumerate(e.lengths):
+            yield Measurement(name, "exit_length", float(length), k)
+            yield Measurement(name, "exit_nees", float(e.default.values[k]), k)
+            yield Measurement(name, "exit_nees_matched", float(e.matched.values[k]), k)
+            yield Measurement(name, "exit_nees_stated", float(e.stated.values[k]), k)
+        yield Measurement(name, "exit_dof", e.default.dof)
+
+    def _entropy(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
+        """Entropy of the scans fused along map samples, or along particles' own paths, the best first."""
+        found = []
+        for poses in self._hypotheses(outcome):
+            grid = judge.fused_grid(self.steps, poses, voxel_size=0.2, model=self.config.filter.beam_model())
+            found.append(grid.entropy())
+        yield Measurement(name, "entropy", found[0])
+        yield Measurement(name, "entropy_min", min(found))
+        yield Measurement(name, "entropy_samples", len(found))
+
+    def _hypotheses(self, outcome: Outcome) -> Iterator[Array]:
+        result, most = outcome.result, self.config.samples
+        if isinstance(result, SegSlamResult):
+            for number in range(most):
+                yield result.trajectory(number).poses
+        elif isinstance(result, RbpfResult):
+            paths = np.swapaxes(result.ancestry.paths(), 0, 1)
+            order = [result.best, *(k for k in range(len(paths)) if k != result.best)]
+            for k in judge.distinct(paths[order], most):
+                yield paths[order[k]]
+        else:
+            yield outcome.path.poses
+
+    def _loops(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
+        """Places visited twice: where each ends to be one, is it known to be the same?"""
+        closed = []
+        for k, r in enumerate(self.world.meta["revisits"]):
+            first, again = (judge.nearest(self.arc, float(r[which][1])) for which in ("first", "again"))
+            path = outcome.path
+            if isinstance(outcome.result, SegSlamResult):
+                path = judge.path_at(outcome.result, again)
+            error = judge.visit_error(path.poses, self.truth, first, again)
+            yield Measurement(name, "visit_error", error, k)
+            if r["same_heading"]:
+                closed.append(error <= judge.CLOSED_DISTANCE)
+        yield Measurement(name, "loops", len(closed))
+        yield Measurement(name, "loops_closed", int(np.sum(closed)))
+        yield Measurement(name, "all_closed", float(all(closed)))
+
+    def _path(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
+        """Points of the path seen from above, with the number of the segment each is in; and of the truth."""
+        at = np.unique(np.linspace(0, len(self.steps) - 1, PATH_POINTS).astype(np.int64))
+        segment: npt.NDArray[np.int64] = np.zeros(len(at), dtype=np.int64)
+        if isinstance(outcome.result, SegSlamResult):
+            starts = np.unique(outcome.result.segmap.intervals()[:, 0])
+            segment = np.searchsorted(starts, at, side="right") - 1
+        est = judge.relative(outcome.path.poses)[at]
+        true = judge.relative(self.truth)[at]
+        for k in range(len(at)):
+            for axis, row in (("x", est[k, 0]), ("y", est[k, 1]), ("true_x", true[k, 0]), ("true_y", true[k, 1])):
+                yield Measurement(name, f"path_{axis}", float(row), k)
+            yield Measurement(name, "path_segment", float(segment[k]), k)
+
+
+class GridStudy:
+    """Worlds and trials of a study of grid front ends; what is made of the table is the study's own.
+
+    Parameters
+    ----------
+    name, description : str
+    full, quick : mapping of world to GridTrialConfig
+    trials : int
+        Of each world where none are asked for; two in quick mode.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        description: str,
+        full: Mapping[str, GridTrialConfig],
+        quick: Mapping[str, GridTrialConfig],
+        trials: int = 20,
+    ) -> None:
+        self.name, self.description = name, description
+        self.full, self.quick, self._trials = full, quick, trials
+
+    def worlds(self, quick: bool) -> tuple[str, ...]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return tuple(self.quick if quick else self.full)
+
+    def default_trials(self, quick: bool) -> int:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        return 2 if quick else self._trials
+
+    def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
+        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        known = {**self.full, **self.quick}
+        if world not in known:
+            raise UnknownNameError(f"world of {self.name}", world, known)
+        return partial(run_trial, known[world])
+
+
+QUICK = GridTrialConfig(
+    world="court",
+    crawler=CrawlerConfig(drift=0.08, max_range=8.0),
+    steps=StepConfig(max_range=8.0, most_points=240),
+    filter=GridFilterConfig(weight_beams=120),
+    segslam=SegSlamConfig(
+        segmentation=SegmentationConfig(window=2.0, min_seconds=6.0, min_length=5.0, max_length=14.0, excluded=3.0),
+        winnowing=WinnowConfig(gap=15.0),
+        search=CandidateSearch(source_radius=8.0),
+        choice=ChoiceConfig(every=2.0),
+    ),
+)
+"""The small world: segments of some metres, and a loop of 37 m."""
