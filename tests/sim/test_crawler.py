@@ -171,6 +171,8 @@ def test_what_is_too_far_or_too_near() -> None:
     np.testing.assert_array_equal(scans.ranges >= scans.max_range, far)  # 6.1 is no float32
     keep = ~near & ~far
     np.testing.assert_array_equal(scans.ranges[keep], full[keep])
+    blurred = simulate_crawler(hall(), 0, dataclasses.replace(config, noise_scale=1.0))["scanner"].ranges
+    assert np.nanmax(blurred) == scans.ranges.max(where=far, initial=0.0)  # noise makes nothing farther than too far
     open_air = dataclasses.replace(hall(), vertices=[[0, 0, -0.1], [1, 0, -0.1], [0, 1, -0.1]], triangles=[[0, 1, 2]])
     nothing = simulate_crawler(open_air, 0, config)["scanner"]
     assert np.mean(nothing.ranges >= nothing.max_range) > 0.9
@@ -327,7 +329,11 @@ def test_seeds(noisy: SensorLog) -> None:
         assert arrays(noisy[name]) == arrays(two[name])  # a further sensor changes nothing in the others
         assert arrays(noisy[name]) != arrays(other[name])
     assert json.dumps(noisy.meta) == json.dumps(again.meta)
-    assert not np.array_equal(two["scanner"].ranges, two["scanner2"].ranges, equal_nan=True)
+    clean = simulate_crawler(hall(), 0, crawler_preset("two-scanners", noise_scale=0.0, drop_out=0.0))
+    a, b = (two[name].ranges - clean[name].ranges for name in ("scanner", "scanner2"))
+    both = np.isfinite(a) & np.isfinite(b)
+    assert not np.array_equal(np.isnan(a), np.isnan(b))
+    assert abs(np.corrcoef(a[both], b[both])[0, 1]) < 4.0 / np.sqrt(both.sum())
 
 
 def test_presets_and_what_the_log_says(noisy: SensorLog) -> None:
