@@ -132,7 +132,7 @@ def register(
     GeometryError
         A start or a shape that is impossible, or clouds of different dimension.
     DataError
-        A mask of another length than the source.
+        A mask, or an answer of ``known``, of another length than the source.
 
     Notes
     -----
@@ -289,6 +289,8 @@ def _measure(
     distance, which = target.tree.query(moved, distance_upper_bound=reach)
     near = distance < config.near
     inside = None if known is None else np.asarray(known(moved) if callable(known) else known, dtype=bool)
+    if inside is not None and inside.shape != (len(source),):
+        raise DataError("the answer of `known` does not go with the source", got=inside.shape, wanted=(len(source),))
     share = float("nan") if inside is None else float(np.mean(inside))
     fitness_known = float("nan") if inside is None else float(np.mean(near[inside])) if np.any(inside) else 0.0
     paired = np.flatnonzero(distance < config.radii[-1])

@@ -314,6 +314,8 @@ def test_known_space_counts_alone(garage: tuple) -> None:
     assert none.fitness_known == 0.0
     with pytest.raises(DataError, match="mask"):
         register(source, target, T, known=np.ones(3, dtype=bool))
+    with pytest.raises(DataError, match="answer"):
+        register(source, target, T, known=lambda p: np.ones(3, dtype=bool))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
