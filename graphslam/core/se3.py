@@ -43,11 +43,20 @@ def quat_normalize(q: ArrayLike) -> Array:
     return np.where(a[..., 3:] < 0, -a, a)
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products ``(..., 3)``, the same to the bit as NumPy's, which takes several times longer over few rows."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    np.subtract(a[..., 1] * b[..., 2], a[..., 2] * b[..., 1], out=out[..., 0])
+    np.subtract(a[..., 2] * b[..., 0], a[..., 0] * b[..., 2], out=out[..., 1])
+    np.subtract(a[..., 0] * b[..., 1], a[..., 1] * b[..., 0], out=out[..., 2])
+    return out
+
+
 def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Hamilton product of quaternions ``(..., 4)`` in xyzw order."""
     a, b = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    v = aw * bv + bw * av + np.cross(av, bv)
+    v = aw * bv + bw * av + _cross(av, bv)
     w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
     return np.concatenate([v, w], -1)
 
@@ -55,8 +64,8 @@ def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
 def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Rotate vectors ``(..., 3)`` by unit quaternions ``(..., 4)``."""
     a, u = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
-    t = 2.0 * np.cross(a[..., :3], u)
-    return u + a[..., 3:] * t + np.cross(a[..., :3], t)
+    t = 2.0 * _cross(a[..., :3], u)
+    return np.asarray(u + a[..., 3:] * t + _cross(a[..., :3], t))
 
 
 def quat_to_matrix(q: ArrayLike) -> Array:

@@ -233,3 +233,10 @@ def test_align_se3_never_mirrors(rng: np.random.Generator) -> None:
     p = rng.normal(size=(20, 3))
     found, _ = se3.align_se3(p, p * [1, 1, -1])  # a mirrored cloud: the best *rotation* is asked for
     assert np.linalg.det(se3.pose_to_matrix(found)[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("shapes", [((3,), (3,)), ((5, 3), (3,)), ((4, 1, 3), (1, 6, 3)), ((0, 3), (0, 3))])
+def test_cross_product_is_numpys_to_the_bit(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+    rng = np.random.default_rng(1)
+    a, b = (rng.normal(size=s) * 10.0 ** rng.integers(-8, 8, size=s) for s in shapes)
+    assert np.array_equal(se3._cross(a, b), np.cross(a, b))
