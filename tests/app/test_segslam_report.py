@@ -85,6 +85,18 @@ def test_table_of_nees_pools_segments_and_bounds_over_runs() -> None:
     assert "particles + stated motion" not in t.index
 
 
+def test_table_of_exits() -> None:
+    rows: list[tuple[object, ...]] = [("w", 0, "segslam-5", -1, "failed", 0.0)]
+    for k, (yaw, x, y, z, length) in enumerate([(0.3, 3.0, 0.0, 0.1, 10.0), (-0.4, -4.0, 0.0, 0.1, 30.0)]):
+        for q, v in (("yaw", yaw), ("x", x), ("y", y), ("z", z), ("length", length)):
+            rows.append(("w", 0, "segslam-5", k, f"exit_{q}", v))
+    (row,) = report.exit_table(frame(rows)).to_dict("records")
+    assert (row["segments"], row["length"]) == (2, 20.0)
+    assert row["yaw"] == pytest.approx(np.sqrt(0.125))
+    assert row["xy"] == pytest.approx(np.sqrt(12.5 / 2))
+    assert row["z"] == pytest.approx(0.1)
+
+
 def test_tables_of_matches_and_loops() -> None:
     w, a = "mine", "segslam-20"
     rows = runs(w, a, "failed", [0, 0, 0]) + runs(w, a, "matches", [5, 0, 7]) + runs(w, a, "false_matches", [0, 0, 2])

@@ -293,6 +293,7 @@ def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) 
         assert e.default.values[k] == pytest.approx(x @ np.linalg.solve(model(L)[2:, 2:], x), rel=1e-6)
         floor = np.array([1e-3, 0.01, 0.01, 0.01])
         assert e.matched.values[k] == pytest.approx(np.sum((x / floor) ** 2), rel=1e-6)
+        np.testing.assert_allclose(e.default.errors[k], x, atol=1e-12)
     assert e.default.dof == 4
 
 

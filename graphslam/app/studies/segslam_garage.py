@@ -14,8 +14,9 @@ also of particles that died out; ``false_matches``: those more than 1 m or 5° o
 map where the body had passed nearest; ``false_match_weight``: the greatest weight of one. ``segments`` closed in all,
 ``intervals`` between boundaries. Per settled segment ``exit_nees`` (particles and drift model), ``exit_nees_stated``
 (particles and the stated noise of the motion), ``exit_nees_matched`` (moment matching), of ``exit_dof`` degrees of
-freedom, and ``exit_length`` [m]. ``entropy`` of one map of all scans along the estimated path [nat m³].
-``effective_median``: N_eff / N. ``path_…``: points of the path, for the picture. Timings: ``seconds_…`` by part.
+freedom; its errors ``exit_yaw`` [rad], ``exit_x``, ``exit_y``, ``exit_z`` [m]; ``exit_length`` [m]. ``entropy`` of one
+map of all scans along the estimated path [nat m³]. ``effective_median``: N_eff / N. ``path_…``: points of the path, for
+the picture. Timings: ``seconds_…`` by part.
 """
 
 from __future__ import annotations
@@ -57,13 +58,14 @@ class SegSlamGarage(GridStudy):
     """See the module."""
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``errors`` (Table II), ``ratios`` of means, ``times`` (Table III), ``nees``, ``matches``, ``paths``,
-        ``seconds`` by part."""
+        """``errors`` (Table II), ``ratios`` of means, ``times`` (Table III), ``nees``, ``exits``, ``matches``,
+        ``paths``, ``seconds`` by part."""
         out = {"errors": tables.error_table(table), "ratios": tables.ratio_table(table)}
         if not timings.empty:
             out["times"] = tables.time_table(table, timings)
             out["seconds"] = tables.seconds_table(timings)
         out["nees"] = tables.nees_table(table)
+        out["exits"] = tables.exit_table(table)
         out["matches"] = tables.match_table(table)
         quantities = ("final_error", "final_yaw", "ate_anchored", "ate_aligned", "entropy", "maps_megabytes")
         out["paths"] = tables.means_table(table, quantities)

@@ -174,6 +174,21 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
+def exit_table(table: pd.DataFrame) -> pd.DataFrame:
+    """RMS errors of the segments' exits: heading [rad], each of x and y [m], z [m]; and the mean length [m]."""
+    out: list[Row] = []
+    for world, name in cases(table):
+        of = table[(table["world"] == world) & (table["algorithm"] == name) & (table["submap"] >= 0)]
+        e = {q: of[of["quantity"] == f"exit_{q}"]["value"].to_numpy(dtype=np.float64) for q in ("yaw", "x", "y", "z")}
+        if not len(e["yaw"]):
+            continue
+        rms = {q: float(np.sqrt(np.mean(v**2))) for q, v in e.items()}
+        row: Row = {"world": world, "algorithm": name, "segments": len(e["yaw"])}
+        row |= {"length": float(of[of["quantity"] == "exit_length"]["value"].mean()), "yaw": rms["yaw"]}
+        out.append(row | {"xy": float(np.hypot(rms["x"], rms["y"]) / np.sqrt(2.0)), "z": rms["z"]})
+    return pd.DataFrame(out)
+
+
 def match_table(table: pd.DataFrame) -> pd.DataFrame:
     """Entries into older maps, those that were false, and how far off the others were; segments a run."""
     out: list[Row] = []

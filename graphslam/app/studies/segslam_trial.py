@@ -234,6 +234,8 @@ class GridTrial:
             yield Measurement(name, "exit_nees", float(e.default.values[k]), k)
             yield Measurement(name, "exit_nees_matched", float(e.matched.values[k]), k)
             yield Measurement(name, "exit_nees_stated", float(e.stated.values[k]), k)
+            for axis, error in zip(("yaw", "x", "y", "z"), e.default.errors[k]):
+                yield Measurement(name, f"exit_{axis}", float(error), k)
         yield Measurement(name, "exit_dof", e.default.dof)
 
     def _entropy(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
