@@ -41,17 +41,22 @@ class StepConfig:
     """σ of an error of the yaw rate of recorded odometry or controls that lasts [rad/s]; ``yaw_bias`` counts too."""
     lasting_scale: float = 0.0
     """σ of an error of its distances that lasts, a share of them."""
+    odometry_tilt_sigma: float = 0.0
+    """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
+    then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""
+    odometry_tilt_time: float = 10.0
+    """Time over which errors of these stay alike [s]."""
     longest_record: float = 20.0
     """Longest time that one record of odometry may take: it tells the whole motion, not how it went [s]."""
 
     def __post_init__(self) -> None:
         positive = {"period": self.period, "max_range": self.max_range}
-        for name in ("range_sigma", "cloud_range", "longest_record"):
+        for name in ("range_sigma", "cloud_range", "longest_record", "odometry_tilt_time"):
             positive[name] = getattr(self, name)
         for name, value in positive.items():
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"steps: {name} = {value}; wanted > 0")
-        for name in ("min_range", "lasting_yaw_bias", "lasting_scale"):
+        for name in ("min_range", "lasting_yaw_bias", "lasting_scale", "odometry_tilt_sigma"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted ≥ 0")
         if not np.isfinite(self.yaw_bias):

@@ -10,6 +10,7 @@ import numpy as np
 from frontends.dead_reckoning import reckon
 from frontends.drift import PathErrors
 from frontends.gaps import find_gaps
+from frontends.grid_motion import tilts
 from frontends.motion import steering_odometry, velocity_odometry
 from frontends.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
 from frontends.step_config import StepConfig
@@ -163,14 +164,25 @@ def _errors(odometry: Odometry, config: StepConfig) -> RecordedErrors:
 def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig) -> MotionSource:
     if len(odometry.times) < 2:
         raise MissingDataError("odometry has a single record: no motion", where=f"{log.name}/{name}")
+    upright = chain(odometry)
+    if config.odometry_tilt_sigma and upright.dim == 2:
+        raise ConfigError(f"{log.name}/{name}: odometry in the plane has no roll and pitch")
     if config.yaw_bias:
         odometry = add_yaw_bias(odometry, config.yaw_bias)
-    whole = chain(odometry)
+    whole = chain(odometry) if config.yaw_bias else upright
 
     def solve(times: Array, _: Array, drops: DropCounter | None) -> StepMotion:
         sure = bridge(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
         cut = cut_odometry(sure, times, config.controls)
-        return StepMotion(odometry=cut, poses=whole.interpolate(times), path=whole, errors=_errors(cut, config))
+        motion = StepMotion(odometry=cut, poses=whole.interpolate(times), path=whole, errors=_errors(cut, config))
+        if not config.odometry_tilt_sigma:
+            return motion
+        return replace(
+            motion,
+            tilt=tilts(upright.interpolate(times)),
+            tilt_sigma=config.odometry_tilt_sigma,
+            tilt_time=config.odometry_tilt_time,
+        )
 
     return MotionSource((name,), whole.dim, float(whole.times[0]), float(whole.times[-1]), solve)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from frontends.segslam.config import ChoiceConfig
 from frontends.segslam.localisation import Localisation
 from frontends.segslam.poses import group_of
 from frontends.segslam.segmap import MATCH, Entry
+from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import Registration, gate
@@ -70,6 +71,18 @@ class Proposal:
     def height(self) -> float:
         """From the prediction to the match, vertically [m]; 0 in two dimensions."""
         return float(abs(self.T[2] - self.T_prior[2])) if len(self.T) == 7 else 0.0
+
+    @property
+    def tilt(self) -> float:
+        """Between the vertical of the match and that of the prediction [rad]; 0 in two dimensions.
+
+        Not between the body and the map: a body on a ramp is tilted where the match is right.
+        """
+        if len(self.T) == 3:
+            return 0.0
+        up = np.array([[0.0, 0.0, 1.0]])
+        here, there = (se3.quat_rotate(np.asarray(q)[3:], up)[0] for q in (self.T, self.T_prior))
+        return math.atan2(float(np.linalg.norm(np.cross(here, there))), float(here @ there))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,7 +205,7 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
     r = p.registration
     if not r.converged or not np.all(np.isfinite(p.T)):
         return ["nothing: " + (r.why or "the result is not finite").replace("; ", ", ")]
-    fails = [text] if (text := gate(r, rules)) else []
+    fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
     if p.height > c.height:
         fails.append(f"height {p.height:.2f} m > {c.height:g}")
     if p.shift > c.shift * p.sigma:

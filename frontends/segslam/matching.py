@@ -7,9 +7,10 @@ the same map share the results; those whose map is another one share them as sta
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -201,7 +202,9 @@ class Matcher:
 
     def _register(self, source: Array, asked: list[Candidates]) -> tuple[dict[int, list[Registration]], int, int]:
         """Results by map, and how many searches and registrations they took."""
-        s, rules = self.config.search, self.config.registration
+        s, gates = self.config.search, self.config.registration.gates
+        # the body may be tilted: what tilts against the prediction is refused later
+        rules = replace(self.config.registration, gates=replace(gates, tilt=math.pi))
         planar = self.segmap.group.dim == 2
         cloud: Target | None = None
         results: dict[int, list[Registration]] = {}

@@ -111,6 +111,12 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
             raise ConfigError(f"{name} = {value!r}; wanted a table of options")
         return build(hint, value, name)
     if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{name} = {value!r}; wanted a list")
+        if args[1:] == (...,):
+            return tuple(_convert(args[0], v, name) for v in value)
+        if len(value) != len(args):
+            raise ConfigError(f"{name} = {value!r}; wanted {len(args)} values")
         return tuple(_convert(a, v, name) for a, v in zip(args, value, strict=True))
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)

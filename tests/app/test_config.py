@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from frontends.landmarks.config import RbpfEkfConfig
+from frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam.app import config as cfg
 from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.worlds import simulate
@@ -20,6 +22,27 @@ def test_nested_options_are_built_and_checked():
     )
     assert (c.particles, c.motion.speed, c.noise.range_sigma) == (7, 1.0, 0.1)
     assert isinstance(c.motion.speed, float)
+
+
+def test_lists_of_any_length_and_of_a_given_one():
+    c = cfg.build(
+        SegSlamFrontEndConfig, {"segslam": {"registration": {"radii": [3, 1, 0.5]}}, "steps": {"scanners": ["a"]}}
+    )
+    assert (c.segslam.registration.radii, c.steps.scanners) == ((3.0, 1.0, 0.5), ("a",))
+    assert cfg.build(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"segslam": {"registration": {"radii": 3.0}}}, "radii = 3.0; wanted a list"),
+        ({"segslam": {"registration": {"radii": ["wide"]}}}, "radii = 'wide'"),
+        ({"filter": {"clamp": [0.1]}}, "clamp = [0.1]; wanted 2 values"),
+    ],
+)
+def test_wrong_lists_are_refused(values, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        cfg.build(SegSlamFrontEndConfig, values)
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,12 @@ def proposal(
     )  # type: ignore[arg-type]  # fmt: skip
 
 
+def leaning(degrees: float, heading: float = 0.7) -> np.ndarray:
+    """At the origin, with a heading, its vertical this far off the map's."""
+    turned = se3.quat_multiply(se3.so3_exp([0, 0, heading]), se3.so3_exp([math.radians(degrees), 0, 0]))
+    return np.concatenate([np.zeros(3), turned])
+
+
 def test_weights_follow_fitness_and_shift() -> None:
     j = judge([proposal(fitness=0.88, x=3.0), proposal(1, fitness=0.97)], C, RULES)
     assert j.why == ("", "")
@@ -64,7 +70,7 @@ def test_weights_follow_fitness_and_shift() -> None:
     [
         ({"fitness": 0.849}, "fitness", {"fitness": 0.851}),
         ({"degeneracy": 0.0059}, "degenerate", {"degeneracy": 0.0061}),
-        ({"tilt": math.radians(4.1)}, "tilt", {"tilt": math.radians(3.9)}),
+        ({"T_target_source": leaning(4.1)}, "tilt", {"T_target_source": leaning(3.9)}),
         ({"z": 1.61}, "height", {"z": 1.59}),
         ({"x": 5.01}, "shift", {"x": 4.99}),
         ({"converged": False, "why": "2 pairs left, fewer than 20"}, "nothing", {"converged": True}),
@@ -78,6 +84,18 @@ def test_each_gate_keeps_out_what_is_beyond_it_alone(change: dict, gate: str, pa
     j = judge([proposal(**passes)], C, RULES)
     assert j.weights[0] > 0.0
     assert j.counts() == {"accepted": 1}
+
+
+def test_on_a_ramp_a_match_is_as_tilted_as_the_prediction_and_one_on_the_flat_is_refused() -> None:
+    """What the registration says of the tilt between body and map is no matter."""
+    ramp, flat = leaning(7.0), leaning(0.0)
+
+    def counts(found: np.ndarray, predicted: np.ndarray) -> dict[str, int]:
+        r = result(T_target_source=found, tilt=math.radians(7.0))
+        return judge([Proposal(segment=0, registration=r, T_prior=predicted, sigma=2.0)], C, RULES).counts()
+
+    assert counts(ramp, ramp) == counts(ramp, leaning(7.0, heading=0.6)) == {"accepted": 1}
+    assert counts(flat, ramp) == counts(ramp, flat) == {"tilt": 1, "accepted": 0}
 
 
 def test_a_rival_in_the_same_map_takes_both_out_and_elsewhere_none() -> None:
