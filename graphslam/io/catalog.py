@@ -35,11 +35,14 @@ class Reader:
     parts : mapping of str to mapping
         Logs inside one data set, by the name that stands after the card's (``mrclam-dataset7/robot1``), and what the
         function is told for each.
+    named : bool
+        The function takes ``name``, which is then the card's: what presets are found by.
     """
 
     target: str
     markers: tuple[str, ...] = ()
     parts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    named: bool = False
 
     def __call__(self, path: Path, **options: Any) -> Any:
         module, _, function = self.target.partition(":")
@@ -61,8 +64,12 @@ READERS: dict[str, Reader] = {
         "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
     ),
     "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
-    "carmen": Reader("graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2")),
-    "lidar-pack": Reader("graphslam.io.lidar_pack:read_lidar_pack", ("xyz_i16_planar.npy.xz", "xyz_i16_planar.npy")),
+    "carmen": Reader(
+        "graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2"), named=True
+    ),
+    "lidar-pack": Reader(
+        "graphslam.io.lidar_pack:read_lidar_pack", ("xyz_i16_planar.npy.xz", "xyz_i16_planar.npy"), named=True
+    ),
 }
 """Readers of folders by name. A pose network is a file: :func:`load` gives its path."""
 
@@ -193,7 +200,8 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
             return _only_file(c)
         if c.reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
-        return READERS[c.reader](locate(c), **{**c.options, **options})
+        called = {"name": c.name} if READERS[c.reader].named else {}
+        return READERS[c.reader](locate(c), **{**called, **c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
         c = card(name)
