@@ -226,8 +226,9 @@ def gate(result: Registration, config: RegistrationConfig) -> str:
     g, planar = config.gates, len(result.T_target_source) == 3
     fails = []
     if np.isnan(result.fitness_known):
-        if result.fitness < g.fitness:
-            fails.append(f"fitness {result.fitness:.3f} < {g.fitness:g}")
+        least = g.fitness_alone if np.isnan(result.fitness_upright) else g.fitness
+        if result.fitness < least:
+            fails.append(f"fitness {result.fitness:.3f} < {least:g}")
     else:
         if result.fitness_known < g.fitness_known:
             fails.append(f"fitness in known space {result.fitness_known:.3f} < {g.fitness_known:g}")
