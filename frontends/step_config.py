@@ -41,6 +41,9 @@ class StepConfig:
     """σ of an error of the yaw rate of recorded odometry or controls that lasts [rad/s]; ``yaw_bias`` counts too."""
     lasting_scale: float = 0.0
     """σ of an error of its distances that lasts, a share of them."""
+    yaw_per_metre: float = 0.0
+    """What recorded odometry in the plane turns too much for each metre driven: taken out [rad/m]. Wheels of unequal
+    size do that; :func:`frontends.odometry_calibration.yaw_per_metre` finds it from scans."""
     odometry_tilt_sigma: float = 0.0
     """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
     then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""
@@ -59,8 +62,9 @@ class StepConfig:
         for name in ("min_range", "lasting_yaw_bias", "lasting_scale", "odometry_tilt_sigma"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted ≥ 0")
-        if not np.isfinite(self.yaw_bias):
-            raise ConfigError(f"steps: yaw_bias = {self.yaw_bias}; wanted a finite number")
+        for name in ("yaw_bias", "yaw_per_metre"):
+            if not np.isfinite(getattr(self, name)):
+                raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted a finite number")
         if self.most_points < 1:
             raise ConfigError(f"steps: most_points = {self.most_points}; wanted ≥ 1")
         if self.max_range is not None and self.max_range <= self.min_range:

@@ -12,6 +12,7 @@ from frontends.drift import PathErrors
 from frontends.gaps import find_gaps
 from frontends.grid_motion import tilts
 from frontends.motion import steering_odometry, velocity_odometry
+from frontends.odometry_calibration import without_yaw_per_metre
 from frontends.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
 from frontends.step_config import StepConfig
 from graphslam.core import se3
@@ -164,6 +165,8 @@ def _errors(odometry: Odometry, config: StepConfig) -> RecordedErrors:
 def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig) -> MotionSource:
     if len(odometry.times) < 2:
         raise MissingDataError("odometry has a single record: no motion", where=f"{log.name}/{name}")
+    if config.yaw_per_metre:
+        odometry = without_yaw_per_metre(odometry, config.yaw_per_metre, where=f"{log.name}/{name}")
     upright = chain(odometry)
     if config.odometry_tilt_sigma and upright.dim == 2:
         raise ConfigError(f"{log.name}/{name}: odometry in the plane has no roll and pitch")
