@@ -79,7 +79,7 @@ def plot_by_particles(
         beside = 1.0 + 0.06 * (k - 0.5 * (len(known) - 1))
         x = c.particles * beside
         for n, v in (c.points or {}).items():
-            ax.plot(np.full(len(v), n * beside), v, ".", color=colour, ms=3.0, alpha=0.45, zorder=2)
+            ax.plot(np.full(len(v), n * beside), v, "_", color=colour, ms=7.0, alpha=0.7, zorder=2)
         if c.low is not None and c.high is not None:
             ax.vlines(x, c.low, c.high, color=colour, lw=1.4, zorder=3)
         ax.plot(x, c.values, "-", marker=marker, color=colour, ms=5.5, lw=1.5, label=_NAMES.get(name, name), zorder=4)

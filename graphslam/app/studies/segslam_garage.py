@@ -10,7 +10,7 @@ Quantities
 ----------
 ``final_error`` [m], ``final_yaw`` [rad]: last pose seen from the first, against the truth; ``ate_anchored`` with the
 first poses in one place, ``ate_aligned`` after a rigid alignment [m]. ``matches``: entries into older maps, by segment,
-also of particles that died out; ``false_matches``: those more than 1 m or 5° off, judged beside the place of the old
+also of particles that died out; ``false_matches``: those 1 m or 5° of heading off, judged beside the place of the old
 map where the body had passed nearest; ``false_match_weight``: the greatest weight of one. ``segments`` closed in all,
 ``intervals`` between boundaries. Per settled segment ``exit_nees`` (particles and drift model), ``exit_nees_stated``
 (particles and the stated noise of the motion), ``exit_nees_matched`` (moment matching), of ``exit_dof`` degrees of

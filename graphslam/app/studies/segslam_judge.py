@@ -95,7 +95,7 @@ class MatchErrors:
     places : (m,) int64
         Step of the old map's path beside which the entry puts the body.
     offsets, angles : (m,)
-        How far off the entry is [m], [rad].
+        How far off the entry is [m], and its heading (without gravity the whole rotation) [rad].
     weights : (m,)
         Share of the particles' weight of each segment when it was closed.
     """
@@ -148,7 +148,8 @@ def match_errors(segmap: SegMap, truth: Array) -> MatchErrors:
         e = g.log(g.between(true, T))
         places[row] = step
         offsets[row] = np.linalg.norm((T - true)[: g.dim])
-        angles[row] = np.abs(e[2]) if g.dim == 2 else np.linalg.norm(e[:3])
+        # where gravity tells roll and pitch they are no part of the match
+        angles[row] = np.abs(e[2]) if g.dim == 2 or segmap.gravity else np.linalg.norm(e[:3])
     return MatchErrors(found, t.start[found], places, offsets, angles, t.weight[found])
 
 
