@@ -44,6 +44,8 @@ class StepConfig:
     yaw_per_metre: float = 0.0
     """What recorded odometry in the plane turns too much for each metre driven: taken out [rad/m]. Wheels of unequal
     size do that; :func:`frontends.odometry_calibration.yaw_per_metre` finds it from scans."""
+    match_scans: bool = False
+    """In the plane: fuse the motion with matches of neighbouring scans (:mod:`frontends.scan_matching`)."""
     odometry_tilt_sigma: float = 0.0
     """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
     then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from frontends.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
 from frontends.drift import PathErrors
+from frontends.scan_matching import match_neighbours
 from frontends.step_config import StepConfig
 from frontends.step_motion import MotionSource, motion_source
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
@@ -195,7 +196,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         _log.info("%s: %s: %d", log.name, what, n)
     if drops is not None:
         drops.counts.update(count.counts)
-    return Steps(
+    steps = Steps(
         times=times,
         odometry=motion.odometry,
         offsets=offsets,
@@ -212,6 +213,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         truth=log.truth.trajectory if log.truth is not None else None,
         errors=motion.errors,
     )
+    return match_neighbours(steps, drops=drops) if config.match_scans else steps
 
 
 def _scanners(log: SensorLog) -> tuple[str, ...]:

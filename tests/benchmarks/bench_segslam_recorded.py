@@ -3,6 +3,7 @@
 ``python -m tests.benchmarks.bench_segslam_recorded [NAME …] [--quick] [--seeds 1] [--particles N] [--out DIR]``
 
 Settings come from the presets of the front end ``segslam`` alone; RBPF SLAM gets the same steps, particles and seed.
+``mended`` is the odometry as both get it, where presets have it fused with matches of neighbouring scans.
 With ``--quick`` the first minute of each log, cut before anything is done. References are outputs of other programs,
 not surveyed. Of a log that ends where it began, the distance from the end of the path to its start is given too.
 """
@@ -135,7 +136,11 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
     reference: Any = log["reference"]
     recorded = float(steps.times[-1] - steps.times[0])
     closed = name in CLOSED and not quick
-    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain(steps.odometry), 0.0)}
+    raw = make_steps(log, dataclasses.replace(config.steps, match_scans=False, yaw_per_metre=0.0))
+    raw = first(raw, 60.0) if quick else raw
+    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain(raw.odometry), 0.0)}
+    if config.steps.match_scans:
+        paths["mended"] = (chain(steps.odometry), 0.0)
     begin = time.process_time()
     rbpf = run_rbpf(steps, config.filter, SeedTree(seed))
     paths["rbpf-grid"] = (rbpf.trajectory(), time.process_time() - begin)
