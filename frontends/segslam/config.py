@@ -113,7 +113,7 @@ class CandidateSearch:
     """Steps of the search in position [m]."""
     yaw_step: float = 0.05
     """Steps in heading [rad]."""
-    max_radius: float = 12.0
+    max_radius: float = 20.0
     """Half width of the search: this [m], or 2.5 σ of the path-length model if that is less."""
     height: float = 0.8
     """Half width in z [m]."""

@@ -83,8 +83,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=1500)
     parser.add_argument("--particles", type=int, default=40)
+    parser.add_argument("--quick", action="store_true", help="300 scans")
     args = parser.parse_args()
-    steps = tunnel_steps(args.scans)
+    steps = tunnel_steps(300 if args.quick else args.scans)
     assert steps.truth is not None
     seconds, way = steps.times[-1] - steps.times[0], steps.path_length[-1]
     print(f"{len(steps)} steps, {seconds:.0f} s, {way:.0f} m, {args.particles} particles, 0.2 m")

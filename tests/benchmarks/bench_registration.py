@@ -1,6 +1,6 @@
 """Figures of docs/registration.md: capture, calibration, what the gates tell apart, time. About three minutes.
 
-python -m tests.benchmarks.bench_registration [capture|calibration|gates|time|recorded]
+python -m tests.benchmarks.bench_registration [capture|calibration|gates|time|recorded] [--quick: time only]
 """
 
 from __future__ import annotations
@@ -248,6 +248,7 @@ def recorded() -> None:
 
 if __name__ == "__main__":
     parts = {"capture": capture, "calibration": calibration, "gates": gates, "time": times, "recorded": recorded}
-    for part in sys.argv[1:] or parts:
+    asked = ["time"] if "--quick" in sys.argv else sys.argv[1:]
+    for part in asked or parts:
         print(f"== {part}")
         parts[part]()

@@ -1,6 +1,6 @@
 """Registration in the simulated garage, as a filter would meet it: maps of dead reckoning, windows of 4 s.
 
-    python -m tests.benchmarks.bench_registration_garage [LAYOUT [SEED]]        half a minute
+    python -m tests.benchmarks.bench_registration_garage [LAYOUT [SEED]] [--quick: every fourth window]    half a minute
 
 Every stretch of 110 steps (about 33 m) becomes an evidence grid at dead-reckoned poses. Windows of 10 steps of another
 time, at the same place or anywhere within 25 m, are searched for from a disturbed start and matched from every mode.
@@ -55,7 +55,7 @@ def window_of(steps: Steps, k: int, poses: Array) -> Array:
     return np.concatenate([se3.se3_transform(se3.se3_between(poses[k], poses[j]), p[r]) for j, p, _, r in scans])
 
 
-def main(layout: str = "A", seed: int = 3) -> None:
+def main(layout: str = "A", seed: int = 3, *, quick: bool = False) -> None:
     steps = make_steps(simulate_crawler(garage(layout, seed=seed), seed))
     assert steps.truth is not None
     true = steps.truth.poses[np.searchsorted(steps.truth.times, steps.times).clip(0, len(steps.truth.times) - 1)]
@@ -67,7 +67,7 @@ def main(layout: str = "A", seed: int = 3) -> None:
         b = min(a + 110, len(steps))
         grid = grid_of(steps, a, b, poses)
         target, field = Target(grid.occupied_cloud(), voxel=0.3), SearchField(grid.occupied_cloud(), cell=0.2)
-        for k in range(0, len(steps) - 12, 12):
+        for k in range(0, len(steps) - 12, 48 if quick else 12):
             apart = np.linalg.norm(true[a:b, :3] - true[k, :3], axis=1)
             here = apart.min() < 2.0
             level = np.linalg.norm(true[a:b, :2] - true[k, :2], axis=1).min()
@@ -112,4 +112,5 @@ def main(layout: str = "A", seed: int = 3) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *[int(s) for s in sys.argv[2:3]])
+    words = [a for a in sys.argv[1:] if a != "--quick"]
+    main(*words[:1], *[int(s) for s in words[1:2]], quick="--quick" in sys.argv)
