@@ -24,6 +24,7 @@ PAGES = [
     "mrclam.md",
     "plaza.md",
     "registration.md",
+    "segslam-recorded.md",
     "simulated-robots.md",
     "steps.md",
     "without-truth.md",
