@@ -15,6 +15,7 @@ from typing import IO, Any, Literal
 import numpy as np
 
 from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.interrupt import deferred_interrupts
 
 
 @contextmanager
@@ -42,7 +43,8 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
     for name, value in arrays.items():
         if np.asarray(value).dtype.hasobject:
             raise FormatError(f"array {name!r} holds Python objects", where=str(path), wanted="numbers or strings")
-    with atomic_open(path) as stream:
+    # a Ctrl-C inside would surface as an error of the half-written archive, and not as what it is
+    with deferred_interrupts(), atomic_open(path) as stream:
         np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})  # type: ignore[arg-type]
 
 
