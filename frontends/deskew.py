@@ -12,12 +12,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from frontends.recorded import between
 from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.poses import group_of
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans
 from graphslam.core.trajectory import Trajectory
@@ -68,18 +68,7 @@ class _Spinning:
         origins = np.broadcast_to(s.T_base_mount[:3], (len(k), 3))
         met = ranges < s.max_range
         reach = np.minimum(ranges, s.max_range)
-        return origins, origins + reach[:, None] * beam_directions(s, k, j), met
-
-
-def beam_directions(scans: RangeScans, record: Index, beam: Index) -> Array:
-    """Unit directions ``(k, 3)`` of single beams in the base at their own time."""
-    assert scans.spin is not None
-    assert scans.spin_rate is not None
-    angle = scans.spin[record] + scans.spin_rate[record] * scans.beam_times[beam]
-    turn = np.zeros((len(angle), 4))
-    turn[:, 0], turn[:, 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
-    q = se3.quat_multiply(np.broadcast_to(scans.T_base_mount[3:], turn.shape), turn)
-    return se3.quat_rotate(q, scans.directions[beam])
+        return origins, origins + reach[:, None] * s.beam_directions(k, j), met
 
 
 @dataclass(slots=True)
@@ -215,13 +204,13 @@ def deskew(
     origins, ends : (q, dim)
     """
     out_origins, out_ends = np.empty_like(ends), np.empty_like(ends)
-    transform = se2_transform if path.dim == 2 else se3.se3_transform
+    group = group_of(step_poses)
     for a in range(0, len(times), _AT_ONCE):
         part = slice(a, min(a + _AT_ONCE, len(times)))
         # beams of one stamp share one motion (a cloud has thousands)
         stamps, first, which = np.unique(times[part], return_index=True, return_inverse=True)
-        T = between(step_poses[step[part][first]], path.interpolate(stamps))[which]
-        out_origins[part], out_ends[part] = transform(T, origins[part]), transform(T, ends[part])
+        T = group.between(step_poses[step[part][first]], path.interpolate(stamps))[which]
+        out_origins[part], out_ends[part] = group.transform(T, origins[part]), group.transform(T, ends[part])
     if not (np.all(np.isfinite(out_ends)) and np.all(np.isfinite(out_origins))):
         raise DataError("a beam has no finite position", got=f"beam {np.argwhere(~np.isfinite(out_ends))[:1]}")
     return out_origins, out_ends

@@ -22,9 +22,9 @@ from frontends.grid_config import GridFilterConfig
 from frontends.grid_motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
 from frontends.grid_weights import informed, inherit, spread
 from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from frontends.segslam.poses import SE2, SE3
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3
 from graphslam.core.random import SeedTree
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.grid import EvidenceGrid

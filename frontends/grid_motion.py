@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from frontends.grid_config import GridFilterConfig
-from frontends.segslam.poses import group_of, heading_of
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, heading_of
 
 
 def motion_covariance(increment: Array, covariance: Array, config: GridFilterConfig) -> Array:

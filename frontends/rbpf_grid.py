@@ -21,11 +21,11 @@ from frontends.drift import DriftModel
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter, GridParticles, Tally
 from frontends.segslam.covariance import Drift, exit_covariance
-from frontends.segslam.poses import group_of
 from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory

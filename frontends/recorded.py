@@ -8,27 +8,11 @@ import numpy as np
 
 from frontends.motion import MotionNoise, recorded_odometry
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import (
-    Array,
-    se2_adjoint,
-    se2_between,
-    se2_compose,
-    se2_exp,
-    se2_inverse,
-    se2_log,
-    se2_right_jacobian,
-)
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
+from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam.core.se3 import (
-    se3_adjoint,
-    se3_between,
-    se3_compose,
-    se3_exp,
-    se3_inverse,
-    se3_log,
-    se3_right_jacobian,
-)
+from graphslam.core.se3 import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
 from graphslam.core.trajectory import Trajectory
 
 BRIDGED = 0.2
@@ -76,54 +60,50 @@ class RecordedErrors:
         DataError
         """
         o = self.odometry
-        n, planar = len(o.times), o.increments.shape[1] == 3
+        n, g = len(o.times), group_of(o.increments)
         if not 0 <= start <= end < n:
             raise DataError("no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {n}")
-        if not planar and (level_start or level_end):
+        if g.dim == 3 and (level_start or level_end):
             raise DataError("recorded odometry does not say where level is", wanted="an IMU")
-        T = np.zeros(3) if planar else np.array([0.0, 0, 0, 0, 0, 0, 1])
-        d = 3 if planar else 6
-        P, J = o.covariances[0].copy(), np.zeros((d, 2))  # J: the error per unit of yaw rate and of scale
+        T = g.identity
+        P, J = o.covariances[0].copy(), np.zeros((g.dof, 2))  # J: the error per unit of yaw rate and of scale
         for k in range(start + 1, end + 1):
             step = o.increments[k]
-            back = se2_adjoint(se2_inverse(step)) if planar else se3_adjoint(se3_inverse(step))
+            back = g.adjoint(g.inverse(step))
             J = back @ J + lasting_effect(step, float(o.times[k] - o.times[k - 1]))
             P = back @ P @ back.T + o.covariances[k]
-            T = se2_compose(T, step) if planar else se3_compose(T, step)
+            T = g.compose(T, step)
         P = P + J @ np.diag([self.yaw_bias**2, self.scale**2]) @ J.T
         return T, 0.5 * (P + P.T)
 
 
 def lasting_effect(step: Array, seconds: float) -> Array:
     """Right-tangent error ``(d, 2)`` of a motion per unit of yaw rate [rad/s] and of scale, constant during it."""
-    planar = len(step) == 3
-    xi = se2_log(step) if planar else se3_log(step)
-    change = np.zeros((len(xi), 2))
-    change[2, 0] = seconds  # heading in the plane, rotation about z in space
-    if planar:
-        change[:2, 1] = xi[:2]
-    else:
-        change[3:, 1] = xi[3:]
-    return (se2_right_jacobian(xi) if planar else se3_right_jacobian(xi)) @ change
+    g = group_of(step)
+    xi = g.log(step)
+    change = np.zeros((g.dof, 2))
+    change[g.heading, 0] = seconds
+    change[g.position, 1] = xi[g.position]
+    return np.asarray(g.right_jacobian(xi) @ change)
 
 
 def add_yaw_bias(odometry: Odometry, rate: float) -> Odometry:
     """The odometry of a robot whose gyro is off by ``rate`` about the z axis of the base [rad/s], all along."""
-    planar = odometry.increments.shape[1] == 3
+    g = group_of(odometry.increments)
     seconds = np.concatenate([[0.0], np.diff(odometry.times)])[: len(odometry.times)]
-    xi = se2_log(odometry.increments) if planar else se3_log(odometry.increments)
-    xi[:, 2] += rate * seconds
-    return replace(odometry, increments=se2_exp(xi) if planar else se3_exp(xi))
+    xi = g.log(odometry.increments)
+    xi[:, g.heading] += rate * seconds
+    return replace(odometry, increments=g.exp(xi))
 
 
 def chain(odometry: Odometry) -> Trajectory:
     """Poses ``(n, 3 | 7)`` of recorded increments in the frame of the first record's pose."""
     poses = odometry.increments.copy()
-    compose = se2_compose if poses.shape[1] == 3 else se3_compose
+    g = group_of(poses)
     if len(poses):
-        poses[0] = np.zeros(3) if poses.shape[1] == 3 else [0.0, 0, 0, 0, 0, 0, 1]
+        poses[0] = g.identity
     for k in range(1, len(poses)):
-        poses[k] = compose(poses[k - 1], odometry.increments[k])
+        poses[k] = g.compose(poses[k - 1], odometry.increments[k])
     return Trajectory(odometry.times, poses)
 
 
@@ -153,13 +133,14 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
         )
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
-    planar = odometry.increments.shape[1] == 3
+    g = group_of(odometry.increments)
     covariances = odometry.covariances.copy()
     for record in k + 1:
-        xi = (se2_log if planar else se3_log)(odometry.increments[record])
-        turn, move = (xi[2:], xi[:2]) if planar else (xi[:3], xi[3:])
-        metres, radians = BRIDGED * np.linalg.norm(move), BRIDGED * np.linalg.norm(turn)
-        sigma = [metres, metres, radians] if planar else np.repeat([radians, metres], 3)
+        xi = g.log(odometry.increments[record])
+        metres = float(np.linalg.norm(xi[g.position]))
+        radians = float(np.linalg.norm(np.delete(xi, np.r_[g.position])))
+        sigma = np.full(g.dof, BRIDGED * radians)
+        sigma[g.position] = BRIDGED * metres
         covariances[record] += np.diag(np.square(sigma))
     return replace(odometry, covariances=covariances)
 
@@ -211,8 +192,3 @@ def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise) -> Odomet
         P[live] = back @ P[live] @ np.swapaxes(back, -1, -2) + added[first[live] + m]
     covariances[1:] += 0.5 * (P + np.swapaxes(P, -1, -2))
     return Odometry(times=t, increments=increments, covariances=covariances)
-
-
-def between(T_wa: Array, T_wb: Array) -> Array:
-    """``T_ab`` of poses ``(..., 3)`` or ``(..., 7)``."""
-    return se2_between(T_wa, T_wb) if np.shape(T_wa)[-1] == 3 else se3_between(T_wa, T_wb)

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from frontends.segslam.config import ChoiceConfig
 from frontends.segslam.localisation import Localisation
-from frontends.segslam.poses import group_of
 from frontends.segslam.segmap import MATCH, Entry
 from graphslam.core import se3
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import Registration, gate
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.poses import group_of, pose_mean, pose_scatter
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import check_covariance, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.poses import group_of, pose_mean, pose_scatter
 
 Drift = Callable[[float], Any]
 """Covariance ``(d, d)``, right tangent, at the end of a path of a length [m]."""

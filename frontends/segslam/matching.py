@@ -16,18 +16,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.choice import NULL, Judgement, Proposal, judge
+from frontends.segslam.choice import NULL, Proposal, judge
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.localisation import localise
-from frontends.segslam.poses import heading_of
 from frontends.segslam.sampling import MapSample, grow, root_of_particle
 from frontends.segslam.segmap import NEW, Entry, SegMap
 from frontends.segslam.window import Ahead
 from frontends.segslam.winnowing import Candidates, Winnowed, winnow
 from graphslam.core.geometry import Array
+from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
-from graphslam.registration.register import Registration, register_starts
-from graphslam.registration.search import SearchField, correlative_search
+from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.search import correlative_search
+from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
 Ints = npt.NDArray[np.int64]
@@ -157,7 +158,7 @@ class Matcher:
             candidates=tuple(sorted({int(s) for c in asked for s in c.segments})),
             searches=searches,
             registrations=registrations,
-            accepted=_with_something(judged),
+            accepted=sum(len(j.accepted) > 0 for j in judged),
             fitness=max(best, default=float("nan")),
             why=dict(sorted(why.items())),
         )
@@ -229,7 +230,7 @@ class Matcher:
                 starts += good
                 found = register_starts(cloud, known.target, starts, rules)
                 registrations += len(starts)
-                results[m] = _distinct(results.get(m, []) + found)
+                results[m] = distinct(results.get(m, []) + found)
                 good += [r.T_target_source for r in found if r.accepted][:1]
         return results, len(done), registrations
 
@@ -288,22 +289,3 @@ class Matcher:
             moved = group.compose(e.T_entry, group.exp(np.linalg.cholesky(e.covariance) @ x))
             out.append(Entry(T_entry=moved, kind=e.kind, source=e.source, covariance=e.covariance, fitness=e.fitness))
         return out
-
-
-def _with_something(judged: list[Judgement]) -> int:
-    return sum(len(j.accepted) > 0 for j in judged)
-
-
-def _distinct(results: list[Registration], apart: float = 0.5, turned: float = 0.1) -> list[Registration]:
-    """Best fitness first, without those next to a better one."""
-    kept: list[Registration] = []
-    for r in sorted(results, key=lambda r: -r.best_fitness):
-        T = r.T_target_source
-        near = [
-            np.linalg.norm((T - b.T_target_source)[: 2 if len(T) == 3 else 3]) < apart
-            and abs(np.angle(np.exp(1j * (heading_of(T) - heading_of(b.T_target_source))))) < turned
-            for b in kept
-        ]
-        if not any(near):
-            kept.append(r)
-    return kept

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from frontends.ancestry import Ancestry
 from frontends.grid_filter import Tally
 from frontends.segslam.matching import Attempt
-from frontends.segslam.sampling import MapSample, concatenate, grow, root_of_segment
+from frontends.segslam.paths import concatenate
+from frontends.segslam.sampling import MapSample, grow, root_of_segment
 from frontends.segslam.segmap import SegMap
 from frontends.segslam.winnowing import Winnowed
 from frontends.steps import Steps

@@ -16,12 +16,12 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.poses import SE2, SE3, Group, normalised
 from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment
 from frontends.segslam.store import Maps, Table
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3, Group, normalised
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
 

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from frontends.segslam.config import SegmentationConfig
-from frontends.segslam.poses import group_of, normalised
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.poses import group_of, normalised
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood
 from graphslam.evidence.queries import cast_grids
@@ -45,8 +45,15 @@ class Window:
     def __len__(self) -> int:
         return len(self.points)
 
+    def thinned(self, most: int) -> Window:
+        """At most so many of its points, evenly spread."""
+        if len(self) <= most:
+            return self
+        rows = np.linspace(0, len(self) - 1, most).astype(np.int64)
+        return Window(points=self.points[rows], origins=self.origins[rows], beams=self.beams)
 
-def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float, *, most: int = 0) -> Window:
+
+def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float) -> Window:
     """Bring the scans of a window into one frame.
 
     Parameters
@@ -56,8 +63,6 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
     scans : sequence of w scans
     max_range : float
         Beams longer than this are left out [m].
-    most : int
-        Keep so many, evenly thinned; 0 = all.
 
     Raises
     ------
@@ -77,11 +82,7 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
         use = np.asarray(returns, dtype=bool) & (ranges < max_range) & (ranges > 0.0)
         points.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), p[use]))
         origins.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), o[use]))
-    P, O = np.concatenate(points), np.concatenate(origins)
-    if most and len(P) > most:
-        keep = np.linspace(0, len(P) - 1, most).astype(np.int64)
-        P, O = P[keep], O[keep]
-    return Window(points=P, origins=O, beams=beams)
+    return Window(points=np.concatenate(points), origins=np.concatenate(origins), beams=beams)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

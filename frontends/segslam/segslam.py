@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +21,13 @@ from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.matching import Attempt, Matcher
-from frontends.segslam.poses import group_of, level
 from frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
 from frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
 from frontends.segslam.segmentation import Decision, Segmenter, predictive_score
-from frontends.segslam.window import look_ahead
+from frontends.segslam.window import Ahead, look_ahead
 from frontends.steps import Steps
 from graphslam.core.errors import DataError
+from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
 
 Ints = npt.NDArray[np.int64]
@@ -74,13 +72,6 @@ def run_segslam(
     return run.result()
 
 
-@dataclass(slots=True)
-class _Clock:
-    """Wall time of what the filter does not count itself [s]."""
-
-    seconds: dict[str, float] = field(default_factory=lambda: {"score": 0.0, "match": 0.0, "segments": 0.0})
-
-
 class _Run:
     """A run, step by step."""
 
@@ -110,7 +101,8 @@ class _Run:
         self.attempts: list[Attempt] = []
         self.boundaries: list[Boundary] = []
         self.closed: Ints = np.full(n, -1, dtype=np.int64)
-        self.clock = _Clock()
+        self.seconds = {"score": 0.0, "match": 0.0, "segments": 0.0}  # wall time of what the filter does not count
+        self.ahead: Ahead | None = None
 
     # --- one step --------------------------------------------------------------------------------------------
 
@@ -156,7 +148,13 @@ class _Run:
         if self.config.segments_per_interval:
             self.segmap.thin(self.config.segments_per_interval)
         self.matcher.forget()
-        self.clock.seconds["segments"] += time.perf_counter() - begin
+        self.seconds["segments"] += time.perf_counter() - begin
+
+    def _look(self, k: int) -> Ahead:
+        """The window ahead, gathered once a step for scores and matches."""
+        if self.ahead is None or self.ahead.step != k:
+            self.ahead = look_ahead(self.steps, k, self.config.segmentation.window)
+        return self.ahead
 
     # --- when a segment ends ---------------------------------------------------------------------------------
 
@@ -173,19 +171,18 @@ class _Run:
         share, shares = np.nan, np.full(n, np.nan)
         if wants:
             begin = time.perf_counter()
-            ahead = look_ahead(self.steps, k, c.window, most=c.score_beams)
-            p = f.particles
+            ahead, p = self._look(k), f.particles
             # half a window at the end of the log would be scored against maxima of whole ones
             if ahead.full:
                 score = predictive_score(
-                    p.grids, p.poses, ahead.window, self.steps.max_range, weights=p.weights, tolerance=c.tolerance,
-                    sigma=c.score_sigma, threads=f.config.threads,
+                    p.grids, p.poses, ahead.window.thinned(c.score_beams), self.steps.max_range, weights=p.weights,
+                    tolerance=c.tolerance, sigma=c.score_sigma, threads=f.config.threads,
                 )  # fmt: skip
                 share, shares = score.share, score.shares
                 self.scores.append(
                     ScoreLine(step=k, share=score.share, log_likelihood=score.log_likelihood, beams=score.beams)
                 )
-            self.clock.seconds["score"] += time.perf_counter() - begin
+            self.seconds["score"] += time.perf_counter() - begin
         why = ""
         if together:
             decision = self._decision(0, k, now, share)
@@ -211,14 +208,14 @@ class _Run:
         if now - max(s.time for s in self.segmenters) < c.choice.every - 1e-6:
             return None  # a segment of nothing
         begin = time.perf_counter()
-        ahead = look_ahead(self.steps, k, c.segmentation.window)
+        ahead = self._look(k)
         attempt = None
         if ahead.full:
             self.last_attempt = now
             attempt = self.matcher.attempt(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
             if attempt.candidates:
                 self.attempts.append(attempt)
-        self.clock.seconds["match"] += time.perf_counter() - begin
+        self.seconds["match"] += time.perf_counter() - begin
         return attempt
 
     # --- boundaries ------------------------------------------------------------------------------------------
@@ -279,8 +276,6 @@ class _Run:
     def result(self) -> SegSlamResult:
         """What it came to; all segments are closed."""
         f = self.filter
-        seconds: dict[str, Any] = dict(f.tally.seconds)
-        seconds.update(self.clock.seconds)
         return SegSlamResult(
             steps=self.steps,
             segmap=self.segmap,
@@ -295,7 +290,7 @@ class _Run:
             boundaries=tuple(self.boundaries),
             winnowed=self.matcher.winnowed,
             tally=f.tally,
-            seconds=seconds,
+            seconds={**f.tally.seconds, **self.seconds},
             step_seconds=self.step_seconds,
             used_bytes=f.pool.used_bytes,
             seed=self.seed,

@@ -7,10 +7,10 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.poses import Group, heading_of
 from frontends.segslam.segment import KINDS
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import Group, heading_of
 from graphslam.evidence.grid import EvidenceGrid
 
 Ints = npt.NDArray[np.int64]

@@ -17,12 +17,12 @@ import numpy.typing as npt
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import exit_covariance
-from frontends.segslam.poses import frame_between, group_of, level, normalised, pose_scatter
 from frontends.segslam.sampling import nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2
+from graphslam.core.poses import frame_between, group_of, level, normalised, pose_scatter
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid

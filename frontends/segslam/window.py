@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from frontends.grid_weights import spread
-from frontends.segslam.poses import group_of
 from frontends.segslam.segmentation import Window, gather_window
 from frontends.steps import Steps
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +46,7 @@ class Ahead:
         return p[rows[spread(len(rows), most)]]
 
 
-def look_ahead(steps: Steps, step: int, seconds: float, *, most: int = 0) -> Ahead:
+def look_ahead(steps: Steps, step: int, seconds: float) -> Ahead:
     """The window ahead of a step: what beams met in the steps after it, up to so many seconds later.
 
     Parameters
@@ -55,15 +55,13 @@ def look_ahead(steps: Steps, step: int, seconds: float, *, most: int = 0) -> Ahe
     step : int
     seconds : float
         W.
-    most : int
-        Beams in it, evenly thinned; 0 = all.
     """
     slack = 1e-6  # half a step's rounding of the clock takes no step off
     until = float(steps.times[step]) + seconds
     last = int(np.searchsorted(steps.times, until + slack, side="right")) - 1
     rows = range(step + 1, last + 1)
     window = gather_window(
-        steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range, most=most
+        steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range
     )
     return Ahead(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
 

@@ -91,18 +91,23 @@ class RangeScans:
             spin_rate=self.spin_rate[index],
         )
 
-    def head_rays(self, index: Any = slice(None)) -> tuple[Array, Array]:
-        """Origin ``(3,)`` and unit directions ``(k, m, 3)`` of scans, base frame.
+    def beam_directions(self, record: Any, beam: Any) -> Array:
+        """Unit directions ``(..., 3)`` of beams ``beam`` of scans ``record`` (broadcast), base frame of their own time.
 
-        The base is that of each beam's own time: what the vehicle does meanwhile is not in it.
+        What the vehicle does between two beams is not in it.
         """
         assert self.spin is not None
         assert self.spin_rate is not None
-        angle = np.asarray(self.spin[index])[..., None] + np.asarray(self.spin_rate[index])[..., None] * self.beam_times
-        half = np.zeros((*angle.shape, 4))
-        half[..., 0], half[..., 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
-        q = quat_multiply(np.broadcast_to(self.T_base_mount[3:], half.shape), half)
-        return self.T_base_mount[:3].copy(), quat_rotate(q, np.broadcast_to(self.directions, (*angle.shape, 3)))
+        angle = self.spin[record] + self.spin_rate[record] * self.beam_times[beam]
+        turn = np.zeros((*angle.shape, 4))
+        turn[..., 0], turn[..., 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
+        q = quat_multiply(np.broadcast_to(self.T_base_mount[3:], turn.shape), turn)
+        return quat_rotate(q, np.broadcast_to(self.directions[beam], (*angle.shape, 3)))
+
+    def head_rays(self, index: Any = slice(None)) -> tuple[Array, Array]:
+        """Origin ``(3,)`` and unit directions ``(k, m, 3)`` of whole scans; see :meth:`beam_directions`."""
+        record = np.arange(len(self.times))[index]
+        return self.T_base_mount[:3].copy(), self.beam_directions(record[:, None], np.arange(len(self.beam_times)))
 
 
 def _finite(value: Any, shape: tuple[int, ...], name: str) -> Array:

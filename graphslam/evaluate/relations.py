@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, se2_between
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 
 Index = npt.NDArray[np.intp]
@@ -82,7 +83,7 @@ def relation_error(estimate: Trajectory, reference: Trajectory, pairs: tuple[Ind
             got=f"{reference.times[used][outside][0]:.3f} s",
             wanted=f"{estimate.times[0]:.3f} to {estimate.times[-1]:.3f} s",
         )
-    between = se2_between if reference.dim == 2 else se3.se3_between
+    between = group_of(reference.poses).between
     a, b = estimate.interpolate(reference.times[i]), estimate.interpolate(reference.times[j])
     d = between(between(reference.poses[i], reference.poses[j]), between(a, b))
     if reference.dim == 2:

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from frontends.segslam.poses import group_of
-from frontends.segslam.sampling import OPEN, MapSample
+from frontends.segslam.sampling import OPEN, MapSample, nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
 
@@ -181,9 +181,8 @@ def sample_paths(segmap: SegMap, sample: MapSample) -> tuple[list[Array], list[T
             continue
         source = segmap[s.source]
         seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
-        d = source.path[:, : g.dim] - seen[: g.dim]
         at = sample.poses[place[s.source]]
-        nearest = source.path[int(np.argmin(np.einsum("ni,ni->n", d, d)))]
+        nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
         ties.append(Tie(paths[-1][0], _placed(at, nearest[None])[0]))
     return paths, ties, labels
 

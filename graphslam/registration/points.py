@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
+from graphslam.core.poses import SE2, SE3
 
 FARTHEST = 1e6
 """Coordinates beyond this are no measurement [m]."""
@@ -53,7 +53,7 @@ def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
 
 def transform(T_ab: Array, points: Array) -> Array:
     """Points ``(m, dim)`` of frame b in frame a; poses may have leading axes to broadcast."""
-    return se2.se2_transform(T_ab, points) if points.shape[-1] == 2 else se3.se3_transform(T_ab, points)
+    return (SE2 if points.shape[-1] == 2 else SE3).transform(T_ab, points)
 
 
 def thin(points: Array, voxel: float) -> Array:

@@ -199,14 +199,24 @@ def register_starts(
         Those with a result, accepted or not; equal fitness in the order of the starts.
     """
     cloud = source if isinstance(source, Target) else Target(source, neighbours=target.neighbours)
-    results = [register(cloud, target, T, config, known=known) for T in starts]
-    results = sorted((r for r in results if r.converged), key=lambda r: -r.best_fitness)
-    distinct: list[Registration] = []
-    for r in results:
-        moves = [_moved(b.T_target_source, r.T_target_source) for b in distinct]
+    return distinct((register(cloud, target, T, config, known=known) for T in starts), apart)
+
+
+def distinct(results: Iterable[Registration], apart: tuple[float, float] = (0.5, 0.1)) -> list[Registration]:
+    """Registrations with a result, best fitness first, without those next to a better one.
+
+    Parameters
+    ----------
+    results : iterable of Registration
+    apart : (float, float)
+        See :func:`register_starts`.
+    """
+    kept: list[Registration] = []
+    for r in sorted((r for r in results if r.converged), key=lambda r: -r.best_fitness):
+        moves = [_moved(b.T_target_source, r.T_target_source) for b in kept]
         if all(shift >= apart[0] or turn >= apart[1] for shift, turn in moves):
-            distinct.append(r)
-    return distinct
+            kept.append(r)
+    return kept
 
 
 def margin(results: list[Registration], *, apart: float = 1.5) -> float:

@@ -19,100 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GeometryError
+from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
 from graphslam.registration.points import check_pose, finite_points, spread, thin, transform
-from graphslam.registration.search_kernels import local_maxima, score_block, splat
+from graphslam.registration.search_field import SearchField
+from graphslam.registration.search_kernels import local_maxima, score_block
 
-MOST_CELLS = 200_000_000
 MOST_STARTS = 50_000_000
-
-
-class SearchField:
-    """How near an occupied cell is, everywhere around a map: what a search looks into.
-
-    Parameters
-    ----------
-    points : (m, dim)
-        Of the map, dim 2 or 3: a cloud, or the centres of a grid's occupied voxels [m]. Those that are not finite are
-        left out and counted in ``dropped``.
-    cell : float
-        Edge of a cell [m].
-    sigma : float
-        The field is ``exp(-d² / 2σ²)`` at distance d [m] from the centre of the nearest occupied cell, in 255 steps,
-        and 0 beyond 3 σ. Half the steps of the lattice to be searched, or more: what falls between them is not found.
-
-    Raises
-    ------
-    GeometryError
-        Points of an impossible shape.
-    DataError
-        No finite point, or points so far apart that the field would not fit into memory.
-    ConfigError
-        An impossible number.
-    """
-
-    def __init__(self, points: Any, *, cell: float = 0.2, sigma: float = 0.3) -> None:
-        if not (np.isfinite(cell) and cell > 0 and np.isfinite(sigma) and sigma > 0):
-            raise ConfigError(f"search field: cell {cell}, sigma {sigma}; wanted positive numbers of metres")
-        p = finite_points(points, what="points of the search field")
-        self.dropped = len(points) - len(p)
-        if not len(p):
-            raise DataError("a search field needs points", got=f"{self.dropped} that are not finite, no other")
-        self.dim, self.cell, self.sigma = p.shape[1], float(cell), float(sigma)
-        reach = int(np.floor(3.0 * sigma / cell))
-        low, high = np.floor(p.min(axis=0) / cell) - reach, np.floor(p.max(axis=0) / cell) + reach
-        size = np.ones(3)
-        size[: self.dim] = high - low + 1
-        if not np.prod(size) <= MOST_CELLS:
-            raise DataError(
-                "the points of a search field are too far apart",
-                got=f"{' × '.join(f'{n * cell:.0f}' for n in size)} m in cells of {cell} m",
-                wanted=f"at most {MOST_CELLS} cells: leave out stray points, or choose larger cells",
-            )
-        self._low = np.zeros(3, dtype=np.int64)
-        self._low[: self.dim] = low.astype(np.int64)
-        occupied = np.unique(self._cells(p), axis=0)
-        around = np.arange(-reach, reach + 1)
-        offsets = np.stack(np.meshgrid(around, around, around if self.dim == 3 else [0], indexing="ij"), -1)
-        offsets = offsets.reshape(-1, 3)
-        d2 = np.sum(offsets**2, axis=1) * cell**2
-        near = d2 <= (3.0 * sigma) ** 2
-        values = np.rint(255.0 * np.exp(-0.5 * d2 / sigma**2)).astype(np.uint8)
-        nx, ny, nz = size.astype(np.int64)
-        self.values: npt.NDArray[np.uint8] = np.zeros((nz, ny, nx), np.uint8)
-        splat(occupied, offsets[near].astype(np.int64), values[near], self.values)
-        self._phases: dict[tuple[int, int, int], npt.NDArray[np.uint8]] = {}
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the field, and of its copies for the lattices searched so far."""
-        return self.values.nbytes + sum(a.nbytes for a in self._phases.values())
-
-    def _cells(self, points: Array) -> npt.NDArray[np.int64]:
-        """Cells ``(m, 3)`` x, y, z of points, counted from the corner of the field."""
-        out = np.zeros((len(points), 3), dtype=np.int64)
-        out[:, : self.dim] = np.floor(points / self.cell).astype(np.int64)
-        return out - self._low
-
-    def _in_phases(self, steps: tuple[int, int, int]) -> npt.NDArray[np.uint8]:
-        """The field as one array per phase of a lattice; see :func:`~.search_kernels.score_block`."""
-        if steps not in self._phases:
-            sx, sy, sz = steps
-            nz, ny, nx = self.values.shape
-            whole = np.pad(self.values, [(0, -nz % sz), (0, -ny % sy), (0, -nx % sx)])
-            z, y, x = whole.shape
-            split = whole.reshape(z // sz, sz, y // sy, sy, x // sx, sx)
-            self._phases[steps] = np.ascontiguousarray(split.transpose(1, 3, 5, 0, 2, 4))
-        return self._phases[steps]
-
-    def value_at(self, points: Any) -> Array:
-        """The field, 0 … 1, at points ``(m, dim)`` in the frame of the map [m]; 0 outside it."""
-        c = self._cells(finite_points(points))
-        inside = np.all((c >= 0) & (c < self.values.shape[::-1]), axis=1)
-        out = np.zeros(len(c))
-        out[inside] = self.values[tuple(c[inside].T[::-1])] / 255.0
-        return out
 
 
 @dataclass(frozen=True, slots=True)

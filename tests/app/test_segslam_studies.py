@@ -11,7 +11,6 @@ import pytest
 
 from frontends.drift import DriftModel
 from frontends.rbpf_grid import RbpfResult
-from frontends.segslam.poses import SE3, level
 from frontends.segslam.result import SegSlamResult
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies import segslam_trial
@@ -21,6 +20,7 @@ from graphslam.app.studies.segslam_mine import STUDY as MINE
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
+from graphslam.core.poses import SE3, level
 from graphslam.core.trajectory import Trajectory
 
 STUDIES = {"segslam-garage": GARAGE, "segslam-mine": MINE, "segslam-building": BUILDING}

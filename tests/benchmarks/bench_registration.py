@@ -18,7 +18,8 @@ from graphslam.core.geometry import Array
 from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.register import Registration, register, register_starts
-from graphslam.registration.search import SearchConfig, SearchField, correlative_search, offset_pose
+from graphslam.registration.search import SearchConfig, correlative_search, offset_pose
+from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from tests.reference.box_world import BoxWorld, around, corridor, hall, heading, survey
 

@@ -18,7 +18,8 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.registration.register import Registration, register_starts
-from graphslam.registration.search import SearchField, correlative_search, offset_pose
+from graphslam.registration.search import correlative_search, offset_pose
+from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.garage import garage

@@ -163,7 +163,7 @@ def ring(
 
 def true_end(steps: Steps) -> Array:
     """True pose ``(7,)`` or ``(3,)`` at the end in the gravity-aligned frame of the first base."""
-    from frontends.segslam.poses import group_of, level
+    from graphslam.core.poses import group_of, level
 
     assert steps.truth is not None
     poses = steps.truth.poses

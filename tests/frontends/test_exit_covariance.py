@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 from scipy import optimize
 
 from frontends.segslam.covariance import exit_covariance, exit_nees
-from frontends.segslam.poses import (
+from graphslam.core import se3
+from graphslam.core.errors import CovarianceError, GeometryError
+from graphslam.core.gaussian import chi2_mean_bounds
+from graphslam.core.poses import (
     SE2,
     SE3,
     Group,
@@ -21,9 +24,6 @@ from frontends.segslam.poses import (
     pose_mean,
     pose_scatter,
 )
-from graphslam.core import se3
-from graphslam.core.errors import CovarianceError, GeometryError
-from graphslam.core.gaussian import chi2_mean_bounds
 
 GROUPS = [SE2, SE3]
 

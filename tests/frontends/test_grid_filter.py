@@ -10,9 +10,9 @@ import pytest
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter
 from frontends.rbpf_grid import run_rbpf
-from frontends.segslam.poses import group_of, level
 from frontends.steps import Steps
 from graphslam.core.errors import GeometryError
+from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
 from graphslam.evidence.memory import memory
 from tests.frontends.grid_world import ring

@@ -7,8 +7,8 @@ import pytest
 
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_motion import motion_covariance, move, square_root, tilted, tilts, walk_tilt_errors
-from frontends.segslam.poses import group_of, heading_of
 from graphslam.core.errors import ConfigError
+from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import se3_exp
 
 QUIET = {"motion_scale": 0.0, "position_walk": 0.0, "height_walk": 0.0, "heading_walk": 0.0, "heading_turn": 0.0,

@@ -9,20 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from frontends.segslam.poses import frame_between, level
-from frontends.segslam.sampling import (
-    OPEN,
-    concatenate,
-    grow,
-    nearest_step,
-    root_of_particle,
-    root_of_segment,
-    seams,
-)
+from frontends.segslam.paths import concatenate, seams
+from frontends.segslam.sampling import OPEN, grow, nearest_step, root_of_particle, root_of_segment
 from frontends.segslam.segmap import SAME, Entry, SegMap
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_inverse
+from graphslam.core.poses import frame_between, level
 from tests.reference.segmap_twin import all_samples, flat_grid, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)

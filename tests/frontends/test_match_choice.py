@@ -12,11 +12,11 @@ from scipy import stats
 from frontends.segslam.choice import NULL, Proposal, judge, match_covariance, second_modes
 from frontends.segslam.config import ChoiceConfig, LocalisationConfig
 from frontends.segslam.localisation import Localisation, localise, range_error
-from frontends.segslam.poses import pose_mean, pose_scatter
 from frontends.segslam.segmap import MATCH
 from frontends.segslam.segmentation import Window
 from graphslam.core import se3
 from graphslam.core.errors import DataError
+from graphslam.core.poses import pose_mean, pose_scatter
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.registration.config import Gates, RegistrationConfig

@@ -11,12 +11,12 @@ import pytest
 from frontends.base import FrontEnd
 from frontends.grid_config import GridFilterConfig
 from frontends.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
-from frontends.segslam.poses import group_of, level
 from frontends.steps import Steps
 from graphslam.app.front_ends import make_front_end
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.evidence.grid import EvidenceGrid

@@ -52,7 +52,7 @@ def test_windows_are_gathered_where_dead_reckoning_puts_them() -> None:
     assert len(w) == 2  # too long, and met nothing: left out
     np.testing.assert_allclose(w.points, [[1.0, 2.0, 0.0], [-1.0, 1.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(w.origins, [[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]], atol=1e-12)
-    assert len(gather_window(np.stack([UP]), [(p, np.zeros((3, 3)), np.ones(3, bool))], 30.0, most=1)) == 1
+    assert len(gather_window(np.stack([UP]), [(p, np.zeros((3, 3)), np.ones(3, bool))], 30.0).thinned(1)) == 1
     with pytest.raises(DataError, match="one increment for each scan"):
         gather_window(np.stack([ahead]), scans, 30.0)
 

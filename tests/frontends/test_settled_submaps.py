@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from frontends.segslam.config import HandoverConfig
-from frontends.segslam.poses import SE3, level, pose_mean
 from frontends.segslam.segmap import SAME, Entry, SegMap
 from frontends.segslam.submaps import drift_by_errors, drift_by_length, settle, settled_chain
 from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse
+from graphslam.core.poses import SE3, level, pose_mean
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.submap_store import read_submaps, write_submaps
 from tests.reference.segmap_twin import flat_grid, mark, marked, match_entry, small_segmap, straight

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontends.deskew import assign, beam_directions, cut_beams, spread
+from frontends.deskew import assign, cut_beams, spread
 from frontends.reckoned import Reckoned
 from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.core import se3
@@ -124,7 +124,7 @@ def test_spread_does_not_fall_into_step_with_scans() -> None:
 def test_directions_equal_those_of_whole_scans(room: SensorLog, rng: np.random.Generator) -> None:
     scans = room["scanner"]
     k, j = rng.integers(len(scans.times), size=50), rng.integers(15, size=50)
-    np.testing.assert_allclose(beam_directions(scans, k, j), scans.head_rays()[1][k, j], atol=1e-12)
+    np.testing.assert_allclose(scans.beam_directions(k, j), scans.head_rays()[1][k, j], atol=1e-12)
 
 
 def test_beams_belong_to_the_step_they_end_in() -> None:

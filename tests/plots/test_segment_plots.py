@@ -6,7 +6,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from frontends.segslam.sampling import concatenate, grow, root_of_segment
+from frontends.segslam.paths import concatenate
+from frontends.segslam.sampling import grow, root_of_segment
 from frontends.segslam.segmap import Entry, SegMap
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from frontends.grid_config import GridFilterConfig
-from frontends.segslam.poses import group_of
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.evidence.grid import EvidenceGrid
 
 

@@ -14,7 +14,8 @@ from graphslam.core.log import DropCounter
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.planar import linearise
 from graphslam.registration.register import Registration, margin, register, register_starts, tilt_of
-from graphslam.registration.search import SearchField, correlative_search, offset_pose
+from graphslam.registration.search import correlative_search, offset_pose
+from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from tests.reference.box_world import BoxWorld, around, hall, heading, survey
 from tests.reference.slow_registration import gicp_hessian, planar_error

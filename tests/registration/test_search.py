@@ -12,14 +12,8 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.registration.points import thin
-from graphslam.registration.search import (
-    SearchConfig,
-    SearchField,
-    correlative_search,
-    make_lattice,
-    offset_pose,
-    score_lattice,
-)
+from graphslam.registration.search import SearchConfig, correlative_search, make_lattice, offset_pose, score_lattice
+from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima
 from tests.reference.box_world import BoxWorld, around, hall, heading, survey
 from tests.reference.slow_registration import slow_field, slow_maxima, slow_scores

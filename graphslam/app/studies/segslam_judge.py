@@ -12,13 +12,14 @@ from frontends.grid_motion import move, tilted
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import Nees, exit_nees
-from frontends.segslam.poses import group_of, heading_of, level
+from frontends.segslam.paths import concatenate
 from frontends.segslam.result import SegSlamResult
-from frontends.segslam.sampling import concatenate, grow, nearest_step, root_of_segment
+from frontends.segslam.sampling import grow, nearest_step, root_of_segment
 from frontends.segslam.segmap import MATCH, SegMap
 from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_length, settle, settled_chain
 from frontends.steps import Steps
 from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.poses import group_of, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel

@@ -45,7 +45,7 @@ def intel(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> SensorLog
     folder = tmp_path_factory.mktemp("intel")
     source = data_dir / "radish_intel"
     if not source.is_dir():
-        pytest.skip("the log radish-intel is not here")
+        pytest.skip("recorded data not found: the folder of GRAPHSLAM_DATA has no radish_intel/")
     with bz2.open(source / "intel.clf.bz2", "rt") as stream:
         scans = list(itertools.islice((x for x in stream if x.startswith("FLASER ")), 1000))
     (folder / "intel.clf").write_text("".join(scans))
@@ -78,7 +78,7 @@ def test_the_beginning_of_intel_is_mapped_better_than_by_its_odometry(intel: Sen
 def test_hku1_closes_its_loop_in_spite_of_a_yaw_bias(data_dir: Path) -> None:
     """The odometry, degraded by 0.005 rad/s, ends 6 m from where it began; a match into the first segments mends it."""
     if not (data_dir / "lidar3d_hku1").is_dir():
-        pytest.skip("the pack lidar3d-hku1 is not here")
+        pytest.skip("recorded data not found: the folder of GRAPHSLAM_DATA has no lidar3d_hku1/")
     log = load("lidar3d-hku1")
     config = settings(log)
     assert config.steps.yaw_bias == 0.005

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontends.segslam.poses import group_of
 from frontends.segslam.window import bring_up_to_date, look_ahead
+from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry
 from tests.frontends.grid_world import ring
 
@@ -37,7 +37,7 @@ def test_points_ahead_lie_where_the_true_motion_puts_them(dim: int) -> None:
     assert len(near) == 25
     assert np.linalg.norm(near, axis=1).max() <= 3.0
     assert len(ahead.source(0, np.inf)) == len(ahead.window)
-    assert len(look_ahead(steps, 7, 2.0, most=30).window) == 30
+    assert len(ahead.window.thinned(30)) == 30
 
 
 def test_at_the_end_of_the_log_the_window_is_not_full() -> None:

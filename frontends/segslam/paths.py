@@ -1,0 +1,81 @@
+"""Paths of map samples: put together of their segments' (A6), and where they do not meet."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.segslam.sampling import OPEN, MapSample
+from frontends.segslam.segmap import SegMap
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.trajectory import Trajectory
+
+Ints = npt.NDArray[np.int64]
+
+
+def seams(segmap: SegMap, sample: MapSample) -> list[tuple[int, int, Array]]:
+    """Where segments follow each other in time that the sample did not link, and what is missing between them.
+
+    Returns
+    -------
+    list of (a, b, T)
+        Places in the sample of the segment before and the one after, and ``T_bodybefore_bodyafter`` at the boundary
+        they share: the identity if all loops closed exactly.
+    """
+    g, t = segmap.group, segmap.table
+    order = sample.in_time.tolist()
+    found = []
+    for a, b in pairwise(order):
+        if sample.intervals[a, 1] != sample.intervals[b, 0] or OPEN in (sample.segments[a], sample.segments[b]):
+            continue
+        if sample.via[a] == b or sample.via[b] == a:
+            continue
+        before = g.compose(sample.poses[a], t.exit[sample.segments[a]])
+        after = g.compose(sample.poses[b], t.entry[sample.segments[b]])
+        found.append((a, b, g.between(before, after)))
+    return found
+
+
+def concatenate(segmap: SegMap, sample: MapSample, open_path: Array | None = None) -> Trajectory:
+    """The path of a sample in the frame of its root (A6, eq. 11–12).
+
+    A boundary stands in two segments; its pose is that of the exit. Where two fronts of the growth met there is a
+    seam, over which the path jumps by what the loops do not close; see :func:`seams`.
+
+    Parameters
+    ----------
+    segmap : SegMap
+    sample : MapSample
+    open_path : (n, 7) or (n, 3), optional
+        ``T_segment_body`` of an open root, from its start to the step of now; without it the path ends where that
+        begins.
+
+    Raises
+    ------
+    DataError
+        Nothing but an open root whose path is not given.
+    """
+    g = segmap.group
+    steps: list[Ints] = []
+    poses: list[Array] = []
+    last = -1
+    for k in sample.in_time.tolist():
+        i, (a, b) = int(sample.segments[k]), sample.intervals[k]
+        path = open_path if i == OPEN else segmap.table.paths[i]
+        if path is None:
+            continue
+        rows = np.asarray(path, dtype=np.float64)
+        if i == OPEN and len(rows) != b - a + 1:
+            raise DataError("the path of the open segment has the wrong length", got=len(rows), wanted=int(b - a + 1))
+        new = np.arange(a, b + 1)
+        skip = 1 if a == last else 0
+        steps.append(new[skip:].astype(np.int64))
+        poses.append(g.compose(np.broadcast_to(sample.poses[k], rows.shape), rows)[skip:])
+        last = int(b)
+    if not steps:
+        raise DataError("a sample without any path", wanted="a closed segment, or the path of the open one")
+    s = np.concatenate(steps)
+    return Trajectory(segmap.times[s], np.concatenate(poses))
