@@ -38,6 +38,9 @@ class SegmentationConfig:
     """σ of the ranges in the score's log-likelihood [m]."""
     score_beams: int = 600
     """Beams of a window that are cast, at most (evenly thinned)."""
+    score_particles: int = 8
+    """Particles in whose maps they are cast, at most, by weight: where the whole filter decides its mean score counts,
+    and particles differ by less than 0.03 in it."""
     excluded: float = 5.0
     """The score says nothing in the first seconds of a segment, and does not count for its maximum [s]."""
     every: float = 2.0
@@ -65,7 +68,16 @@ class SegmentationConfig:
         _check(
             self,
             "segmentation",
-            positive=("window", "tolerance", "score_sigma", "score_beams", "every", "max_length", "max_seconds"),
+            positive=(
+                "window",
+                "tolerance",
+                "score_sigma",
+                "score_beams",
+                "score_particles",
+                "every",
+                "max_length",
+                "max_seconds",
+            ),
             unit=("score", "relative_score"),
         )
         if self.min_length > self.max_length or self.min_seconds > self.max_seconds:
@@ -125,6 +137,11 @@ class CandidateSearch:
     """… but no more [rad]."""
     starts: int = 6
     """Distinct modes handed to the registration."""
+    least_score: float = 0.7
+    """A place that explains less of the points than this in the search is not registered: what registration accepted
+    later scored 0.85 to 0.97, and places that the robot had not been at 0.54 to 0.63, with a few to 0.84."""
+    score_margin: float = 0.15
+    """… and none that scores so much less than the best."""
     source_radius: float = 15.0
     """Points of the look-ahead window beyond this are left out [m]."""
     source_points: int = 300
@@ -150,6 +167,7 @@ class CandidateSearch:
                 "most_searches",
                 "same_start",
             ),
+            unit=("least_score", "score_margin"),
         )
 
     def yaw_width(self, length: float) -> float:
@@ -169,6 +187,9 @@ class ChoiceConfig:
     """… and no farther from it than this many σ of the path-length model."""
     margin: float = 0.03
     """A second mode must be worse by this share of the points …"""
+    rivals: float = 0.1
+    """In the maps that other particles made of the same steps only modes are tried that in the first were worse by no
+    more than this; less than ``margin`` would hide second modes."""
     mode_distance: float = 1.5
     """… if it is farther off than this [m]."""
     fitness_sigma: float = 0.15
@@ -194,7 +215,7 @@ class ChoiceConfig:
                 "every", "shift", "fitness_sigma", "error_sigma", "spread_sigma", "null_weight", "position_sigma",
                 "angle_sigma",
             ),
-            unit=("margin",),
+            unit=("margin", "rivals"),
         )  # fmt: skip
         if self.method not in ("registration", "localisation", "both"):
             raise ConfigError(f"choice.method = {self.method!r}; known: registration, localisation, both")

@@ -19,10 +19,10 @@ import numpy.typing as npt
 from frontends.segslam.choice import NULL, Proposal, judge
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.localisation import localise
-from frontends.segslam.sampling import MapSample, grow, root_of_particle
+from frontends.segslam.sampling import grow, root_of_particle
 from frontends.segslam.segmap import NEW, Entry, SegMap
 from frontends.segslam.window import Ahead
-from frontends.segslam.winnowing import Candidates, Winnowed, winnow
+from frontends.segslam.winnowing import Candidates, Winnowed, winnow_all
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
@@ -83,14 +83,6 @@ class Attempt:
         }
 
 
-@dataclass(slots=True)
-class _Map:
-    """What a closed map is matched by: made when it is first asked for."""
-
-    target: Target | None
-    field: SearchField | None
-
-
 class Matcher:
     """Looks for re-entries.
 
@@ -107,7 +99,9 @@ class Matcher:
         self.segmap, self.config, self.max_range, self.threads = segmap, config, max_range, threads
         self.winnowed = Winnowed()
         self.seconds = 0.0
-        self._maps: dict[int, _Map] = {}
+        # what a closed map is matched by: made when it is first asked for
+        self._targets: dict[int, Target | None] = {}
+        self._fields: dict[tuple[int, int], SearchField] = {}  # one of all particles' maps of the same steps
 
     def attempt(self, step: int, poses: Array, ahead: Ahead, seed: SeedTree) -> Attempt:
         """Try to match all particles, and draw.
@@ -168,28 +162,24 @@ class Matcher:
     def _candidates(self, step: int, poses: Array, seed: SeedTree) -> list[Candidates]:
         """What each particle asks for. Particles that came the same way share a map sample."""
         segmap, config = self.segmap, self.config
-        samples: dict[tuple[int, int, int], MapSample] = {}
-        held: dict[int, frozenset[int]] = {}
+        groups: dict[tuple[int, int, int], list[int]] = {}
+        for i, entry in enumerate(segmap.entries):
+            groups.setdefault((id(entry), int(segmap.start[i]), int(segmap.previous[i])), []).append(i)
         weights = segmap.table.weight[: len(segmap)]
-        out = []
-        for i, pose in enumerate(poses):
-            entry = segmap.entries[i]
-            key = (id(entry), int(segmap.start[i]), int(segmap.previous[i]))
-            if key not in samples:
-                rng = seed.child("sample", len(samples)).generator()
-                samples[key] = grow(
-                    segmap, root_of_particle(segmap, i, step), rng, weights=weights,
-                    local_length=config.winnowing.local_length,
-                )  # fmt: skip
-            origin = -1 if entry is None or entry.kind == NEW else entry.source
-            if origin not in held:
-                held[origin] = self._held(origin)
-            out.append(
-                winnow(
-                    segmap, samples[key], pose, step, config.winnowing, exclude=held[origin], tally=self.winnowed
-                )
+        out: dict[int, Candidates] = {}
+        for number, members in enumerate(groups.values()):
+            rng = seed.child("sample", number).generator()
+            sample = grow(
+                segmap, root_of_particle(segmap, members[0], step), rng, weights=weights,
+                local_length=config.winnowing.local_length,
             )  # fmt: skip
-        return out
+            entry = segmap.entries[members[0]]
+            held = self._held(-1 if entry is None or entry.kind == NEW else entry.source)
+            found = winnow_all(
+                segmap, sample, poses[members], step, config.winnowing, exclude=held, tally=self.winnowed
+            )  # fmt: skip
+            out.update(zip(members, found))
+        return [out[i] for i in range(len(poses))]
 
     def _held(self, source: int) -> frozenset[int]:
         """Segments of whose scans every one is in the map of ``source`` already."""
@@ -210,45 +200,68 @@ class Matcher:
         cloud: Target | None = None
         results: dict[int, list[Registration]] = {}
         done: set[tuple[int, ...]] = set()
-        good: list[Array] = []  # accepted in some map: starts for the others, whose frames are much the same
-        registrations = 0
+        modes: dict[int, list[tuple[Array, float, list[Array]]]] = {}  # of maps that begin at one step
+        searches = registrations = 0
         for c in asked:
             for segment, T, sigma, way in zip(c.segments.tolist(), c.T_map_body, c.sigma, c.travelled):
                 m = int(self.segmap.table.map[segment])
                 key = (m, *np.rint(T[:2] / s.same_start).astype(int).tolist(), round(float(heading_of(T)) / 0.1))
                 if key in done or len(done) >= s.most_searches:
                     continue
-                known = self._map(m, segment)
-                if known.target is None or known.field is None:
+                target = self._target(m, segment)
+                if target is None:
                     continue
                 done.add(key)
-                cloud = Target(source, neighbours=known.target.neighbours) if cloud is None else cloud
+                cloud = Target(source, neighbours=target.neighbours) if cloud is None else cloud
                 radius = min(s.max_radius, 2.5 * float(sigma))
-                half = [radius, radius, *([] if planar else [s.height]), s.yaw_width(float(way))]
-                steps = [s.grid, s.grid, *([] if planar else [s.grid]), s.yaw_step]
-                starts = [p.T for p in correlative_search(source, known.field, T, half, steps, s.starts)]
-                starts += good
-                found = register_starts(cloud, known.target, starts, rules)
+                # particles' maps that begin at one step begin at one place: where the first was found the others are
+                alike = modes.setdefault(self._begin(segment), [])
+                starts = next((f for at, r, f in alike if np.linalg.norm((T - at)[:2]) <= 0.25 * min(r, radius)), None)
+                first = starts is None
+                if starts is None:
+                    half = [radius, radius, *([] if planar else [s.height]), s.yaw_width(float(way))]
+                    steps = [s.grid, s.grid, *([] if planar else [s.grid]), s.yaw_step]
+                    starts = self._search(source, segment, T, half, steps)
+                    searches += 1
+                found = register_starts(cloud, target, starts, rules)
                 registrations += len(starts)
+                if first:
+                    top = found[0].best_fitness if found else 0.0
+                    near = [r.T_target_source for r in found if r.best_fitness >= top - self.config.choice.rivals]
+                    alike.append((T, radius, near))
                 results[m] = distinct(results.get(m, []) + found)
-                good += [r.T_target_source for r in found if r.accepted][:1]
-        return results, len(done), registrations
+        return results, searches, registrations
 
-    def _map(self, m: int, segment: int) -> _Map:
-        if m not in self._maps:
-            grid, _ = self.segmap.map_of(segment)
-            points = grid.binned_cloud(self.config.search.cloud_level).points
-            occupied = grid.occupied_cloud()
-            enough = len(points) >= self.config.registration.least_points
-            self._maps[m] = _Map(
-                target=Target(points) if enough else None,
-                field=SearchField(occupied, cell=0.5 * self.config.search.grid) if enough else None,
-            )
-        return self._maps[m]
+    def _begin(self, segment: int) -> int:
+        """Step at which the map that a segment works in was begun."""
+        t = self.segmap.table
+        while t.source[segment] >= 0:
+            segment = int(t.source[segment])
+        return int(t.start[segment])
+
+    def _target(self, m: int, segment: int) -> Target | None:
+        """The map's cloud, None if there is too little of it."""
+        if m not in self._targets:
+            points = self.segmap.map_of(segment)[0].binned_cloud(self.config.search.cloud_level).points
+            self._targets[m] = Target(points) if len(points) >= self.config.registration.least_points else None
+        return self._targets[m]
+
+    def _search(self, source: Array, segment: int, T: Array, half: list[float], steps: list[float]) -> list[Array]:
+        """Starts of registrations: the distinct best places, if any is good enough to be the true one."""
+        s = self.config.search
+        known = (self._begin(segment), int(self.segmap.table.end[segment]))
+        if known not in self._fields:
+            self._fields[known] = SearchField(self.segmap.map_of(segment)[0].occupied_cloud(), cell=0.5 * s.grid)
+        found = correlative_search(source, self._fields[known], T, half, steps, s.starts)
+        best = max((p.score for p in found), default=0.0)
+        return [p.T for p in found if p.score >= max(s.least_score, best - s.score_margin)]
 
     def forget(self) -> None:
         """Drop what belongs to maps that are gone."""
-        self._maps = {m: v for m, v in self._maps.items() if self.segmap.maps.grids[m] is not None}
+        segmap = self.segmap
+        self._targets = {m: v for m, v in self._targets.items() if segmap.maps.grids[m] is not None}
+        ends = set(segmap.table.end[segmap.alive].tolist())
+        self._fields = {key: v for key, v in self._fields.items() if key[1] in ends}
 
     # --- what is drawn ---------------------------------------------------------------------------------------
 

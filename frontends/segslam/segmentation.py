@@ -73,16 +73,16 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
     g = group_of(u)
     if len(u) != len(scans):
         raise DataError("a window needs one increment for each scan", got=len(u), wanted=len(scans))
-    T = g.identity
-    points, origins, beams = [np.zeros((0, g.dim))], [np.zeros((0, g.dim))], 0
-    for step, (p, o, returns) in zip(u, scans):
-        T = g.compose(T, step)
-        beams += len(p)
-        ranges = np.linalg.norm(p - o, axis=1)
-        use = np.asarray(returns, dtype=bool) & (ranges < max_range) & (ranges > 0.0)
-        points.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), p[use]))
-        origins.append(g.transform(np.broadcast_to(T, (int(use.sum()), g.size)), o[use]))
-    return Window(points=np.concatenate(points), origins=np.concatenate(origins), beams=beams)
+    if not scans:
+        return Window(points=np.zeros((0, g.dim)), origins=np.zeros((0, g.dim)), beams=0)
+    T = np.empty_like(u)
+    for k, step in enumerate(u):
+        T[k] = step if k == 0 else g.compose(T[k - 1], step)
+    p, o, returns = (np.concatenate(part) for part in zip(*scans))
+    ranges = np.linalg.norm(p - o, axis=1)
+    use = np.asarray(returns, dtype=bool) & (ranges < max_range) & (ranges > 0.0)
+    at = np.repeat(T, [len(scan[0]) for scan in scans], axis=0)[use]
+    return Window(points=g.transform(at, p[use]), origins=g.transform(at, o[use]), beams=len(p))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +158,19 @@ def predictive_score(
         log_likelihood=float(w @ log_p),
         beams=len(window),
     )
+
+
+def few(weights: Array, most: int) -> tuple[npt.NDArray[np.int64], Array]:
+    """Which particles speak for all: at most so many, spread evenly over the weight, and the share of each.
+
+    The weighted mean of anything over them is that over all, but for the spread within one ``most``-th of the weight.
+    """
+    if len(weights) <= most:
+        return np.arange(len(weights), dtype=np.int64), weights
+    at = (np.arange(most) + 0.5) / most * weights.sum()
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), at, side="right"), np.flatnonzero(weights > 0)[-1])
+    rows, counts = np.unique(chosen, return_counts=True)
+    return rows.astype(np.int64), counts / most
 
 
 def motion_error(lengths: ArrayLike, turns: ArrayLike, translation: ArrayLike, rotation: ArrayLike) -> Array:

@@ -23,7 +23,7 @@ from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.matching import Attempt, Matcher
 from frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
 from frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
-from frontends.segslam.segmentation import Decision, Segmenter, predictive_score
+from frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
 from frontends.segslam.window import Ahead, look_ahead
 from frontends.steps import Steps
 from graphslam.core.errors import DataError
@@ -174,11 +174,13 @@ class _Run:
             ahead, p = self._look(k), f.particles
             # half a window at the end of the log would be scored against maxima of whole ones
             if ahead.full:
+                rows, weights = few(p.weights, c.score_particles if together else n)
                 score = predictive_score(
-                    p.grids, p.poses, ahead.window.thinned(c.score_beams), self.steps.max_range, weights=p.weights,
-                    tolerance=c.tolerance, sigma=c.score_sigma, threads=f.config.threads,
+                    [p.grids[i] for i in rows], p.poses[rows], ahead.window.thinned(c.score_beams),
+                    self.steps.max_range, weights=weights, tolerance=c.tolerance, sigma=c.score_sigma,
+                    threads=f.config.threads,
                 )  # fmt: skip
-                share, shares = score.share, score.shares
+                share, shares[rows] = score.share, score.shares
                 self.scores.append(
                     ScoreLine(step=k, share=score.share, log_likelihood=score.log_likelihood, beams=score.beams)
                 )

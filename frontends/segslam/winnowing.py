@@ -60,6 +60,61 @@ class Winnowed:
     surplus: int = 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Segments of a sample that ended long enough ago, and the poses of their paths one after another.
+
+    Parameters
+    ----------
+    place : (c,) int64
+        In the sample.
+    index : (c,) int64
+        In the SegMap.
+    positions : (m, dim)
+        Of all paths, in the frames of their segments.
+    owner : (m,) int64
+        Which of the c segments each belongs to.
+    first : (c,) int64
+        Where each segment's poses begin.
+    way : (m,)
+        From the root's anchor, through the sample [m].
+    sigma : (m,)
+        Of the path-length model [m].
+    """
+
+    place: Ints
+    index: Ints
+    positions: Array
+    owner: Ints
+    first: Ints
+    way: Array
+    sigma: Array
+
+
+def _places(
+    segmap: SegMap, sample: MapSample, step: int, config: WinnowConfig, exclude: frozenset[int] | set[int]
+) -> tuple[_Places | None, int]:
+    """What does not depend on the particle, and how many segments ended too recently."""
+    t = segmap.table
+    place = np.array([k for k, i in enumerate(sample.segments.tolist()) if i != OPEN and i not in exclude], np.int64)
+    if len(place) and sample.segments[0] != OPEN:
+        place = place[place != 0]
+    old = segmap.times[step] - segmap.times[sample.intervals[place, 1]] >= config.gap
+    recent = int(np.sum(~old))
+    place = place[old]
+    if not len(place):
+        return None, recent
+    index = sample.segments[place]
+    paths = [cast(Array, t.paths[i])[:, : segmap.group.dim] for i in index.tolist()]
+    sizes = np.array([len(p) for p in paths])
+    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    owner = np.repeat(np.arange(len(place)), sizes)
+    steps = np.arange(int(sizes.sum())) - first[owner] + t.start[index][owner]
+    L = segmap.path_length
+    way = sample.travelled[place][owner] + np.abs(L[steps] - L[sample.anchor[place]][owner])
+    return _Places(place, index, np.concatenate(paths), owner, first, way, config.drift(way)), recent
+
+
 def winnow(
     segmap: SegMap,
     sample: MapSample,
@@ -70,7 +125,7 @@ def winnow(
     exclude: frozenset[int] | set[int] = frozenset(),
     tally: Winnowed | None = None,
 ) -> Candidates:
-    """Candidates of one particle at one step.
+    """Candidates of one particle at one step; of several that share a sample see :func:`winnow_all`.
 
     Parameters
     ----------
@@ -87,40 +142,64 @@ def winnow(
     tally : Winnowed, optional
         Counts are added.
     """
-    g, t = segmap.group, segmap.table
+    poses = np.asarray(T_root_body, dtype=np.float64)[None]
+    return winnow_all(segmap, sample, poses, step, config, exclude=exclude, tally=tally)[0]
+
+
+def winnow_all(
+    segmap: SegMap,
+    sample: MapSample,
+    T_root_body: ArrayLike,
+    step: int,
+    config: WinnowConfig,
+    *,
+    exclude: frozenset[int] | set[int] = frozenset(),
+    tally: Winnowed | None = None,
+) -> list[Candidates]:
+    """Candidates of particles ``(n, 7)`` or ``(n, 3)`` that share a sample, and what they do not ask for."""
+    T = np.asarray(T_root_body, dtype=np.float64)
     tally = Winnowed() if tally is None else tally
-    place = np.array([k for k, i in enumerate(sample.segments.tolist()) if i != OPEN and i not in exclude], np.int64)
-    if len(place) and sample.segments[0] != OPEN:
-        place = place[place != 0]
     # 1. temporal separation
-    now = segmap.times[step]
-    old = now - segmap.times[sample.intervals[place, 1]] >= config.gap
-    tally.recent += int(np.sum(~old))
-    place = place[old]
-    if not len(place):
-        return _none(segmap)
+    places, recent = _places(segmap, sample, step, config, exclude)
+    tally.recent += recent * len(T)
+    if places is None:
+        return [_none(segmap)] * len(T)
     # 2. spatial proximity: to the paths of all segments at once
-    T_seg_body = g.between(sample.poses[place], np.broadcast_to(T_root_body, (len(place), g.size)))
-    index = sample.segments[place]
-    paths = [cast(Array, t.paths[i])[:, : g.dim] for i in index.tolist()]
-    sizes = np.array([len(p) for p in paths])
-    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    owner = np.repeat(np.arange(len(place)), sizes)
-    d = np.concatenate(paths) - T_seg_body[owner, : g.dim]
-    flat = np.hypot(d[:, 0], d[:, 1])
-    steps = np.arange(len(d)) - first[owner] + t.start[index][owner]
-    L = segmap.path_length
-    way = sample.travelled[place][owner] + np.abs(L[steps] - L[sample.anchor[place]][owner])
-    sigma = config.drift(way)
-    far = flat > config.sigmas * sigma
+    g, c, n = segmap.group, len(places.place), len(T)
+    frames = np.broadcast_to(sample.poses[places.place], (n, c, g.size))
+    T_seg_body = g.between(frames, np.broadcast_to(T[:, None], frames.shape))
+    at = T_seg_body[:, places.owner, : g.dim]
+    flat = np.hypot(places.positions[:, 0] - at[..., 0], places.positions[:, 1] - at[..., 1])
+    measure = flat / places.sigma
+    far = measure > config.sigmas
     if g.dim == 3:
-        far |= np.abs(d[:, 2]) > config.height
-    measure = np.where(far, np.inf, flat / sigma)
-    best = np.array([a + int(np.argmin(measure[a : a + n])) for a, n in zip(first.tolist(), sizes.tolist())])
-    near = np.isfinite(measure[best])
+        far |= np.abs(places.positions[:, 2] - at[..., 2]) > config.height
+    measure[far] = np.inf
+    ends = [*places.first[1:].tolist(), len(places.owner)]
+    nearest = np.stack(
+        [a + np.argmin(measure[:, a:b], axis=1) for a, b in zip(places.first.tolist(), ends)], axis=1
+    )  # (n, c)
+    return [
+        _known(segmap, places, T_seg_body[k], nearest[k], flat[k], measure[k, nearest[k]], config, tally)
+        for k in range(n)
+    ]
+
+
+def _known(
+    segmap: SegMap,
+    places: _Places,
+    T_seg_body: Array,
+    nearest: Ints,
+    flat: Array,
+    measure: Array,
+    config: WinnowConfig,
+    tally: Winnowed,
+) -> Candidates:
+    """3. does the map know the place? Of one particle, nearest first, until there are enough."""
+    g = segmap.group
+    near = np.isfinite(measure)
     tally.far += int(np.sum(~near))
-    rows = [k for k in np.lexsort((index, measure[best])).tolist() if near[k]]
-    # 3. does the map know the place? nearest first, until there are enough
+    rows = [k for k in np.lexsort((places.index, measure)).tolist() if near[k]]
     chosen: list[int] = []
     known: list[int] = []
     poses: list[Array] = []
@@ -128,10 +207,10 @@ def winnow(
         if len(chosen) == config.keep:
             tally.surplus += len(rows) - tried
             break
-        grid, T_map = segmap.map_of(int(index[k]))
+        grid, T_map = segmap.map_of(int(places.index[k]))
         T = g.compose(T_map, T_seg_body[k])
         half = np.full(g.dim, 0.5 * config.near)
-        half[:2] += config.sigmas * sigma[best[k]]
+        half[:2] += config.sigmas * places.sigma[nearest[k]]
         half[2:] += config.height
         count = int(box_query(grid, (T[: g.dim] - half)[None], (T[: g.dim] + half)[None]).known[0])
         if count < config.known:
@@ -142,13 +221,13 @@ def winnow(
         poses.append(T)
     if not chosen:
         return _none(segmap)
-    at = best[chosen]
+    at = nearest[chosen]
     return Candidates(
-        segments=index[chosen],
+        segments=places.index[chosen],
         T_map_body=np.stack(poses),
         distance=flat[at],
-        travelled=way[at],
-        sigma=sigma[at],
+        travelled=places.way[at],
+        sigma=places.sigma[at],
         known=np.array(known, np.int64),
     )
 

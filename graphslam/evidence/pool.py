@@ -107,17 +107,13 @@ class GridPool:
         more_nodes = nodes - (len(self.node_ref) - c[NODES_USED] + c[NODES_FREE])
         more_bricks = bricks - (len(self.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
         if more_nodes > 0:
-            n = len(self.node_ref) + max(int(more_nodes), len(self.node_ref) // 2)
-            grown = tuple(
-                _longer(a, n, c[NODES_USED]) for a in (self.children, self.node_ref, self.node_occupied, self.node_free)
+            self.children, self.node_ref, self.node_occupied, self.node_free = _grown(
+                (self.children, self.node_ref, self.node_occupied, self.node_free), int(more_nodes), c[NODES_USED]
             )
-            self.children, self.node_ref, self.node_occupied, self.node_free = grown
         if more_bricks > 0:
-            n = len(self.brick_ref) + max(int(more_bricks), len(self.brick_ref) // 2)
-            grown = tuple(
-                _longer(a, n, c[BRICKS_USED]) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free)
+            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = _grown(
+                (self.bricks, self.brick_ref, self.brick_lines, self.brick_free), int(more_bricks), c[BRICKS_USED]
             )
-            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = grown
 
     @property
     def used_nodes(self) -> int:
@@ -208,6 +204,19 @@ class GridPool:
             f"GridPool(levels={self.levels}): {self.used_nodes} nodes, {self.used_bricks} bricks, "
             f"{self.used_bytes / 1e6:.1f} MB"
         )
+
+
+def _grown(arrays: tuple[Any, ...], more: int, used: int) -> tuple[Any, ...]:
+    """All arrays with room for ``more`` rows at least; far more where the machine has it.
+
+    What is set aside costs nothing before it is used, while every growth is a copy into memory that was never touched,
+    which can be dearer than all that is done in it.
+    """
+    size = len(arrays[1])
+    try:
+        return tuple(_longer(a, size + max(more, 3 * size), used) for a in arrays)
+    except MemoryError:
+        return tuple(_longer(a, size + max(more, size // 4), used) for a in arrays)
 
 
 def _longer(a: npt.NDArray[Any], n: int, used: int) -> npt.NDArray[Any]:

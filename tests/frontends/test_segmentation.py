@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from frontends.segslam.config import SegmentationConfig, SegSlamConfig
-from frontends.segslam.segmentation import Segmenter, gather_window, motion_error, predictive_score
+from frontends.segslam.segmentation import Segmenter, few, gather_window, motion_error, predictive_score
 from graphslam.app.config import build
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
@@ -227,3 +227,22 @@ def test_se3_windows_score_in_three_dimensions() -> None:
     w = gather_window(UP[None], [scan], 20.0)
     assert predictive_score([grid], tilted[None], w, 20.0).share > 0.97
     assert predictive_score([grid], UP[None], w, 20.0).share < 0.75
+
+
+def test_few_particles_speak_for_all() -> None:
+    rng = np.random.default_rng(3)
+    w = rng.dirichlet(np.full(40, 0.3))
+    rows, shares = few(w, 8)
+    assert len(rows) <= 8
+    assert shares.sum() == pytest.approx(1.0)
+    assert np.all(np.diff(rows) > 0)
+    # nobody speaks for more than its own weight and what lies within an eighth of it
+    assert np.all(np.abs(shares - w[rows]) <= 2.0 / 8)
+    x = np.sort(rng.normal(size=40))  # what changes slowly from one to the next is told well
+    assert abs(shares @ x[rows] - w @ x) < 0.5 * x.std()
+    everybody, same = few(w, 40)
+    np.testing.assert_array_equal(everybody, np.arange(40))
+    np.testing.assert_array_equal(same, w)
+    alone, all_of_it = few(np.array([0.0, 1.0, 0.0]), 2)
+    assert alone.tolist() == [1]
+    assert all_of_it.tolist() == [1.0]
