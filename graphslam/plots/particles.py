@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 
 from frontends.landmarks.filter import ParticleSet
 from frontends.rbpf_grid import RbpfResult
+from frontends.segslam.result import SegSlamResult
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import Truth
@@ -202,20 +204,28 @@ def plot_histories(ax: Axes | None, sets: Mapping[str, ParticleSet], *, title: s
 
 
 def plot_ancestry(
-    result: RbpfResult, ax: Axes | None, segment_boundaries: Sequence[float] | None = None, *, title: str | None = None
+    result: RbpfResult | SegSlamResult,
+    ax: Axes | None,
+    segment_boundaries: Sequence[float] | None = None,
+    *,
+    since: float | None = None,
+    title: str | None = None,
 ) -> Axes:
     """Who descends from whom: particles over time, joined to those they went on from (SegSLAM Fig. 2–3).
 
     Parameters
     ----------
-    result : RbpfResult
+    result : RbpfResult or SegSlamResult
         Its run must have kept the lineages that died out (``prune_every=0``) for them to be shown.
     ax : Axes or None
     segment_boundaries : sequence of float, optional
         Times [s] at which segments end. Only within a segment does it matter that the particles have met: across a
         boundary any of them may follow any other.
+    since : float, optional
+        Time [s] at which the picture begins; default the start.
     """
-    tree, times = result.ancestry, np.asarray(result.times) - result.times[0]
+    stamps = np.asarray(result.times if isinstance(result, RbpfResult) else result.steps.times)
+    tree, times = result.ancestry, stamps - stamps[0]
     ax = style.new_axes(ax, (8.0, 3.6))
     edges, alive = tree.links()
     # from the particle it went on from, one step earlier, to the particle itself
@@ -233,9 +243,9 @@ def plot_ancestry(
         ax.plot(times[met], who, "o", color=style.VERMILION, ms=6, mec="white", mew=0.6, zorder=4,
                 label=f"their last common ancestor, {times[-1] - times[met]:.1f} s back")  # fmt: skip
     for k, t in enumerate(segment_boundaries or ()):
-        ax.axvline(t - result.times[0], color=style.BLACK, lw=0.9, ls="--", zorder=3,
+        ax.axvline(t - stamps[0], color=style.BLACK, lw=0.9, ls="--", zorder=3,
                    label="segments end" if k == 0 else None)  # fmt: skip
-    ax.set_xlim(0.0, max(float(times[-1]), 1e-9))
+    ax.set_xlim(0.0 if since is None else since - stamps[0], max(float(times[-1]), 1e-9))
     ax.set_ylim(-0.7, tree.particles - 0.3)
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("time [s]")
@@ -273,6 +283,50 @@ def plot_effective(result: RbpfResult, ax: Axes | None, *, title: str | None = N
         ax.set_title(title, fontsize="medium")
     style.legend(ax, outside=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncol=3)
     return ax
+
+
+def plot_pasts(rbpf: RbpfResult, segslam: SegSlamResult, ax: Axes | None, *, title: str | None = None) -> Axes:
+    """How many different pasts are left of each time: of one filter, and in a SegMap (SegSLAM Fig. 2–3 in numbers).
+
+    A filter remembers of each step as many pasts as its particles have ancestors there. Of a SegMap any segment of an
+    interval may follow any of the one before (A6), so the pasts of all intervals multiply.
+
+    Parameters
+    ----------
+    rbpf : RbpfResult
+    segslam : SegSlamResult
+        Of the same steps.
+    ax : Axes or None
+    """
+    stamps = np.asarray(segslam.steps.times)
+    if len(rbpf.times) != len(stamps):
+        raise DataError("the two runs have different steps", got=len(rbpf.times), wanted=len(stamps))
+    ax = style.new_axes(ax, (8.0, 3.2))
+    segmap, times = segslam.segmap, stamps - stamps[0]
+    intervals = segmap.intervals()
+    counts = np.array([len(segmap.in_interval((int(a), int(b)))) for a, b in intervals])
+    for k, ((a, b), n) in enumerate(zip(intervals, counts)):
+        label = f"segments of each interval; together {_power(counts)} ways through the SegMap"
+        ax.fill_between(times[[a, b]], 0, n, color=style.SKY, alpha=0.45, lw=0, label=label if k == 0 else None)
+        ax.plot(times[[a, b]], [n, n], color=style.ESTIMATE, lw=1.6)
+        ax.axvline(times[b], color=style.BLACK, lw=0.6, ls="--") if k + 1 < len(counts) else None
+    ax.step(times, rbpf.ancestry.survivors(), where="mid", color=style.VERMILION, lw=1.4,
+            label="RBPF: ancestors of its last particles")  # fmt: skip
+    ax.set_xlim(0.0, max(float(times[-1]), 1e-9))
+    ax.set_ylim(0.0, 1.1 * max(int(counts.max()), rbpf.ancestry.particles))
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("different pasts")
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax, outside=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncol=2)
+    return ax
+
+
+def _power(counts: npt.NDArray[np.int64]) -> str:
+    """The product of numbers, whole while it is small."""
+    exponent = float(np.sum(np.log10(counts)))
+    return f"{round(10**exponent):,}" if exponent < 5 else f"about $10^{{{exponent:.0f}}}$"
 
 
 def histories_left(particles: ParticleSet) -> Array:

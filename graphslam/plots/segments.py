@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -153,9 +154,18 @@ def plot_segments(
     return ax
 
 
-def sample_paths(segmap: SegMap, sample: MapSample) -> tuple[list[Array], list[Tie], list[str]]:
-    """Paths of the closed segments of a map sample in the frame of its root, in the order of time, for
-    :func:`plot_segments`; the matches between them; and their labels.
+def sample_paths(
+    segmap: SegMap, sample: MapSample, *, frame: Literal["root", "first"] = "root"
+) -> tuple[list[Array], list[Tie], list[str]]:
+    """Paths of the closed segments of a map sample, in the order of time, for :func:`plot_segments`; the matches
+    between them; and their labels.
+
+    Parameters
+    ----------
+    segmap : SegMap
+    sample : MapSample
+    frame : {"root", "first"}
+        In the frame of the sample's root, or of its first segment in time.
 
     Returns
     -------
@@ -166,6 +176,12 @@ def sample_paths(segmap: SegMap, sample: MapSample) -> tuple[list[Array], list[T
         Number in time, with "m" where an older map was entered.
     """
     g, t = segmap.group, segmap.table
+    if frame not in ("root", "first"):
+        raise ConfigError(f"frame {frame!r} of a map sample; known: root, first")
+    poses = sample.poses
+    if frame == "first":
+        first = g.inverse(poses[int(sample.in_time[0])])
+        poses = g.compose(np.broadcast_to(first, poses.shape), poses)
     place = {int(i): k for k, i in enumerate(sample.segments.tolist()) if i != OPEN}
     paths: list[Array] = []
     ties: list[Tie] = []
@@ -175,13 +191,13 @@ def sample_paths(segmap: SegMap, sample: MapSample) -> tuple[list[Array], list[T
         if i == OPEN:
             continue
         s = segmap[i]
-        paths.append(_placed(sample.poses[k], s.path))
+        paths.append(_placed(poses[k], s.path))
         labels.append(f"{len(labels)}{'m' if s.kind == KINDS[MATCH] else ''}")
         if s.kind != KINDS[MATCH] or s.source not in place:
             continue
         source = segmap[s.source]
         seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
-        at = sample.poses[place[s.source]]
+        at = poses[place[s.source]]
         nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
         ties.append(Tie(paths[-1][0], _placed(at, nearest[None])[0]))
     return paths, ties, labels
@@ -194,6 +210,7 @@ def plot_samples(
     best: int | None = None,
     truth: Path | None = None,
     plane: str = "xy",
+    what: str = "map sample",
     title: str | None = None,
 ) -> Axes:
     """Map samples over each other: where they agree, the map is sure.
@@ -207,6 +224,8 @@ def plot_samples(
         The one to set off, as that of least entropy.
     truth : Trajectory or (n, dim), optional
     plane : {"xy", "xz", "yz"}
+    what : str
+        Name of one of them, in the legend.
     """
     if not trajectories:
         raise DataError("no sample to draw")
@@ -217,7 +236,7 @@ def plot_samples(
         p = _positions(path, max(i, j))
         if k != best:
             ax.plot(p[:, i], p[:, j], color=style.SKY, lw=0.7, alpha=max(0.12, min(1.0, 4.0 / n)), zorder=2)
-    ax.plot([], [], color=style.SKY, lw=1.2, label=f"{n} map sample{'s' if n != 1 else ''}")
+    ax.plot([], [], color=style.SKY, lw=1.2, label=f"{n} {what}{'s' if n != 1 else ''}")
     if best is not None:
         p = _positions(trajectories[best], max(i, j))
         ax.plot(p[:, i], p[:, j], color=style.ESTIMATE, lw=1.5, label="the best of them", zorder=3)

@@ -99,6 +99,8 @@ def plot_by_particles(
     if log:
         ax.set_yscale("log")
         ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        # less than a decade has one power of ten, if any: 2 and 5 are named as well
+        ax.yaxis.set_minor_formatter(FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "25" else ""))
     ax.set_xlabel("particles")
     ax.set_ylabel(label)
     if title:

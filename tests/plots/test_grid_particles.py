@@ -1,4 +1,4 @@
-"""Figures of an RBPF run: every edge of the tree is drawn, those that died out in another colour."""
+"""Figures of RBPF and SegSLAM runs: every edge of the tree is drawn, those that died out in another colour."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from matplotlib.collections import LineCollection
 
 from frontends.grid_config import GridFilterConfig
 from frontends.rbpf_grid import RbpfResult, run_rbpf
+from frontends.segslam.config import SegmentationConfig, SegSlamConfig
+from frontends.segslam.segslam import run_segslam
+from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
-from graphslam.plots.particles import plot_ancestry, plot_effective
+from graphslam.plots.particles import plot_ancestry, plot_effective, plot_pasts
 from tests.frontends.grid_world import ring
 
 
@@ -40,6 +43,33 @@ def test_effective_shows_every_step_and_every_resampling(result: RbpfResult) -> 
     assert np.array_equal(by_label["effective, before resampling"].get_ydata(), result.effective)
     assert len(by_label["resampled"].get_xdata()) == result.tally.resamplings > 0
     assert np.array_equal(by_label["ancestors of the last particles"].get_ydata(), result.ancestry.survivors())
+    plt.close("all")
+
+
+def test_ancestry_of_segments_begins_where_it_is_asked_to_and_their_pasts_are_counted(result: RbpfResult) -> None:
+    steps = ring(2, 2, length=16.0, beams=40)
+    often = SegmentationConfig(period=8.0, window=0.8, min_seconds=2.0, min_length=1.0, excluded=1.0)
+    segslam = run_segslam(
+        steps, GridFilterConfig(particles=6), SegSlamConfig(segmentation=often), SeedTree(0), prune_every=0
+    )
+    ends = [float(steps.times[b.step]) for b in segslam.boundaries[:-1]]
+    assert ends
+    ax = plot_ancestry(segslam, None, ends, since=float(steps.times[0]) + 5.0)
+    assert ax.get_xlim() == pytest.approx((5.0, float(steps.times[-1] - steps.times[0])))
+    drawn = [c for c in ax.collections if isinstance(c, LineCollection)]
+    assert sum(len(c.get_segments()) for c in drawn) == 6 * (len(steps) - 1)
+
+    ax = plot_pasts(result, segslam, None)
+    intervals = segslam.segmap.intervals()
+    counts = [len(segslam.segmap.in_interval((int(a), int(b)))) for a, b in intervals]
+    flat = [line for line in ax.lines if len(line.get_xdata()) == 2 and line.get_linestyle() == "-"]
+    assert [int(line.get_ydata()[0]) for line in flat] == counts
+    np.testing.assert_array_equal(ax.lines[-1].get_ydata(), result.ancestry.survivors())
+    ways = next(t.get_text() for t in ax.get_legend().get_texts() if "ways" in t.get_text())
+    assert (f"{np.prod(counts):,} ways" in ways) == (np.prod(counts) < 1e5)
+    short = run_rbpf(ring(2, 2, length=3.0, beams=8), GridFilterConfig(particles=1), SeedTree(0))
+    with pytest.raises(DataError, match="different steps"):
+        plot_pasts(short, segslam, None)
     plt.close("all")
 
 

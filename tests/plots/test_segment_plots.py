@@ -69,6 +69,16 @@ def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> No
     k = sample.segments.tolist().index(0)
     np.testing.assert_allclose(ties[0].there, se2_compose(sample.poses[k], m[0].path[-1])[:2], atol=1e-12)
     np.testing.assert_allclose(ties[0].here, [1.9, 2.1], atol=1e-12)
+    # the root is the last segment: seen from the first, everything is moved as one, and the first stands at the origin
+    early, first_ties, same = sample_paths(m, sample, frame="first")
+    assert same == labels
+    np.testing.assert_allclose(early[0], m[0].path[:, :2], atol=1e-12)
+    moved = sample.poses[k]
+    for here, there in zip([*early, first_ties[0].there[None]], [*paths, ties[0].there[None]]):
+        back = se2_compose(np.broadcast_to(moved, (len(here), 3)), np.column_stack([here, np.zeros(len(here))]))
+        np.testing.assert_allclose(back[:, :2], there, atol=1e-12)
+    with pytest.raises(ConfigError, match="frame"):
+        sample_paths(m, sample, frame="last")  # type: ignore[arg-type]
     ax = plot_segments(None, paths, ties=ties, labels=labels, truth=whole)
     assert "matches (1)" in texts(ax)
     assert {t.get_text() for t in ax.texts} == set(labels)
@@ -100,6 +110,7 @@ def test_samples_lie_over_each_other() -> None:
     assert plot_samples(ax, paths, best=2, truth=paths[0], title="five") is ax
     np.testing.assert_array_equal(ax.lines[-2].get_xydata(), paths[2])
     assert texts(ax) == ["5 map samples", "the best of them", "truth"]
+    assert texts(plot_samples(None, paths, what="path")) == ["5 paths"]
     plt.close("all")
 
 

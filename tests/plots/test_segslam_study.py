@@ -34,6 +34,15 @@ def test_curves_runs_and_the_paper_are_where_they_belong() -> None:
     plt.close(ax.figure)
 
 
+def test_an_axis_of_less_than_a_decade_is_numbered() -> None:
+    ax = plot_by_particles(
+        None, {"rbpf": Curve(particles=np.array([1.0, 5.0]), values=np.array([0.15, 0.6]))}, label="x"
+    )
+    ax.figure.canvas.draw()
+    assert {t.get_text() for t in ax.get_yticklabels(minor=True)} == {"", "0.2", "0.5"}
+    plt.close(ax.figure)
+
+
 def test_nothing_to_draw_is_refused() -> None:
     with pytest.raises(DataError):
         plot_by_particles(None, {"rbpf": Curve(particles=np.zeros(0), values=np.zeros(0))}, label="x")

@@ -1,0 +1,91 @@
+"""Several paths over each other, with what they claim to know, in two or three dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array, rotation2
+from graphslam.core.se3 import quat_to_matrix
+from graphslam.core.trajectory import Trajectory
+from graphslam.plots import style
+from graphslam.plots.map import plot_ellipses
+
+_COLOURS = {"dead reckoning": style.DEAD_RECKONING, "RBPF": style.VERMILION, "SegSLAM": style.ESTIMATE}
+
+
+def position_covariances(poses: Array, covariances: Array) -> Array:
+    """Covariances of positions ``(n, 2, 2)`` or ``(n, 3, 3)`` in the axes of the frame the poses are in.
+
+    Parameters
+    ----------
+    poses : (n, 3) or (n, 7)
+    covariances : (n, 3, 3) or (n, 6, 6)
+        Right tangents.
+    """
+    if poses.shape[-1] == 3:
+        R, C = rotation2(poses[..., 2]), covariances[..., :2, :2]
+    else:
+        R, C = quat_to_matrix(poses[..., 3:]), covariances[..., 3:, 3:]
+    return np.asarray(R @ C @ np.swapaxes(R, -1, -2))
+
+
+def plot_paths(
+    ax: Axes | None,
+    paths: Mapping[str, Trajectory],
+    *,
+    truth: Trajectory | Array | None = None,
+    ellipses: int = 8,
+    confidence: float = 0.95,
+    plane: str = "xy",
+    title: str | None = None,
+) -> Axes:
+    """Paths in one frame; nothing is aligned.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    paths : mapping of label to Trajectory
+        "dead reckoning", "RBPF" and "SegSLAM" have colours of their own.
+    truth : Trajectory or (n, ≥ dim), optional
+    ellipses : int
+        Of each path that has covariances, spread over its length.
+    confidence : float
+        Of the ellipses.
+    plane : {"xy", "xz", "yz"}
+        Seen from above, or from the side.
+
+    Raises
+    ------
+    DataError
+        No path, or one without that plane.
+    """
+    if plane not in ("xy", "xz", "yz"):
+        raise ConfigError(f"plane {plane!r}; known: xy, xz, yz")
+    ij = ["xyz".index(c) for c in plane]
+    if not paths or any(p.dim <= max(ij) for p in paths.values()):
+        raise DataError("no paths to draw in this plane", got=list(paths), wanted=plane)
+    ax = style.new_axes(ax)
+    if truth is not None:
+        t = np.asarray(truth.positions if isinstance(truth, Trajectory) else truth)[:, ij]
+        ax.plot(t[:, 0], t[:, 1], color=style.TRUTH, lw=1.0, ls="--", label="truth", zorder=4)
+        ax.plot(*t[-1], "x", color=style.TRUTH, ms=7, mew=1.6, zorder=5)
+    for k, (label, path) in enumerate(paths.items()):
+        colour = _COLOURS.get(label, style.colour(k))
+        p = path.positions[:, ij]
+        ax.plot(p[:, 0], p[:, 1], color=colour, lw=1.5, label=label, zorder=3)
+        ax.plot(*p[-1], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=6, mec="white", mew=0.7, zorder=5)
+        if path.covariances is None or ellipses < 1:
+            continue
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+        at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ellipses + 1)[1:]).clip(0, len(p) - 1))
+        P = position_covariances(path.poses[at], path.covariances[at])[:, ij][:, :, ij]
+        plot_ellipses(ax, p[at], P, confidence=confidence, colour=colour, label=f"{label}, {confidence:.0%}")
+    style.metric_axes(ax, *plane)
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax)
+    return ax

@@ -1,0 +1,125 @@
+"""How sure segments are of where they end, and how far off they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from frontends.segslam.covariance import Nees
+from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array
+from graphslam.core.submap import Submap
+from graphslam.plots import style
+from graphslam.plots.map import plot_ellipses
+from graphslam.plots.paths import position_covariances
+
+_COLOURS = (style.ESTIMATE, style.PURPLE, style.GREEN)
+
+
+def plot_segment_exit(
+    ax: Axes | None,
+    handovers: Mapping[str, Submap],
+    *,
+    exits: Array | None = None,
+    weights: Array | None = None,
+    truth: Array | None = None,
+    confidence: float = 0.95,
+    title: str | None = None,
+) -> Axes:
+    """Where a segment ends, from above, in the frame of its own start: particles, Gaussians, truth.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    handovers : mapping of label to Submap
+        Of one segment, with different covariances.
+    exits : (n, 7) or (n, 3), optional
+        Of the particles, in the same frame.
+    weights : (n,), optional
+        The area of a dot grows with them.
+    truth : (7,) or (3,), optional
+    confidence : float
+        Of the ellipses.
+
+    Raises
+    ------
+    DataError
+        Nothing to draw.
+    """
+    if not handovers:
+        raise DataError("no submap to draw")
+    ax = style.new_axes(ax, (5.5, 4.5))
+    if exits is not None:
+        w = np.full(len(exits), 1.0 / len(exits)) if weights is None else weights
+        area = np.clip(20.0 * len(exits) * w, 3.0, 90.0)
+        ax.scatter(exits[:, 0], exits[:, 1], s=area, color=style.GREY, alpha=0.6, lw=0, zorder=2,
+                   label=f"{len(exits)} segments of the interval")  # fmt: skip
+    for k, (label, submap) in enumerate(handovers.items()):
+        pose, colour = submap.exit_pose[None], _COLOURS[k % len(_COLOURS)]
+        P = position_covariances(pose, submap.exit_covariance[None])[:, :2, :2]
+        plot_ellipses(ax, pose[:, :2], P, confidence=confidence, colour=colour, alpha=0.10,
+                      label=f"{label}, {confidence:.0%}")  # fmt: skip
+        size = 1.2 * np.sqrt(chi2_quantile(confidence, 2) * np.diagonal(P[0]))  # ellipses do not set the limits
+        ax.update_datalim([pose[0, :2] - size, pose[0, :2] + size])
+        ax.plot(*pose[0, :2], "o", color=colour, ms=4, mec="white", mew=0.5, zorder=4)
+    if truth is not None:
+        ax.plot(*truth[:2], "x", color=style.TRUTH, ms=9, mew=1.8, label="truth", zorder=5)
+    ax.autoscale_view()
+    style.metric_axes(ax)
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax)
+    return ax
+
+
+def plot_exit_nees(
+    ax: Axes | None, scores: Mapping[str, Nees], *, confidence: float = 0.95, title: str | None = None
+) -> Axes:
+    """Squared error of every segment's exit in units of its covariance, for several covariances (log scale).
+
+    Honest ones scatter about 1 and leave the grey band, between the quantiles of a single χ², once in twenty times.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    scores : mapping of label to Nees
+        Of the same segments, in order.
+    confidence : float
+        Of the band.
+
+    Raises
+    ------
+    DataError
+        Nothing to draw, or different segments.
+    """
+    lengths = {len(s.values) for s in scores.values()}
+    if len(lengths) != 1 or lengths == {0}:
+        raise DataError("no exits to draw, or different ones", got=sorted(lengths), wanted="as many of each")
+    ax = style.new_axes(ax, (7.0, 3.4))
+    n = lengths.pop()
+    dof = next(iter(scores.values())).dof
+    tail = 0.5 * (1.0 - confidence)
+    low, high = chi2_quantile(tail, dof) / dof, chi2_quantile(1.0 - tail, dof) / dof
+    ax.axhspan(low, high, color=style.BOUNDS, alpha=0.6, lw=0, zorder=0, label=f"honest, {confidence:.0%}")
+    ax.axhline(1.0, color=style.GREY, lw=0.7, zorder=1)
+    x = np.arange(n)
+    for k, (label, s) in enumerate(scores.items()):
+        y = np.maximum(s.values / s.dof, 1e-3)
+        text = (
+            f"{label}: mean {s.per_dof:,.1f}, {int(np.sum(s.values <= chi2_quantile(confidence, dof)))} of {n} inside"
+        )
+        ax.vlines(x + 0.12 * k, 1.0, y, color=_COLOURS[k % len(_COLOURS)], lw=1.2, alpha=0.6, zorder=2)
+        ax.plot(x + 0.12 * k, y, style.MARKERS[k % len(style.MARKERS)], color=_COLOURS[k % len(_COLOURS)], ms=5.5,
+                label=text, zorder=3)  # fmt: skip
+    ax.set_yscale("log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("segment of the settled chain")
+    ax.set_ylabel("NEES / degree of freedom")
+    if title:
+        ax.set_title(title, fontsize="medium")
+    style.legend(ax, outside=False, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncol=1)
+    return ax
