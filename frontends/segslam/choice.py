@@ -42,6 +42,8 @@ class Proposal:
         Where the map sample puts the body in that map.
     sigma : float
         σ of the path-length model at that place [m].
+    travelled : float
+        Way from there to the body, through the sample [m].
     localisation : Localisation or None
         What the throw-away particle filter says of it.
     """
@@ -50,6 +52,7 @@ class Proposal:
     registration: Registration
     T_prior: Array
     sigma: float
+    travelled: float = 0.0
     localisation: Localisation | None = None
 
     @property
@@ -206,8 +209,10 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
     if not r.converged or not np.all(np.isfinite(p.T)):
         return ["nothing: " + (r.why or "the result is not finite").replace("; ", ", ")]
     fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
-    if p.height > c.height:
-        fails.append(f"height {p.height:.2f} m > {c.height:g}")
+    if p.fitness < c.fitness and not any("fitness" in f for f in fails):
+        fails.append(f"fitness {p.fitness:.3f} < {c.fitness:g}")
+    if p.height > (height := c.height + c.height_per_metre * p.travelled):
+        fails.append(f"height {p.height:.2f} m > {height:g}")
     if p.shift > c.shift * p.sigma:
         fails.append(f"shift {p.shift:.2f} m > {c.shift:g} σ of {p.sigma:.2f} m")
     if margin < c.margin:

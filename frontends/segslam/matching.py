@@ -101,7 +101,8 @@ class Matcher:
         self.seconds = 0.0
         # what a closed map is matched by: made when it is first asked for
         self._targets: dict[int, Target | None] = {}
-        self._fields: dict[tuple[int, int], SearchField] = {}  # one of all particles' maps of the same steps
+        # fine and coarse, of one of all particles' maps of the same steps
+        self._fields: dict[tuple[int, int], tuple[SearchField, SearchField]] = {}
 
     def attempt(self, step: int, poses: Array, ahead: Ahead, seed: SeedTree) -> Attempt:
         """Try to match all particles, and draw.
@@ -219,9 +220,8 @@ class Matcher:
                 starts = next((f for at, r, f in alike if np.linalg.norm((T - at)[:2]) <= 0.25 * min(r, radius)), None)
                 first = starts is None
                 if starts is None:
-                    half = [radius, radius, *([] if planar else [s.height]), s.yaw_width(float(way))]
-                    steps = [s.grid, s.grid, *([] if planar else [s.grid]), s.yaw_step]
-                    starts = self._search(source, segment, T, half, steps)
+                    height = [] if planar else [s.height + s.height_per_metre * float(way)]
+                    starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(way))])
                     searches += 1
                 found = register_starts(cloud, target, starts, rules)
                 registrations += len(starts)
@@ -246,13 +246,20 @@ class Matcher:
             self._targets[m] = Target(points) if len(points) >= self.config.registration.least_points else None
         return self._targets[m]
 
-    def _search(self, source: Array, segment: int, T: Array, half: list[float], steps: list[float]) -> list[Array]:
+    def _search(self, source: Array, segment: int, T: Array, half: list[float]) -> list[Array]:
         """Starts of registrations: the distinct best places, if any is good enough to be the true one."""
         s = self.config.search
         known = (self._begin(segment), int(self.segmap.table.end[segment]))
         if known not in self._fields:
-            self._fields[known] = SearchField(self.segmap.map_of(segment)[0].occupied_cloud(), cell=0.5 * s.grid)
-        found = correlative_search(source, self._fields[known], T, half, steps, s.starts)
+            occupied = self.segmap.map_of(segment)[0].occupied_cloud()
+            cell = s.grid / 4.0
+            self._fields[known] = (
+                SearchField(occupied, cell=cell, sigma=s.sigma),
+                SearchField(occupied, cell=2.0 * cell, sigma=2.0 * s.sigma),
+            )
+        fine, coarse = self._fields[known]
+        steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
+        found = correlative_search(source, fine, T, half, steps, s.starts, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
         return [p.T for p in found if p.score >= max(s.least_score, best - s.score_margin)]
 
@@ -283,6 +290,7 @@ class Matcher:
                         registration=r,
                         T_prior=c.T_map_body[k],
                         sigma=float(c.sigma[k]),
+                        travelled=float(c.travelled[k]),
                         localisation=local,
                     )
                 )

@@ -74,9 +74,13 @@ class SearchConfig:
     turned: float = 0.35
     score_sigma: float = 0.15
     refine: bool = True
+    coarse_points: int = 100
+    """Source points used on a coarse field, see :func:`correlative_search`."""
+    coarse_modes: int = 64
+    """Modes of a coarse field that are looked at in the finer one."""
 
     def __post_init__(self) -> None:
-        for name in ("most_points", "apart", "turned", "score_sigma"):
+        for name in ("most_points", "apart", "turned", "score_sigma", "coarse_points", "coarse_modes"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"search: {name} is {value}; wanted a positive number")
@@ -195,6 +199,7 @@ def correlative_search(
     keep: int = 6,
     *,
     prior: Sequence[float] | None = None,
+    coarse: SearchField | None = None,
     config: SearchConfig | None = None,
 ) -> list[Start]:
     """Distinct places where the source may lie in the map, best first.
@@ -216,6 +221,9 @@ def correlative_search(
         Modes wanted. There may be fewer.
     prior : as ``half_widths``, optional
         σ of the true pose about ``around``: starts are then ordered by score and prior together.
+    coarse : SearchField, optional
+        Of the same map, with larger cells and σ, made for the steps of the lattice: few points are scored on it, and
+        only the best modes in ``field``. What is searched may then be some ten times as wide for the same time.
     config : SearchConfig, optional
 
     Returns
@@ -241,18 +249,25 @@ def correlative_search(
     if keep < 1:
         raise ConfigError(f"search: {keep} modes wanted; wanted at least 1")
     p = spread(thin(p, field.cell), config.most_points)
-    step = (*[2.0 * field.cell] * field.dim, 0.0) if steps is None else steps
+    step = (*[2.0 * (coarse or field).cell] * field.dim, 0.0) if steps is None else steps
     reach = float(np.quantile(np.hypot(p[:, 0], p[:, 1]), 0.9)) if len(p) else 1.0
     lattice = make_lattice(field, half_widths, step, reach)
     sigmas = _prior(prior, field.dim)
     if not len(p):
         return []
-    weights, scores = _weigh(score_lattice(p, field, T, lattice), len(p), lattice, sigmas, config)
+    if coarse is None:
+        few, seen, modes = p, lattice, 4 * keep
+        sums = score_lattice(p, field, T, lattice)
+    else:
+        few, modes = spread(p, config.coarse_points), max(config.coarse_modes, keep)
+        seen = make_lattice(coarse, half_widths, step, reach)
+        sums = score_lattice(few, coarse, T, seen)
+    weights, scores = _weigh(sums, len(few), seen, sigmas, config)
     top = local_maxima(weights)
-    places, best = lattice.places(top), tuple(top.T)
+    places, best = seen.places(top), tuple(top.T)
     weight, score = weights[best], scores[best]
-    if config.refine:
-        first = _distinct(places, weight, 4 * keep, config)
+    if config.refine or coarse is not None:
+        first = _distinct(places, weight, modes, config)
         places, weight, score = _refine(p, field, T, lattice, places[first], sigmas, config)
     starts = []
     for s in _distinct(places, weight, keep, config):

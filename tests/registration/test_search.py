@@ -11,7 +11,7 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.registration.points import thin
+from graphslam.registration.points import spread, thin, transform
 from graphslam.registration.search import SearchConfig, correlative_search, make_lattice, offset_pose, score_lattice
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima
@@ -30,6 +30,12 @@ def map_of(world: BoxWorld, rng: np.random.Generator) -> Array:
 def pillars() -> tuple[BoxWorld, SearchField]:
     world = hall()
     return world, SearchField(map_of(world, np.random.default_rng(5)))
+
+
+@pytest.fixture(scope="module")
+def coarse() -> SearchField:
+    """Of the same map, with cells and σ of twice the size."""
+    return SearchField(map_of(hall(), np.random.default_rng(5)), cell=0.4, sigma=0.6)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -134,6 +140,26 @@ def test_true_place_is_best_where_an_end_wall_is_in_sight(pillars: tuple[BoxWorl
     starts = correlative_search(scan, field, start, (12.0, 12.0, 0.8, 0.3), (0.4, 0.4, 0.4, 0.0))
     assert np.linalg.norm(starts[0].T[:3] - T[:3]) < 0.5, starts
     assert starts[0].score > starts[1].score
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_coarse_look_first_finds_what_the_whole_search_finds(
+    pillars: tuple[BoxWorld, SearchField], coarse: SearchField, seed: int
+) -> None:
+    """Six times as many offsets, most of them scored by a third of the points on a blurred field."""
+    world, field = pillars
+    rng = np.random.default_rng(seed)
+    T = heading(rng.uniform(8, 16), rng.uniform(7, 11), 1.2, rng.uniform(-3, 3))
+    scan = world.scan(T, around(rng, 2000), 0.025, 25.0, rng)
+    start = offset_pose(T, rng.uniform(-1, 1, 4) * [9.0, 5.0, 0.7, 0.3])
+    half, steps = (16.0, 16.0, 0.8, 0.5), (0.8, 0.8, 0.8, 0.1)
+    found = correlative_search(scan, field, start, half, steps, 3, coarse=coarse)
+    assert min(np.linalg.norm(s.T[:3] - T[:3]) for s in found) < 0.3, found
+    whole = correlative_search(scan, field, start, half, (0.4, 0.4, 0.4, 0.05), 1)[0]
+    assert found[0].score > whole.score - 0.05
+    # what is scored coarsely is not what is reported: scores are those of the fine field
+    p = spread(thin(scan, field.cell), 300)
+    assert found[0].score == pytest.approx(field.value_at(transform(found[0].T, p)).mean(), abs=0.01)
 
 
 def test_prior_decides_between_aliases(pillars: tuple[BoxWorld, SearchField], rng: np.random.Generator) -> None:
