@@ -50,7 +50,16 @@ class SegmentationConfig:
     min_length: float = 9.0
     """… and [m]: both must be reached."""
     max_length: float = 60.0
-    """A segment ends at this length at the latest [m]."""
+    """A segment ends after this length of new ground at the latest [m]."""
+    known_score: float = 0.8
+    """Where the map predicts the window this well …"""
+    known_radius: float = 2.0
+    """… and its own path passed this near [m] …"""
+    known_gap: float = 20.0
+    """… so long ago [s], the body drives where it has been: it localises there, gathers no drift, and the way is not
+    counted for ``max_length``; a map that ended there would be drawn a second time beside the first. A score of 1 =
+    every metre counts. In a simulated building three quarters of the scores on new ground are below 0.78, and of those
+    on the way back above 0.84."""
     max_seconds: float = math.inf
     """… or after this time [s], except where less than the minimum length was driven."""
     period: float = 0.0
@@ -78,7 +87,7 @@ class SegmentationConfig:
                 "max_length",
                 "max_seconds",
             ),
-            unit=("score", "relative_score"),
+            unit=("score", "relative_score", "known_score"),
         )
         if self.min_length > self.max_length or self.min_seconds > self.max_seconds:
             raise ConfigError(f"segmentation: the minimum size is above the maximum, got {self}")

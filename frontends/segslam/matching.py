@@ -19,7 +19,7 @@ import numpy.typing as npt
 from frontends.segslam.choice import NULL, Proposal, judge
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.localisation import localise
-from frontends.segslam.sampling import grow, root_of_particle
+from frontends.segslam.sampling import draw_weights, grow, root_of_particle
 from frontends.segslam.segmap import NEW, Entry, SegMap
 from frontends.segslam.window import Ahead
 from frontends.segslam.winnowing import Candidates, Winnowed, winnow_all
@@ -166,7 +166,7 @@ class Matcher:
         groups: dict[tuple[int, int, int], list[int]] = {}
         for i, entry in enumerate(segmap.entries):
             groups.setdefault((id(entry), int(segmap.start[i]), int(segmap.previous[i])), []).append(i)
-        weights = segmap.table.weight[: len(segmap)]
+        weights = draw_weights(segmap)
         out: dict[int, Candidates] = {}
         for number, members in enumerate(groups.values()):
             rng = seed.child("sample", number).generator()

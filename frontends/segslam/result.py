@@ -12,7 +12,7 @@ from frontends.ancestry import Ancestry
 from frontends.grid_filter import Tally
 from frontends.segslam.matching import Attempt
 from frontends.segslam.paths import concatenate
-from frontends.segslam.sampling import MapSample, grow, root_of_segment
+from frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
 from frontends.segslam.segmap import SegMap
 from frontends.segslam.winnowing import Winnowed
 from frontends.steps import Steps
@@ -108,8 +108,7 @@ class SegSlamResult:
         """
         at = int(self.closed[self.best if particle is None else particle])
         rng = self.seed.child("map-sample", number).generator()
-        weights = self.segmap.table.weight[: len(self.segmap)]
-        return grow(self.segmap, root_of_segment(self.segmap, at), rng, weights=weights)
+        return grow(self.segmap, root_of_segment(self.segmap, at), rng, weights=draw_weights(self.segmap))
 
     def trajectory(self, number: int = 0, particle: int | None = None) -> Trajectory:
         """The whole path of a map sample in the frame of its first segment (A6)."""

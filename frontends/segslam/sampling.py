@@ -1,9 +1,11 @@
 """Map samples: one path through the SegMap, with the pose of every submap on it (SegSLAM section 3.3).
 
-A sample begins at one segment and grows breadth-first along two kinds of links: to segments that end where one begins
-(or begin where it ends), any of which will do (A6), and from a segment that entered an older map to the one it
-entered. So after a loop closure older submaps stand where the closure says, not where the long way round would put
-them. Among links of equal depth the order is random.
+A sample begins at one segment and grows along two kinds of links: to segments that end where one begins (or begin where
+it ends), any of which will do (A6), and between a segment that entered an older map and the one it entered. These two
+share a frame, in which the later was localised in what the earlier saw: nothing drifts between them. So such links are
+taken at once, before those in time, which are taken breadth-first, among links of equal depth in random order. After a
+loop closure submaps stand where the closure says, not where the long way round would put them; and a place that was
+driven through twice is one place, whichever of its two segments was reached first.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ class MapSample:
     via : (m,) int64
         Place in this sample of the segment each was reached from; -1 of the root.
     depth : (m,) int64
-        Links from the root.
+        Links from the root, of both kinds.
     intervals : (m, 2) int64
         Steps of the boundaries; of an open root its start and the step of now.
     anchor : (m,) int64
@@ -120,9 +122,11 @@ def grow(
 ) -> MapSample:
     """Draw a map sample.
 
-    Level by level, the links of all segments of a level are taken in random order. A link in time leads to any
-    segment that fits there and does not overlap in time with what the sample holds; a link to an entered map leads to
-    the one segment that was entered, unless its place is taken.
+    Level by level, the links in time of all segments of a level are taken in random order; each leads to any segment
+    that fits there and does not overlap in time with what the sample holds. As soon as a segment is reached, those that
+    share its frame follow, on the same level: the one whose map it entered, unless its place is taken, and of each
+    interval with segments that entered its own map the one that is drawn of that interval, if it is one of these. Of
+    each interval one segment is drawn, once.
 
     Parameters
     ----------
@@ -145,6 +149,27 @@ def grow(
         local_length=local_length,
         local_depth=local_depth,
     )
+
+
+def draw_weights(segmap: SegMap) -> Array:
+    """Weights of all segments ``(len(segmap),)`` for the draw among those of an interval.
+
+    A segment's own weight is what its particles had when it was closed, of what was known by then. Where later segments
+    entered maps of an interval, more is known: those maps were found again, by particles that are still there, and what
+    came after was localised in them. So of such an interval the segments that were entered share the weight of those
+    that entered them, and the others, beside whose maps a second one of the same place would stand, have none.
+    """
+    t, n = segmap.table, len(segmap)
+    out = np.where(t.alive[:n], t.weight[:n], 0.0)
+    received = np.zeros(n)
+    # the latest first: a segment is entered only by later ones
+    for begin, end in segmap.intervals()[::-1].tolist():
+        rows = segmap.in_interval((begin, end))
+        if received[rows].any():
+            out[rows] = received[rows]
+        entered = rows[t.source[rows] >= 0]
+        np.add.at(received, t.source[entered], out[entered])
+    return out
 
 
 def probabilities(fits: Ints, weights: Array | None) -> Array:
@@ -207,46 +232,74 @@ def grow_by(
         anchor.append(step_there)
         travelled.append(travelled[at] + float(abs(L[step_here] - L[anchor[at]])))
 
-    level = [0]
+    drawn: dict[tuple[int, int], int] = {}
+
+    def draw(found: Ints) -> int:
+        """One of those that fit; the same again of an interval that was asked for before."""
+        begins, ends = t.start[found], t.end[found]
+        if (begins != begins[0]).any() or (ends != ends[0]).any():
+            return int(found[choose(found)])
+        key = int(begins[0]), int(ends[0])
+        if key not in drawn:
+            drawn[key] = int(found[choose(found)])
+        return drawn[key]
+
+    def grows(k: int) -> bool:
+        return not ((local_length and travelled[k] > local_length) or (local_depth and depth[k] >= local_depth))
+
+    def settle(k: int) -> list[int]:
+        """Places of what shares a frame with place k, and with those in turn; place k first."""
+        found = [k]
+        for k in found:  # grows as it goes
+            if not grows(k):
+                continue
+            i, begin = segments[k], intervals[k][0]
+            source, T, entry = root.source, root.link, root.entry
+            if k:
+                source, T, entry = int(t.source[i]), t.link[i], t.entry[i]
+            if source >= 0 and t.alive[source] and free(int(t.start[source]), int(t.end[source])):
+                T = cast(Array, T)
+                # the way goes on from where the body stood in the entered map
+                add(source, k, nearest_step(segmap, source, g.compose(g.inverse(T), entry)), begin)
+                frames.linked(k, T)
+                found.append(len(segments) - 1)
+            entering = segmap.entering(i)
+            for begin, end in dict.fromkeys(zip(t.start[entering].tolist(), t.end[entering].tolist())):
+                if not free(begin, end):
+                    continue
+                rivals = segmap.beginning_at(begin)
+                rivals = rivals[t.end[rivals] == end]
+                chosen = draw(rivals)
+                if t.source[chosen] != i:
+                    continue  # particles of that time that went another way
+                T = g.inverse(t.link[chosen])
+                add(chosen, k, begin, nearest_step(segmap, i, g.compose(T, t.entry[chosen])))
+                frames.linked(k, T)
+                found.append(len(segments) - 1)
+        return found
+
+    level = settle(0)
     while level:
         links: list[tuple[int, int]] = []
         for k in level:
-            if (local_length and travelled[k] > local_length) or (local_depth and depth[k] >= local_depth):
-                continue
-            links.append((k, _BEFORE))
-            if segments[k] != OPEN:
-                links.append((k, _AFTER))
-            source = root.source if k == 0 else int(t.source[segments[k]])
-            if source >= 0 and t.alive[source]:
-                links.append((k, _ENTERED))
+            if grows(k):
+                links.append((k, _BEFORE))
+                if segments[k] != OPEN:
+                    links.append((k, _AFTER))
         level = []
         if not links:
             break
         for j in order(len(links)):
             k, direction = links[j]
             begin, end = intervals[k]
-            if direction == _ENTERED:
-                i = segments[k]
-                chosen, link, entry = root.source, root.link, root.entry
-                if k:
-                    chosen, link, entry = int(t.source[i]), t.link[i], t.entry[i]
-                if not free(int(t.start[chosen]), int(t.end[chosen])):
-                    continue
-                # the way goes on from where the body stood in the entered map
-                T = cast(Array, link)
-                there = nearest_step(segmap, chosen, g.compose(g.inverse(T), entry))
-                add(chosen, k, there, begin)
-                frames.linked(k, T)
-                level.append(len(segments) - 1)
+            there = fits(segmap.ending_at(begin) if direction == _BEFORE else segmap.beginning_at(end))
+            if not len(there):
                 continue
-            found = fits(segmap.ending_at(begin) if direction == _BEFORE else segmap.beginning_at(end))
-            if not len(found):
-                continue
-            chosen = int(found[choose(found)])
+            chosen = draw(there)
             at = begin if direction == _BEFORE else end
             add(chosen, k, at, at)
             frames.joined(k, segments[k], chosen, direction)
-            level.append(len(segments) - 1)
+            level += settle(len(segments) - 1)
     return MapSample(
         segments=np.array(segments, np.int64),
         poses=frames.poses(),
@@ -258,7 +311,7 @@ def grow_by(
     )
 
 
-_BEFORE, _AFTER, _ENTERED = 0, 1, 2
+_BEFORE, _AFTER = 0, 1
 
 
 class _Free:

@@ -228,6 +228,10 @@ class SegMap:
         """Viable segments that begin at a boundary, ascending: those that may follow what ends there."""
         return self.table.fitting[0].get(int(step), _NOBODY)
 
+    def entering(self, index: int) -> Ints:
+        """Viable segments that entered the map of a segment, or went on in it, ascending: they share its frame."""
+        return self.table.fitting[2].get(int(index), _NOBODY)
+
     def intervals(self) -> Ints:
         """Intervals ``(k, 2)`` of the viable segments, ascending."""
         a = self.alive

@@ -202,6 +202,8 @@ class Decision:
         The score, NaN if there is none, and its maximum since the segment began, NaN before the first that counts.
     seconds, length : float
         Age and way of the segment [s], [m].
+    new_ground : float
+        Way that its map did not foretell [m].
     error : float
         Motion error.
     """
@@ -212,6 +214,7 @@ class Decision:
     best_score: float
     seconds: float
     length: float
+    new_ground: float
     error: float
 
 
@@ -236,17 +239,27 @@ class Segmenter:
     turned: float = 0.0
     best: float = field(default=math.nan, init=False)
     last: float = field(default=-math.inf, init=False)
+    new_ground: float = field(default=0.0, init=False)
+    seen: float = field(default=math.nan, init=False)
+
+    def __post_init__(self) -> None:
+        self.seen = self.length
 
     def begin(self, time: float, length: float, turned: float = 0.0) -> None:
         """A new segment begins here."""
         self.time, self.length, self.turned = time, length, turned
         self.best, self.last = math.nan, -math.inf
+        self.new_ground, self.seen = 0.0, length
 
     def copy(self) -> Segmenter:
         """An equal one, for a resampled particle."""
         twin = Segmenter(self.config, self.time, self.length, self.turned)
-        twin.best, twin.last = self.best, self.last
+        twin.follow(self)
         return twin
+
+    def follow(self, other: Segmenter) -> None:
+        """Know of the segment what another one knows that has decided."""
+        self.best, self.last, self.new_ground, self.seen = other.best, other.last, other.new_ground, other.seen
 
     def due(self, time: float) -> bool:
         """Is it time for a decision? Half a step's rounding of the clock does not put it off."""
@@ -257,7 +270,9 @@ class Segmenter:
         c = self.config
         return not c.period and bool(c.score or c.relative_score) and time - self.time >= c.excluded - 1e-6
 
-    def decide(self, time: float, length: float, turned: float = 0.0, score: float = math.nan) -> Decision:
+    def decide(
+        self, time: float, length: float, turned: float = 0.0, score: float = math.nan, *, again: bool = False
+    ) -> Decision:
         """Does the segment end here?
 
         Parameters
@@ -266,6 +281,8 @@ class Segmenter:
             Now, on the same scales as those of the beginning.
         score : float
             Predictive score of the window ahead; NaN: there is none.
+        again : bool
+            The body is where the path of its map passed before; only then may the ground be known.
 
         Raises
         ------
@@ -279,8 +296,15 @@ class Segmenter:
         self.last = time
         error = float(motion_error([way], [turned - self.turned], c.motion_translation, c.motion_rotation)[-1])
         counts = not math.isnan(score) and seconds >= c.excluded - 1e-6
-        if counts:  # the maximum that a drop is measured against includes the score of now
-            self.best = score if math.isnan(self.best) else max(self.best, score)
+        known = counts and again and c.known_score < 1.0 and score >= c.known_score
+        if counts:
+            # The maximum that a drop is measured against includes the score of now, but not how well a map foretells
+            # what it has seen before: leaving that for new ground is no drop.
+            usual = c.known_score if known else score
+            self.best = usual if math.isnan(self.best) else max(self.best, usual)
+        if not known:  # since the last decision; without a score nobody knows, and it counts
+            self.new_ground += length - self.seen
+        self.seen = length
         why = self._why(seconds, way, error, score if counts else math.nan)
         ends = bool(why)
         if ends and not why.startswith("max"):
@@ -288,11 +312,14 @@ class Segmenter:
                 ends, why = False, "young"
             elif way < c.min_length:
                 ends, why = False, "short"
-        return Decision(ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=way, error=error)
+        return Decision(
+            ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=way,
+            new_ground=self.new_ground, error=error,
+        )  # fmt: skip
 
     def _why(self, seconds: float, way: float, error: float, score: float) -> str:
         c = self.config
-        if way >= c.max_length:
+        if self.new_ground >= c.max_length - 1e-9:
             return "max-length"
         if seconds >= c.max_seconds and way >= c.min_length:
             return "max-seconds"

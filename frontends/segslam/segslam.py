@@ -27,6 +27,7 @@ from frontends.segslam.segmentation import Decision, Segmenter, few, predictive_
 from frontends.segslam.window import Ahead, look_ahead
 from frontends.steps import Steps
 from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
 
@@ -70,6 +71,11 @@ def run_segslam(
         run.step(k)
         run.step_seconds[k] = time.perf_counter() - begin
     return run.result()
+
+
+def near(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
+    """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are as near to a pose [m], in height too."""
+    return np.asarray(np.linalg.norm((path - T)[:, : group_of(T).dim], axis=1) <= radius)
 
 
 class _Run:
@@ -187,20 +193,40 @@ class _Run:
             self.seconds["score"] += time.perf_counter() - begin
         why = ""
         if together:
-            decision = self._decision(0, k, now, share)
+            decision = self._decision(0, k, now, share, f.particles.best)
             for s in self.segmenters[1:]:
-                s.best, s.last = self.segmenters[0].best, self.segmenters[0].last
+                s.follow(self.segmenters[0])
             ends[:] = decision.ends
             why = decision.why if decision.ends else ""
         else:
             for i in due:
-                decision = self._decision(i, k, now, float(shares[i]))
+                decision = self._decision(i, k, now, float(shares[i]), i)
                 ends[i] = decision.ends
                 why = why or (decision.why if decision.ends else "")
         return ends, why
 
-    def _decision(self, i: int, k: int, now: float, score: float) -> Decision:
-        return self.segmenters[i].decide(now, float(self.path_length[k]), float(self.turned[k]), score)
+    def _decision(self, i: int, k: int, now: float, score: float, particle: int) -> Decision:
+        again = score >= self.config.segmentation.known_score and self._been_here(k, particle)
+        length, turned = float(self.path_length[k]), float(self.turned[k])
+        return self.segmenters[i].decide(now, length, turned, score, again=again)
+
+    def _been_here(self, k: int, particle: int) -> bool:
+        """Did the path of the map that a particle works in pass here, long enough ago?"""
+        f, segmap, c = self.filter, self.segmap, self.config.segmentation
+        entry, start, T = segmap.entries[particle], int(segmap.start[particle]), f.particles.poses[particle]
+        assert entry is not None
+        old = int(np.searchsorted(self.steps.times, self.steps.times[k] - c.known_gap, side="right")) - 1
+        own = f.ancestry.recent(k - start)[: max(old - start, 0), particle] if old > start else T[None][:0]
+        paths, frames = [own], [T]
+        source, link = (-1 if entry.kind == NEW else entry.source), segmap.links[particle]
+        while source >= 0:  # on through the older segments that drew this map, each in its own frame
+            T = self.group.compose(self.group.inverse(link), T)
+            path, link = segmap.table.paths[source], segmap.table.link[source]
+            source = int(segmap.table.source[source])
+            if path is not None:
+                paths.append(path)
+                frames.append(T)
+        return any(bool(near(path, at, c.known_radius).any()) for path, at in zip(paths, frames))
 
     def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> Attempt | None:
         """Try to enter older maps: every so often, and wherever a segment ends."""

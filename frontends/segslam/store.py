@@ -48,7 +48,7 @@ class Table:
         self.T_map: Array = np.zeros((n, size))  # T_map_segment
         self.paths: list[Array | None] = []
         self.covariances: list[Array | None] = []
-        self._fitting: tuple[dict[int, Ints], dict[int, Ints]] | None = None
+        self._fitting: tuple[dict[int, Ints], dict[int, Ints], dict[int, Ints]] | None = None
 
     def append(
         self,
@@ -88,11 +88,15 @@ class Table:
         self._fitting = None
 
     @property
-    def fitting(self) -> tuple[dict[int, Ints], dict[int, Ints]]:
-        """Viable segments by the step they begin at, and by the step they end at, each ascending."""
+    def fitting(self) -> tuple[dict[int, Ints], dict[int, Ints], dict[int, Ints]]:
+        """Viable segments by the step they begin at, by the step they end at, and by the segment whose map they
+        entered, each ascending."""
         if self._fitting is None:
             alive = np.flatnonzero(self.alive).astype(np.int64)
-            self._fitting = _by_value(self.start, alive), _by_value(self.end, alive)
+            entered = alive[self.source[alive] >= 0]
+            self._fitting = (
+                _by_value(self.start, alive), _by_value(self.end, alive), _by_value(self.source, entered)
+            )  # fmt: skip
         return self._fitting
 
     def row(self, i: int, times: Array) -> dict[str, Any]:

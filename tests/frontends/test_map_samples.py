@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from frontends.segslam.paths import concatenate, seams
-from frontends.segslam.sampling import OPEN, grow, nearest_step, root_of_particle, root_of_segment
+from frontends.segslam.sampling import OPEN, draw_weights, grow, nearest_step, root_of_particle, root_of_segment
 from frontends.segslam.segmap import SAME, Entry, SegMap
 from graphslam.core import se3
 from graphslam.core.errors import DataError
@@ -105,30 +105,16 @@ def test_enumeration_on_a_chain_is_the_product_of_the_choices() -> None:
 
 
 def test_ties_are_broken_at_random() -> None:
-    """Interval (2, 4) is two links from a re-entered map and two from the other side: each way is taken."""
+    """The fronts from a re-entered map and from the other side meet at one interval: each of them takes it."""
     m = square()
     ways = set()
     for seed in range(40):
         s = grow(m, root_of_particle(m, 0, 9), np.random.default_rng(seed))
         place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
-        middle = place[(2, 4)]
-        ways.add(tuple(s.intervals[s.via[middle]].tolist()))
-        assert s.depth[middle] == 2
-        assert s.depth[place[(4, 6)]] == 2
-    assert ways == {(0, 2)}  # (4, 6) is on the same level, from the other side
-    # three matches deep, a tie that can be seen: the middle of five intervals
-    m = small_segmap(14, 1)
-    for k in range(5):
-        m.open(2 * k, [Entry(T_entry=ZERO)])
-        m.close(2 * k + 2, [flat_grid()], [straight(ZERO, 1.0, 2)])
-    m.open(10, [match_entry(ZERO, 1)])
-    ways = set()
-    for seed in range(40):
-        s = grow(m, root_of_particle(m, 0, 11), np.random.default_rng(seed))
-        place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
-        for q in ((4, 6), (6, 8)):
-            ways.add((q, tuple(s.intervals[s.via[place[q]]].tolist())))
-    assert ways == {((4, 6), (2, 4)), ((6, 8), (8, 10))}
+        for q in ((2, 4), (4, 6), (6, 8)):
+            ways.add((q, tuple(s.intervals[s.via[place[q]]].tolist()), int(s.depth[place[q]])))
+    # the link to the entered map is one of depth, but costs no turn
+    assert ways == {((2, 4), (0, 2), 2), ((6, 8), (8, 9), 1), ((4, 6), (2, 4), 3), ((4, 6), (6, 8), 2)}
 
 
 def test_the_same_generator_gives_the_same_sample() -> None:
@@ -148,20 +134,102 @@ def test_local_samples_stop_at_their_reach() -> None:
     assert len(grow(m, root, np.random.default_rng(0))) == 5
 
 
-def test_going_on_in_the_same_map_leads_to_one_segment_before_not_to_two() -> None:
+def test_going_on_in_the_same_map_leads_to_what_it_went_on_from() -> None:
     m = small_segmap(9, 2)
     m.open(0, [Entry(T_entry=ZERO)] * 2)
     m.close(2, [flat_grid(), flat_grid()], [straight(ZERO, 1.0 + p, 2) for p in range(2)])
     m.open(2, [Entry(T_entry=m[p].T_exit, kind=SAME, source=p) for p in range(2)])
-    seen = set()
-    for seed in range(30):
-        s = grow(m, root_of_particle(m, 0, 3), np.random.default_rng(seed))
-        assert len(s) == 2
-        seen.add(int(s.segments[1]))
-        # whichever it is, the body stands where it stood: 1 m along the frame of the root
-        at = se2_compose(s.poses[1], m[int(s.segments[1])].T_exit)
-        np.testing.assert_allclose(at, [1.0, 0.0, 0.0], atol=1e-12)
-    assert seen == {0, 1}
+    for seed in range(10):
+        for p in range(2):
+            s = grow(m, root_of_particle(m, p, 3), np.random.default_rng(seed))
+            assert s.segments.tolist() == [OPEN, p]  # whose map it has, and no other particle's
+            np.testing.assert_allclose(s.poses[1], 0.0, atol=1e-12)
+
+
+def twice(weights: tuple[float, ...] = (0.25, 0.25, 0.25, 0.25)) -> SegMap:
+    """A way of 2 m, driven by two particles; away; then again, when each entered the map of its own first time, 0.1 m
+    off; away; and a third time, when both entered the map of segment 1.
+
+    Segments 0, 1 in (0, 2); 2, 3 in (2, 4); 4 (enters 0), 5 (enters 1) in (4, 6); 6, 7 in (6, 8); 8, 9 (enter 1) after.
+    """
+    m = small_segmap(12, 2)
+    for k in range(5):
+        sources = {2: (0, 1), 4: (1, 1)}.get(k)
+        entries = [
+            Entry(T_entry=ZERO) if sources is None else match_entry(np.array([0.1, 0, 0]), i) for i in sources or (0, 0)
+        ]
+        m.open(2 * k, entries)
+        grids, paths = (
+            [flat_grid() for _ in range(2)],
+            [straight(e.T_entry, 2.0 + 0.3 * p, 2) for p, e in enumerate(entries)],
+        )
+        m.close(2 * k + 2, grids, paths, weights[:2])
+    m.open(10, [Entry(T_entry=ZERO)] * 2)
+    return m
+
+
+def test_a_place_driven_through_twice_is_one_place() -> None:
+    """Segments that entered one map stand in its frame, whichever of them is reached first."""
+    m = twice()
+    drawn = Counter[bool]()
+    for seed in range(20):
+        s = grow(m, root_of_segment(m, 8 + seed % 2), np.random.default_rng(seed), weights=draw_weights(m))
+        place = {int(i): k for k, i in enumerate(s.segments.tolist())}
+        assert len(s) == 5  # every interval has one
+        assert place[1] == 1  # of the first, what was found again
+        drawn[5 in place] += 1
+        if 5 not in place:  # the second time it was another map that was entered
+            continue
+        last = 0
+        np.testing.assert_array_equal(s.poses[place[1]], s.poses[last])
+        np.testing.assert_array_equal(s.poses[place[5]], s.poses[last])
+        # from the third visit to the first by the entered map, on to the second: not by the way between them
+        assert s.via[place[1]] == last
+        assert s.via[place[5]] == place[1]
+        # 2 m and more to where the third visit began, 0.1 m along the way of the first: its first step is nearest
+        assert s.anchor[place[5]] == 4
+        assert s.travelled[place[5]] == pytest.approx(2.0)
+    assert min(drawn[True], drawn[False]) > 3
+
+
+def test_of_an_interval_one_segment_is_drawn_once() -> None:
+    """Half of the second visits entered another map than the one at hand: they come as often as their weight says."""
+    m = twice()
+    n = np.full(len(m), 1.0)
+    n[4], n[5] = 3.0, 1.0
+    table = all_samples(m, root_of_segment(m, 9), weights=n)
+    assert sum(table.values()) == Fraction(1)
+    assert sum(v for k, v in table.items() if 4 in k) == Fraction(3, 4)
+
+
+def test_what_was_entered_again_takes_the_weight_of_what_was_not() -> None:
+    m = twice((0.75, 0.25))
+    w = draw_weights(m)
+    # segment 1 was entered by 8, 9 (weights 0.75 and 0.25) and by 5 (0.25); 0 by 4 (0.75)
+    np.testing.assert_allclose(w, [0.75, 1.25, 0.75, 0.25, 0.75, 0.25, 0.75, 0.25, 0.75, 0.25])
+    np.testing.assert_array_equal(w, _draw_weights_twin(m))
+    # without the entry of 4 nothing speaks for 0; pruned segments speak for nothing
+    m._release(np.array([4]))
+    np.testing.assert_allclose(draw_weights(m)[:6], [0.0, 1.25, 0.75, 0.25, 0.0, 0.25])
+    np.testing.assert_array_equal(draw_weights(m), _draw_weights_twin(m))
+    # where nothing was entered, weights are as they are
+    np.testing.assert_allclose(draw_weights(square()), square().table.weight[:8])
+
+
+def _draw_weights_twin(m: SegMap) -> list[float]:
+    """By recursion: what a segment has been given, if anybody in its interval has been given anything."""
+    t = m.table
+
+    def given(i: int) -> float:
+        return sum(weight(j) for j in m.alive.tolist() if t.source[j] == i)
+
+    def weight(i: int) -> float:
+        if not t.alive[i]:
+            return 0.0
+        mates = [j for j in m.alive.tolist() if (t.start[j], t.end[j]) == (t.start[i], t.end[i])]
+        return given(i) if any(given(j) > 0 for j in mates) else float(t.weight[i])
+
+    return [weight(i) for i in range(len(m))]
 
 
 def test_a_pruned_source_is_no_link() -> None:
@@ -221,7 +289,7 @@ def test_frames_stay_level_whatever_particles_think_of_gravity() -> None:
         turn = se3.quat_multiply(se3.so3_exp(np.array([0, 0, heading])), se3.so3_exp([*(0.02 * rng.normal(size=2)), 0]))
         return np.concatenate([[x, y, z], turn])
 
-    m = SegMap(np.arange(6.0), np.arange(6.0), 2, dim=3, gravity=True)
+    m = SegMap(np.arange(8.0), np.arange(8.0), 2, dim=3, gravity=True)
     m.open(0, [Entry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
     starts = [e.T_entry for e in m.entries if e is not None]
     m.close(
@@ -229,25 +297,33 @@ def test_frames_stay_level_whatever_particles_think_of_gravity() -> None:
         [flat_grid(dim=3) for _ in range(2)],
         [np.stack([s, body(1, 0, 0, 0.3), body(2, 0, 0.1, 0.7)]) for s in starts],
     )
+    m.open(2, [Entry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
+    starts = [e.T_entry for e in m.entries if e is not None]
+    m.close(
+        4,
+        [flat_grid(dim=3) for _ in range(2)],
+        [np.stack([s, body(1, 0, 0, 0.3), body(2, 0, 0.1, 0.7)]) for s in starts],
+    )
     # a match far from the origin of its frame, where a tilt would be a long lever
     source_entry = body(40.0, 30.0, 1.0, 2.0)
     cov = np.eye(6) * 1e-4
-    m.open(2, [Entry(T_entry=source_entry, kind=1, source=0, covariance=cov, fitness=0.9)] * 2)
+    m.open(4, [Entry(T_entry=source_entry, kind=1, source=0, covariance=cov, fitness=0.9)] * 2)
     # the sample's own arithmetic against whole poses; another particle's segment may come before the match
     seen = set()
-    for seed in range(8):
-        s = grow(m, root_of_particle(m, 0, 3), np.random.default_rng(seed))
-        i = int(s.segments[1])
-        T = frame_between(source_entry, m[i].T_exit, gravity=True)
+    for seed in range(20):
+        s = grow(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
+        assert s.segments[1] == 0
+        np.testing.assert_array_equal(s.poses[1], [0, 0, 0, 0, 0, 0, 1])  # the entered map is that of the root
+        i, by_root = int(s.segments[2]), s.via[2] == 0
+        before, after = (source_entry, m[i].T_exit) if by_root else (m[0].T_exit, m[i].T_entry)
+        T = frame_between(before, after, gravity=True)
         np.testing.assert_array_equal(level(T), T)
-        linked = s.poses[1][:3].any()
-        seen.add((i, bool(linked)))
-        if linked:
-            np.testing.assert_allclose(s.poses[1], T, atol=1e-12)
-            np.testing.assert_allclose(se3.se3_compose(T, m[i].T_exit)[:3], source_entry[:3], atol=1e-12)
-    assert seen == {(0, True), (1, True), (0, False)}
-    loose = frame_between(source_entry, m[0].T_exit, gravity=False)
-    np.testing.assert_allclose(se3.se3_compose(loose, m[0].T_exit)[:3], source_entry[:3], atol=1e-12)
+        seen.add((i, bool(by_root)))
+        np.testing.assert_allclose(s.poses[2], T, atol=1e-12)
+        np.testing.assert_allclose(se3.se3_compose(T, after)[:3], before[:3], atol=1e-12)
+    assert seen == {(2, True), (3, True), (2, False), (3, False)}
+    loose = frame_between(source_entry, m[2].T_exit, gravity=False)
+    np.testing.assert_allclose(se3.se3_compose(loose, m[2].T_exit)[:3], source_entry[:3], atol=1e-12)
     assert np.abs(loose[3:5]).max() > 1e-3  # what levelling took out
 
 
@@ -278,18 +354,22 @@ def test_a_sample_has_a_seam_where_its_fronts_met() -> None:
     """The square does not close by 0.1 m a side in particle 1's segments: with them, the seam is what is missing."""
     m = square()
     root = root_of_particle(m, 0, 10)
-    seen = set()
+    seen, places = set(), set()
     for seed in range(30):
         s = grow(m, root, np.random.default_rng(seed))
         ((a, b, T),) = seams(m, s)
-        assert sorted((s.intervals[a].tolist(), s.intervals[b].tolist())) == [[2, 4], [4, 6]]
+        at = int(s.intervals[b, 0])
+        assert s.intervals[a, 1] == at
+        places.add(at)
         # the four sides against the match, which says that the last corner is 0.2 m along the first side
         sides = [2.0 + 0.1 * (s.segments[k] % 2) for k in s.in_time[:4].tolist()]
         missing = np.hypot(sides[0] - sides[2] - 0.2, sides[1] - sides[3])
         assert np.hypot(*T[:2]) == pytest.approx(missing, abs=1e-9)
         path = concatenate(m, s, straight(np.array([0.2, 0.0, 0.0]), 2.0, 2))
-        jump = se2_compose(se2_inverse(path.poses[4]), path.poses[5])[:2] - 0.5 * sides[2] * np.array([1.0, 0.0])
+        step = 0.5 * sides[at // 2] * np.array([1.0, 0.0])
+        jump = se2_compose(se2_inverse(path.poses[at]), path.poses[at + 1])[:2] - step
         np.testing.assert_allclose(np.hypot(*jump), missing, atol=1e-9)
         seen.add(round(float(missing), 6))
     assert len(seen) > 2
+    assert places == {4, 6}  # on either side of where the fronts meet
     assert seams(m, grow(m, root_of_segment(m, 6), np.random.default_rng(0))) == []

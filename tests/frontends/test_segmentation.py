@@ -118,7 +118,7 @@ def _run(config: SegmentationConfig, scores: dict[float, float], until: float = 
     s, cuts, level = Segmenter(config, 0.0), [], 0.7
     for t in np.arange(0.0, until, 2.0):
         level = scores.get(float(t), level)
-        d = s.decide(float(t), speed * float(t), score=level)
+        d = s.decide(float(t), speed * float(t), score=level, again=True)
         if d.ends:
             cuts.append((float(t), d.why))
             s.begin(float(t), speed * float(t))
@@ -129,8 +129,8 @@ def test_a_segment_ends_where_the_score_drops() -> None:
     config = SegmentationConfig()
     assert _run(config, {30.0: 0.44, 32.0: 0.7}) == [(30.0, "score"), (90.0, "max-length")]
     assert _run(config, {30.0: 0.46, 32.0: 0.7}, 60.0) == []  # above 0.45, and above 0.65 · 0.7 = 0.455
-    assert _run(config, {20.0: 0.9, 22.0: 0.7, 30.0: 0.58, 32.0: 0.7}, 60.0) == [(30.0, "relative-score")]
-    assert _run(config, {20.0: 0.9, 22.0: 0.7, 30.0: 0.59, 32.0: 0.7}, 60.0) == []
+    assert _run(config, {20.0: 0.79, 22.0: 0.7, 30.0: 0.51, 32.0: 0.7}, 60.0) == [(30.0, "relative-score")]
+    assert _run(config, {20.0: 0.79, 22.0: 0.7, 30.0: 0.52, 32.0: 0.7}, 60.0) == []
     # the maximum is that of this segment: after a cut 0.9 is forgotten
     assert _run(config, {14.0: 0.9, 16.0: 0.4, 18.0: 0.5, 34.0: 0.46, 36.0: 0.5}, 60.0) == [(16.0, "score")]
 
@@ -159,6 +159,38 @@ def test_without_drops_segments_have_their_maximum_size() -> None:
     assert _run(SegmentationConfig(max_seconds=30.0), {}, 70.0) == [(30.0, "max-seconds"), (60.0, "max-seconds")]
     # a robot that stands still cuts nothing, whatever it sees and however long
     assert _run(SegmentationConfig(max_seconds=30.0), {20.0: 0.1}, speed=0.01) == []
+
+
+def test_ground_that_the_map_foretells_does_not_count_for_the_maximum_size() -> None:
+    """A corridor of 12 s out and 12 s back, 1 m/s: the way back is known, so the segment goes on into the next."""
+    config = SegmentationConfig(max_length=20.0, relative_score=0.0)
+    there = {0.0: 0.7, 14.0: 0.9, 26.0: 0.7}
+    # 12 m out; the decisions at 14 … 24 s look back on known ground; 8 m more are driven by 32 s
+    assert _run(config, there, 34.0) == [(32.0, "max-length")]
+    assert _run(SegmentationConfig(max_length=20.0, relative_score=0.0, known_score=1.0), there, 34.0) == [
+        (20.0, "max-length")
+    ]
+    s = Segmenter(config, 0.0, 5.0)
+    assert s.decide(2.0, 7.0, score=0.95).new_ground == pytest.approx(2.0)  # too early for a score to say anything
+    assert s.decide(6.0, 11.0, score=0.95, again=True).new_ground == pytest.approx(2.0)
+    assert s.copy().decide(8.0, 13.0, score=0.95).new_ground == pytest.approx(4.0)  # nowhere near its path
+    assert s.decide(8.0, 13.0, score=NAN, again=True).new_ground == pytest.approx(4.0)
+    assert s.copy().decide(10.0, 15.0, score=0.7).new_ground == pytest.approx(6.0)
+    assert s.new_ground == pytest.approx(4.0)
+    s.begin(8.0, 13.0)
+    assert s.decide(10.0, 16.0).new_ground == pytest.approx(3.0)
+
+
+def test_leaving_known_ground_is_no_drop() -> None:
+    """0.58 after 0.95 is below 0.65 of the maximum, but the maximum is that of a way driven twice."""
+    s = Segmenter(SegmentationConfig(), 0.0)
+    s.decide(20.0, 20.0, score=0.95, again=True)
+    d = s.decide(22.0, 22.0, score=0.58)
+    assert (d.ends, d.best_score) == (False, 0.8)
+    assert s.decide(24.0, 24.0, score=0.51).why == "relative-score"  # below 0.65 · 0.8
+    s = Segmenter(SegmentationConfig(), 0.0)
+    s.decide(20.0, 20.0, score=0.95)  # a map that foretells new ground so well must go on doing so
+    assert s.decide(22.0, 22.0, score=0.58).why == "relative-score"
 
 
 def test_periods_and_motion_error() -> None:

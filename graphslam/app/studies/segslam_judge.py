@@ -14,7 +14,7 @@ from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import Nees, exit_nees
 from frontends.segslam.paths import concatenate
 from frontends.segslam.result import SegSlamResult
-from frontends.segslam.sampling import grow, nearest_step, root_of_segment
+from frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
 from frontends.segslam.segmap import MATCH, SegMap
 from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_length, settle, settled_chain
 from frontends.steps import Steps
@@ -199,7 +199,7 @@ def path_at(result: SegSlamResult, step: int, number: int = 0) -> Trajectory:
     inside = chain[(t.start[chain] < step) & (t.end[chain] >= step)]
     at = int(inside[0]) if len(inside) else int(chain[0])
     rng = result.seed.child("visit", step, number).generator()
-    sample = grow(segmap, root_of_segment(segmap, at), rng, weights=t.weight[: len(segmap)])
+    sample = grow(segmap, root_of_segment(segmap, at), rng, weights=draw_weights(segmap))
     return concatenate(segmap, sample)
 
 
