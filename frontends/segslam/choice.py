@@ -42,8 +42,8 @@ class Proposal:
         Where the map sample puts the body in that map.
     sigma : float
         σ of the path-length model at that place [m].
-    travelled : float
-        Way from there to the body, through the sample [m].
+    rise : float
+        What heights may have drifted by over the way from there to the body [m].
     localisation : Localisation or None
         What the throw-away particle filter says of it.
     """
@@ -52,7 +52,7 @@ class Proposal:
     registration: Registration
     T_prior: Array
     sigma: float
-    travelled: float = 0.0
+    rise: float = 0.0
     localisation: Localisation | None = None
 
     @property
@@ -211,7 +211,7 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
     fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
     if p.fitness < c.fitness and not any("fitness" in f for f in fails):
         fails.append(f"fitness {p.fitness:.3f} < {c.fitness:g}")
-    if p.height > (height := c.height + c.height_per_metre * p.travelled):
+    if p.height > (height := c.height + p.rise):
         fails.append(f"height {p.height:.2f} m > {height:g}")
     if p.shift > c.shift * p.sigma:
         fails.append(f"shift {p.shift:.2f} m > {c.shift:g} σ of {p.sigma:.2f} m")

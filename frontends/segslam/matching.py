@@ -220,7 +220,7 @@ class Matcher:
                 starts = next((f for at, r, f in alike if np.linalg.norm((T - at)[:2]) <= 0.25 * min(r, radius)), None)
                 first = starts is None
                 if starts is None:
-                    height = [] if planar else [s.height + s.height_per_metre * float(way)]
+                    height = [] if planar else [s.height + self.config.winnowing.rise(float(way))]
                     starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(way))])
                     searches += 1
                 found = register_starts(cloud, target, starts, rules)
@@ -290,7 +290,7 @@ class Matcher:
                         registration=r,
                         T_prior=c.T_map_body[k],
                         sigma=float(c.sigma[k]),
-                        travelled=float(c.travelled[k]),
+                        rise=self.config.winnowing.rise(float(c.travelled[k])),
                         localisation=local,
                     )
                 )

@@ -173,7 +173,7 @@ def winnow_all(
     measure = flat / places.sigma
     far = measure > config.sigmas
     if g.dim == 3:
-        height = config.height + config.height_per_metre * places.way
+        height = config.height + config.rise(places.way)
         far |= np.abs(places.positions[:, 2] - at[..., 2]) > height
     measure[far] = np.inf
     ends = [*places.first[1:].tolist(), len(places.owner)]
@@ -212,7 +212,7 @@ def _known(
         T = g.compose(T_map, T_seg_body[k])
         half = np.full(g.dim, 0.5 * config.near)
         half[:2] += config.sigmas * places.sigma[nearest[k]]
-        half[2:] += config.height + config.height_per_metre * places.way[nearest[k]]
+        half[2:] += config.height + config.rise(places.way[nearest[k]])
         count = int(box_query(grid, (T[: g.dim] - half)[None], (T[: g.dim] + half)[None]).known[0])
         if count < config.known:
             tally.unknown += 1

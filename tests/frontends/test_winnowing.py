@@ -142,7 +142,7 @@ def test_levels_above_each_other_are_told_apart() -> None:
     sample = _sample(m, 60)
     at = np.tile(up, (2, 1))
     at[1, 2] = -3.1  # back on the first level
-    c = WinnowConfig(gap=25.0, known=5, height_per_metre=0.0)
+    c = WinnowConfig(gap=25.0, known=5)
     high, low = (winnow(m, sample, T, 60, c) for T in at)
     assert high.segments.tolist() == low.segments.tolist() == [0]
     # each finds the part of the path on its own level: the ends lie over each other
@@ -152,7 +152,7 @@ def test_levels_above_each_other_are_told_apart() -> None:
     # heights drift with the way: 30 m of it since the nearest pose
     for rise, found in ((1.7, 1), (1.6 + 0.005 * high.travelled[0] + 0.05, 0)):
         moved = at[0] + [0, 0, rise, 0, 0, 0, 0]
-        assert len(winnow(m, sample, moved, 60, WinnowConfig(gap=25.0, known=5))) == found
+        assert len(winnow(m, sample, moved, 60, WinnowConfig(gap=25.0, known=5, height_per_metre=5e-3))) == found
 
 
 def test_merged_maps_are_asked_in_their_own_frame() -> None:
