@@ -20,7 +20,7 @@ from graphslam.app.studies.segslam_mine import STUDY as MINE
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE2, SE3, heading_of, level
 from graphslam.core.trajectory import Trajectory
 
 STUDIES = {"segslam-garage": GARAGE, "segslam-mine": MINE, "segslam-building": BUILDING}
@@ -167,6 +167,8 @@ def test_mine_and_building_measure_what_they_are_for(tables: dict[str, tuple[pd.
     assert mean(table, "segslam-5", "entropy_min") <= mean(table, "segslam-5", "entropy")
     assert 1 <= mean(table, "rbpf-5", "entropy_samples") <= 3
     assert mean(table, "segslam-5", "entropy_samples") == 3
+    assert mean(table, "segslam-5", "known_volume") > mean(table, "segslam-5", "entropy_min")
+    assert mean(table, "segslam-5", "height_rmse") < 1.0
     assert mean(table, "segslam-5", "leg_angle") < mean(table, "dead-reckoning", "leg_angle")
 
 
@@ -185,6 +187,9 @@ def test_errors_of_a_path(trial: GridTrial) -> None:
     assert e.anchored == pytest.approx(0.5 / np.sqrt(len(truth)), rel=1e-6)
     assert 0.0 < e.aligned <= e.anchored
     assert judge.path_errors(Trajectory(times, moved), truth, truth[-1]).final == pytest.approx(0.0, abs=1e-9)
+    assert e.height == pytest.approx(0.0, abs=1e-9)
+    moved[1:, 2] += 0.2
+    assert judge.path_errors(Trajectory(times, moved), truth).height == pytest.approx(0.2, rel=0.01)
 
 
 def test_dead_reckoning_is_what_one_particle_does(trial: GridTrial) -> None:
@@ -201,6 +206,39 @@ def test_fused_map_is_the_map_of_a_filter_on_the_same_path(trial: GridTrial) -> 
     np.testing.assert_array_equal(grid.brick_values(), own.brick_values())
     true = judge.fused_grid(trial.steps, trial.truth, model=trial.config.filter.beam_model())
     assert true.entropy() < 0.95 * grid.entropy()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_placements_of_a_grid_fill_a_voxel_and_a_quarter_turn(dim: int) -> None:
+    group = SE3 if dim == 3 else SE2
+    np.testing.assert_array_equal(judge.placements(1, 0.2, dim), group.identity[None])
+    T = judge.placements(4, 0.2, dim)
+    assert T.shape == (4, group.size)
+    assert np.all((T[:, :dim] >= 0.0) & (T[:, :dim] < 0.2))
+    np.testing.assert_allclose(heading_of(T), np.pi / 2 * np.array([0.125, 0.375, 0.625, 0.875]))
+    np.testing.assert_allclose(level(T), T, atol=1e-12)
+    for axis in range(dim):  # no half of the voxel is left out
+        assert len(np.unique(T[:, axis])) == 4
+        assert T[:, axis].min() < 0.1 < T[:, axis].max()
+    if dim == 3:
+        np.testing.assert_allclose(T[:, 2], [0.025, 0.075, 0.125, 0.175])
+
+
+def test_clarity_is_the_mean_over_grids_that_stand_differently(trial: GridTrial) -> None:
+    steps, model = trial.steps, trial.config.filter.beam_model()
+    one = judge.clarity(steps, trial.truth, model=model)
+    grid = judge.fused_grid(steps, trial.truth, model=model)
+    assert (one.entropy, one.volume) == (grid.entropy(), grid.known_volume())
+    moved = [SE3.compose(np.broadcast_to(T, trial.truth.shape), trial.truth) for T in judge.placements(2, 0.2, 3)]
+    grids = [judge.fused_grid(steps, path, model=model) for path in moved]
+    two = judge.clarity(steps, trial.truth, model=model, count=2)
+    assert two.entropy == pytest.approx(np.mean([g.entropy() for g in grids]))
+    assert two.volume == pytest.approx(np.mean([g.known_volume() for g in grids]))
+    assert two.entropy != one.entropy
+    # a map pressed together has less in it
+    pressed = trial.truth.copy()
+    pressed[:, :3] *= 0.5
+    assert judge.clarity(steps, pressed, model=model).volume < 0.9 * one.volume
 
 
 def test_steps_of_the_way_are_where_the_way_is(trial: GridTrial) -> None:

@@ -19,7 +19,7 @@ from frontends.segslam.segmap import MATCH, SegMap
 from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_length, settle, settled_chain
 from frontends.steps import Steps
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.poses import group_of, heading_of, level
+from graphslam.core.poses import SE2, SE3, group_of, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
@@ -50,12 +50,15 @@ class PathErrors:
         Of the last pose [m], [rad].
     anchored, aligned : float
         RMS of the positions [m], with the first poses in the same place, and after a rigid alignment of all.
+    height : float
+        RMS of the heights [m], with the first poses in the same place; 0 in two dimensions.
     """
 
     final: float
     final_yaw: float
     anchored: float
     aligned: float
+    height: float
 
 
 def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None) -> PathErrors:
@@ -78,6 +81,7 @@ def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None)
         final_yaw=float(np.abs(wrap_angle(heading_of(last) - heading_of(true[-1])))),
         anchored=ate(moved, reference, alignment="none").statistics.rmse,
         aligned=ate(moved, reference, alignment="se").statistics.rmse,
+        height=float(np.sqrt(np.mean((est[:, 2] - true[:, 2]) ** 2))) if group.dim == 3 else 0.0,
     )
 
 
@@ -297,6 +301,62 @@ def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: Bea
         if len(points):
             grid.insert_scan(points, origins, pose=path[k], max_range=steps.max_range, returns=returns)
     return grid
+
+
+def placements(count: int, voxel_size: float, dim: int) -> Array:
+    """Poses ``(count, 7)`` or ``(count, 3)`` of a path's frame in a grid, none of them favoured.
+
+    Headings over a quarter turn, and positions, heights foremost, over a voxel, both spread evenly. A single one is the
+    identity.
+    """
+    group = SE3 if dim == 3 else SE2
+    tangents = np.zeros((count, group.dof))
+    if count > 1:
+        share = (np.arange(count) + 0.5) / count
+        tangents[:, group.heading] = 0.5 * np.pi * share
+    poses = group.exp(tangents)
+    if count > 1:
+        # of a golden section the multiples fill a voxel evenly, whatever their number
+        golden = 0.5 * (np.sqrt(5.0) - 1.0)
+        shares = np.stack([golden * np.arange(1, count + 1) % 1.0, golden**2 * np.arange(1, count + 1) % 1.0, share], 1)
+        poses[:, :dim] = voxel_size * shares[:, :dim]
+    return poses
+
+
+@dataclass(frozen=True, slots=True)
+class Clarity:
+    """How clear a map is.
+
+    Parameters
+    ----------
+    entropy : float
+        Mean over the placements [nat m³].
+    volume : float
+        Volume of what was observed, likewise [m³]: a map that is folded onto itself knows less of the world, and has
+        less entropy for that.
+    """
+
+    entropy: float
+    volume: float
+
+
+def clarity(
+    steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None, count: int = 1
+) -> Clarity:
+    """Entropy of all scans along a path ``(n, d)``, in grids that stand in ``count`` different ways.
+
+    Where the voxels lie counts: a floor in the middle of its layer is clear, one between two layers is not. A filter
+    that has one map all along pulls its path to where that map's voxels are clearest; map samples are put together of
+    segments with maps of their own, and cannot have that in one frame.
+    """
+    group = group_of(path)
+    grids = [
+        fused_grid(steps, group.compose(np.broadcast_to(T, path.shape), path), voxel_size=voxel_size, model=model)
+        for T in placements(count, voxel_size, steps.dim)
+    ]
+    return Clarity(
+        entropy=float(np.mean([g.entropy() for g in grids])), volume=float(np.mean([g.known_volume() for g in grids]))
+    )
 
 
 def quarters(seconds: Array) -> tuple[float, float]:

@@ -79,6 +79,8 @@ class GridTrialConfig:
     """What is measured beside the errors of the path and the times."""
     samples: int = 1
     """Map samples, or particles of a filter, whose entropy is taken at most."""
+    placements: int = 1
+    """Ways in which the grid of each stands (see :func:`~graphslam.app.studies.segslam_judge.clarity`)."""
     crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
     """The robot."""
     steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))
@@ -93,8 +95,8 @@ class GridTrialConfig:
     def __post_init__(self) -> None:
         for name in self.algorithms:
             family_of(name)
-        if len(set(self.algorithms)) != len(self.algorithms) or self.samples < 1:
-            raise ConfigError("trial of grids: an algorithm stands twice, or no sample is wanted")
+        if len(set(self.algorithms)) != len(self.algorithms) or min(self.samples, self.placements) < 1:
+            raise ConfigError("trial of grids: an algorithm stands twice, or no sample or placement is wanted")
 
     def make_world(self, seed: int) -> World:
         """The world of a seed, which moves what can be moved in it."""
@@ -192,6 +194,7 @@ class GridTrial:
         yield Measurement(name, "final_yaw", e.final_yaw)
         yield Measurement(name, "ate_anchored", e.anchored)
         yield Measurement(name, "ate_aligned", e.aligned)
+        yield Measurement(name, "height_rmse", e.height)
         for part, seconds in outcome.seconds.items():
             yield Measurement(name, f"seconds_{part}", seconds, timing=True)
         if result is not None:
@@ -242,10 +245,12 @@ class GridTrial:
         """Entropy of the scans fused along map samples, or along particles' own paths, the best first."""
         found = []
         for poses in self._hypotheses(outcome):
-            grid = judge.fused_grid(self.steps, poses, voxel_size=0.2, model=self.config.filter.beam_model())
-            found.append(grid.entropy())
-        yield Measurement(name, "entropy", found[0])
-        yield Measurement(name, "entropy_min", min(found))
+            model = self.config.filter.beam_model()
+            found.append(judge.clarity(self.steps, poses, voxel_size=0.2, model=model, count=self.config.placements))
+        best = min(found, key=lambda c: c.entropy)
+        yield Measurement(name, "entropy", found[0].entropy)
+        yield Measurement(name, "entropy_min", best.entropy)
+        yield Measurement(name, "known_volume", best.volume)
         yield Measurement(name, "entropy_samples", len(found))
 
     def _hypotheses(self, outcome: Outcome) -> Iterator[Array]:
