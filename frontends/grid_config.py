@@ -64,6 +64,9 @@ class GridFilterConfig:
     its particle takes the mean evidence of the older ones. 12 are 5 s, after which a spun scanner has seen all round
     once and a walking robot's scans overlap."""
 
+    full_walk: int = 20
+    """With fewer particles the walks below are σ times √(N / this): where few stand for many, wide noise throws them
+    farther off than it lets them find."""
     motion_scale: float = 1.0
     """Factor on the σ of the odometry."""
     position_walk: float = 0.025
@@ -83,7 +86,14 @@ class GridFilterConfig:
     """Threads that weigh and update maps; the result is the same for any number."""
 
     def __post_init__(self) -> None:
-        for name, least in (("particles", 1), ("weight_beams", 1), ("threads", 1), ("map_beams", 0), ("young", 0)):
+        for name, least in (
+            ("particles", 1),
+            ("weight_beams", 1),
+            ("threads", 1),
+            ("map_beams", 0),
+            ("young", 0),
+            ("full_walk", 1),
+        ):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ {least}")
         if not 0.0 < self.ess_fraction <= 1.0:

@@ -31,9 +31,11 @@ def motion_covariance(increment: Array, covariance: Array, config: GridFilterCon
     """
     planar = len(increment) == 3
     path = float(np.linalg.norm(increment[: 2 if planar else 3]))
-    position, height, tilt = (w * w * path for w in (config.position_walk, config.height_walk, config.tilt_walk))
+    share = min(1.0, config.particles / config.full_walk)
+    walks = (config.position_walk, config.height_walk, config.tilt_walk)
+    position, height, tilt = (share * w * w * path for w in walks)
     turn = abs(float(increment[2])) if planar else 2.0 * float(np.arctan2(abs(increment[5]), abs(increment[6])))
-    heading = config.heading_walk**2 * path + config.heading_turn**2 * turn
+    heading = share * (config.heading_walk**2 * path + config.heading_turn**2 * turn)
     if planar:
         added = [position, position, heading]
     else:

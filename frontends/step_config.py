@@ -51,6 +51,9 @@ class StepConfig:
     then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""
     odometry_tilt_time: float = 10.0
     """Time over which errors of these stay alike [s]."""
+    level_floors: bool = False
+    """The floors driven on are level on the whole, as in buildings: what gravity's roll and pitch show in the median
+    over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did."""
     longest_record: float = 20.0
     """Longest time that one record of odometry may take: it tells the whole motion, not how it went [s]."""
 

@@ -205,7 +205,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         returns=met,
         max_range=config.max_range or max(s.max_range for s in sources),
         range_sigma=max(s.sigma for s in sources),
-        tilt=motion.tilt,
+        tilt=level_on_the_whole(motion.tilt, motion.odometry.increments) if config.level_floors else motion.tilt,
         tilt_sigma=motion.tilt_sigma,
         tilt_time=motion.tilt_time,
         uses=frozenset((*source.names, *names)),
@@ -214,6 +214,19 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         errors=motion.errors,
     )
     return match_neighbours(steps, drops=drops) if config.match_scans else steps
+
+
+def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
+    """Roll and pitch ``(n, 2)`` [rad] without their median over the steps in which the body moved.
+
+    On level floors the body stands level whatever way it heads, and ramps are less than half of the way, and lead up as
+    often as down; so the median is that part of gravity's error that lasts.
+    """
+    if tilt is None:
+        return None
+    way = np.linalg.norm(increments[:, :3], axis=1)
+    moved = way > 0.5 * float(np.median(way))
+    return tilt - np.median(tilt[moved if moved.any() else slice(None)], axis=0)
 
 
 def _scanners(log: SensorLog) -> tuple[str, ...]:

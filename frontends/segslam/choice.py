@@ -205,7 +205,7 @@ def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
 
 
 def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
-    r = p.registration
+    r, g = p.registration, group_of(p.T)
     if not r.converged or not np.all(np.isfinite(p.T)):
         return ["nothing: " + (r.why or "the result is not finite").replace("; ", ", ")]
     fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
@@ -215,6 +215,11 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
         fails.append(f"height {p.height:.2f} m > {height:g}")
     if p.shift > c.shift * p.sigma:
         fails.append(f"shift {p.shift:.2f} m > {c.shift:g} σ of {p.sigma:.2f} m")
+    sigma = np.sqrt(np.diag(r.covariance))
+    if p.localisation is None and (
+        sigma[g.position].max() > c.vague_position or np.delete(sigma, g.position).max() > c.vague_angle
+    ):
+        fails.append("vague")
     if margin < c.margin:
         fails.append(f"margin {margin:.3f} < {c.margin:g}")
     if c.method != "registration" and p.localisation is None:

@@ -210,6 +210,10 @@ class ChoiceConfig:
     margin: float = 0.1
     """A second mode must be worse by this share of the points: in simulated mines right matches were better than any
     other by 0.10 and more, wrong ones by 0.03 to 0.09 …"""
+    vague_position: float = 0.4
+    """A match is not taken whose own σ is above this in some direction [m]: nothing there holds it …"""
+    vague_angle: float = 0.04
+    """… or above this about some axis [rad]."""
     rivals: float = 0.15
     """In the maps that other particles made of the same steps only modes are tried that in the first were worse by no
     more than this; less than ``margin`` would hide second modes."""
@@ -235,7 +239,8 @@ class ChoiceConfig:
             self,
             "choice",
             positive=(
-                "every", "shift", "fitness_sigma", "error_sigma", "spread_sigma", "null_weight", "position_sigma",
+                "every", "shift", "vague_position", "vague_angle", "fitness_sigma", "error_sigma", "spread_sigma",
+                "null_weight", "position_sigma",
                 "angle_sigma",
             ),
             unit=("fitness", "margin", "rivals"),

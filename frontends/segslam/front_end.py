@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from frontends.drift import DriftModel
+from frontends.filter_drift import FilterDrift
 from frontends.grid_config import GridFilterConfig
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segslam import run_segslam
-from frontends.segslam.submaps import drift_by_length, settle, settled_chain
+from frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from frontends.step_config import StepConfig
 from frontends.steps import make_steps
 from graphslam.core.log import DropCounter, SensorLog
@@ -29,8 +29,8 @@ class SegSlamFrontEndConfig:
     """Particles, motion, weights."""
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
     """Segmentation, matching, what is handed over."""
-    drift: DriftModel = field(default_factory=DriftModel)
-    """Errors that all particles share, by the length of the segment; its dimension is that of the log."""
+    drift: FilterDrift = field(default_factory=FilterDrift)
+    """Errors that all particles share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,22 +57,22 @@ class SegSlam:
                 yield submap
 
 
-def settled(result: SegSlamResult, drift: DriftModel, config: SegSlamConfig) -> list[Submap]:
+def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:
     """Submaps of the best particle's chain.
 
     Parameters
     ----------
     result : SegSlamResult
-    drift : DriftModel
-        Errors that all particles share; its dimension is taken from the result.
+    drift : FilterDrift
+        Errors that all particles share.
     config : SegSlamConfig
     """
     segmap, steps = result.segmap, result.steps
-    model = replace(drift, dim=steps.dim)
+    chain = settled_chain(segmap, int(result.closed[result.best]))
     return settle(
         segmap,
-        settled_chain(segmap, int(result.closed[result.best])),
-        drift_by_length(steps.path_length, model),
+        chain,
+        drift_by_path(segmap, chain, drift),
         config.handover,
         uses=steps.uses,
         reasons={b.step: b.why for b in result.boundaries},

@@ -14,6 +14,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
+from frontends.filter_drift import FilterDrift
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import exit_covariance
@@ -53,6 +54,16 @@ def drift_by_length(path_length: Array, model: LengthDrift) -> Drift:
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
         return np.asarray(model(float(path_length[end] - path_length[start])), dtype=np.float64)
+
+    return drift
+
+
+def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift) -> Drift:
+    """What a filter of so many particles leaves of the errors along the paths of the segments of a chain."""
+    paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
+
+    def drift(start: int, end: int, *, level_end: bool) -> Array:
+        return model.covariance(paths[start][: end - start + 1], segmap.particles, gravity=segmap.gravity and level_end)
 
     return drift
 

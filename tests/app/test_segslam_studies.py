@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from frontends.drift import DriftModel
+from frontends.filter_drift import FilterDrift
 from frontends.rbpf_grid import RbpfResult
 from frontends.segslam.result import SegSlamResult
 from graphslam.app.studies import segslam_judge as judge
@@ -318,7 +318,7 @@ def test_legs_of_the_way_are_straight(trial: GridTrial) -> None:
 
 def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) -> None:
     """One particle has no spread: its NEES is that of the drift model, written out."""
-    model = DriftModel(heading_scale=0.01, position_scale=0.05)
+    model = FilterDrift(heading_walk=0.02, position_walk=0.05)
     e = judge.exit_errors(single, trial.truth, model)
     t = single.segmap.table
     for k, i in enumerate(single.segmap.chain(int(single.closed[0])).tolist()):
@@ -328,7 +328,8 @@ def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) 
         x = SE3.log(SE3.between(est, true))[2:]
         L = float(single.steps.path_length[b] - single.steps.path_length[a])
         assert e.lengths[k] == pytest.approx(L)
-        assert e.default.values[k] == pytest.approx(x @ np.linalg.solve(model(L)[2:, 2:], x), rel=1e-6)
+        D = model.covariance(t.paths[i], 1)[2:, 2:]
+        assert e.default.values[k] == pytest.approx(x @ np.linalg.solve(D, x), rel=1e-6)
         floor = np.array([1e-3, 0.01, 0.01, 0.01])
         assert e.matched.values[k] == pytest.approx(np.sum((x / floor) ** 2), rel=1e-6)
         np.testing.assert_allclose(e.default.errors[k], x, atol=1e-12)

@@ -98,15 +98,26 @@ def test_on_a_ramp_a_match_is_as_tilted_as_the_prediction_and_one_on_the_flat_is
     assert counts(flat, ramp) == counts(ramp, flat) == {"tilt": 1, "accepted": 0}
 
 
+def test_a_match_that_nothing_holds_in_some_direction_is_refused() -> None:
+    fine, wide, turned = (
+        np.diag([1e-6] * 3 + [1e-4] * 3),
+        np.diag([1e-6] * 3 + [1e-4, 0.17, 1e-4]),
+        np.diag([1e-6, 1e-6, 0.0017] + [1e-4] * 3),
+    )
+    j = judge([proposal(k, covariance=C_) for k, C_ in enumerate((fine, wide, turned))], C, RULES)
+    assert j.why == ("", "vague", "vague")
+    assert j.accepted.tolist() == [0]
+
+
 def test_a_rival_in_the_same_map_takes_both_out_and_elsewhere_none() -> None:
     """One pillar on, 8 m away, fits as well: nobody knows which. The same fit in another map is another hypothesis."""
     wide = 10.0
     near = [proposal(fitness=0.93, sigma=wide), proposal(fitness=0.92, x=8.0, sigma=wide)]
     assert judge(near, C, RULES).counts() == {"margin": 2, "accepted": 0}
-    clear = [proposal(fitness=0.93, sigma=wide), proposal(fitness=0.88, x=8.0, sigma=wide)]
+    clear = [proposal(fitness=0.97, sigma=wide), proposal(fitness=0.86, x=8.0, sigma=wide)]
     j = judge(clear, C, RULES)
     assert j.accepted.tolist() == [0]
-    np.testing.assert_allclose(j.margins, [0.05, -0.05])
+    np.testing.assert_allclose(j.margins, [0.11, -0.11])
     # a mode within 1.5 m is the same place; one that fits too badly for the gate still speaks against its rival
     assert judge([proposal(fitness=0.93), proposal(fitness=0.92, x=1.4)], C, RULES).accepted.tolist() == [0, 1]
     assert (

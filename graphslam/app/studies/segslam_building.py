@@ -24,7 +24,7 @@ import pandas as pd
 from frontends.segslam.config import SegmentationConfig, SegSlamConfig
 from graphslam.app.studies import segslam_report as tables
 from graphslam.app.studies.segslam_garage import path_figure
-from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
+from graphslam.app.studies.segslam_trial import DEAD_RECKONING, LEVEL, QUICK, Figure, GridStudy, GridTrialConfig
 from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
 
@@ -35,7 +35,13 @@ _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")
 SEGSLAM = SegSlamConfig(segmentation=SegmentationConfig(max_length=120.0))
 WORLDS = {
     "building": GridTrialConfig(
-        world="building", algorithms=_ALGORITHMS, figures=_FIGURES, samples=20, placements=4, segslam=SEGSLAM
+        world="building",
+        algorithms=_ALGORITHMS,
+        figures=_FIGURES,
+        samples=20,
+        placements=4,
+        segslam=SEGSLAM,
+        steps=LEVEL,
     )
 }
 QUICK_WORLDS = {

@@ -29,7 +29,15 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig, family_of
+from graphslam.app.studies.segslam_trial import (
+    DEAD_RECKONING,
+    LEVEL,
+    QUICK,
+    Figure,
+    GridStudy,
+    GridTrialConfig,
+    family_of,
+)
 from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
@@ -45,7 +53,7 @@ def _algorithms(numbers: tuple[int, ...]) -> tuple[str, ...]:
 
 WORLDS = {
     f"garage-{layout}": GridTrialConfig(
-        world="garage", layout=layout, algorithms=_algorithms(NUMBERS), figures=_FIGURES
+        world="garage", layout=layout, algorithms=_algorithms(NUMBERS), figures=_FIGURES, steps=LEVEL
     )
     for layout in ("A", "B", "C")
 }

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from frontends.filter_drift import FilterDrift
 from frontends.grid_motion import move, tilted
 from frontends.segslam.config import HandoverConfig
-from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import Nees, exit_nees
 from frontends.segslam.paths import concatenate
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
 from frontends.segslam.segmap import MATCH, SegMap
-from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_length, settle, settled_chain
+from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 from frontends.steps import Steps
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.poses import SE2, SE3, group_of, heading_of, level
@@ -256,7 +256,7 @@ class ExitErrors:
     stated: Nees
 
 
-def exit_errors(result: SegSlamResult, truth: Array, drift: LengthDrift) -> ExitErrors:
+def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> ExitErrors:
     """Exits of the settled chain against the truth: each end as seen from its own start, both level where frames are.
 
     Parameters
@@ -264,17 +264,16 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: LengthDrift) -> Exit
     result : SegSlamResult
     truth : (n, 7) or (n, 3)
         At the steps.
-    drift : callable
-        Path length [m] → covariance ``(d, d)``.
+    drift : FilterDrift
     """
     segmap, steps = result.segmap, result.steps
     g = segmap.group
     chain = settled_chain(segmap, int(result.closed[result.best]))
-    by_length = drift_by_length(segmap.path_length, drift)
-    stated: Drift = by_length if steps.errors is None else drift_by_errors(steps.errors, gravity=segmap.gravity)
+    by_path = drift_by_path(segmap, chain, drift)
+    stated: Drift = by_path if steps.errors is None else drift_by_errors(steps.errors, gravity=segmap.gravity)
     made = [
         settle(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
-        for d, m in ((by_length, False), (by_length, True), (stated, False))
+        for d, m in ((by_path, False), (by_path, True), (stated, False))
     ]
     t = segmap.table
     ends = level(truth) if segmap.gravity else truth
