@@ -9,7 +9,7 @@ import pytest
 
 from frontends.deskew import assign, cut_beams, spread
 from frontends.reckoned import Reckoned
-from frontends.steps import StepConfig, Steps, make_steps
+from frontends.steps import StepConfig, Steps, level_on_the_whole, make_steps
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_transform
@@ -288,6 +288,38 @@ def test_motion_of_an_imu_and_wheels() -> None:
     biased = make_steps(log, StepConfig(yaw_bias=0.02))
     turned = se3.so3_log(se3.se3_between(biased.errors.poses[-1], steps.errors.poses[-1])[3:])
     assert turned[2] == pytest.approx(-0.02 * (steps.times[-1]), rel=0.05)
+
+
+def test_level_floors_tell_what_gravity_is_off_by(rng: np.random.Generator) -> None:
+    """Out on the flat, up a ramp, on, down another, and back: the median is the lasting error, whatever the ramps."""
+    lasting = np.array([0.004, -0.0055])
+    tilt = lasting + 0.004 * rng.standard_normal((600, 2))
+    tilt[100:160, 1] -= 0.12
+    tilt[380:440, 1] += 0.12
+    increments = np.zeros((600, 7))
+    increments[:, 0], increments[:, 6] = 0.25, 1.0
+    # a long stand on a slope says nothing of floors
+    increments[:200, 0] = np.where(np.arange(200) < 90, 0.0, 0.25)
+    tilt[:90] += 0.08
+    level = level_on_the_whole(tilt, increments)
+    assert level is not None
+    taken = tilt - level
+    np.testing.assert_allclose(taken, np.broadcast_to(taken[0], taken.shape), atol=1e-15)  # one number each
+    np.testing.assert_allclose(taken[0], lasting, atol=8e-4)
+    assert level_on_the_whole(None, increments) is None
+    still = level_on_the_whole(tilt, np.tile([0.0, 0, 0, 0, 0, 0, 1], (600, 1)))
+    assert still is not None
+    assert np.all(np.isfinite(still))
+
+
+def test_steps_on_level_floors() -> None:
+    d = drive(np.random.default_rng(0), seconds=8.0)
+    scans = room_scans(d.truth, np.array([40.0, 40.0, 4.0]), beams=7, max_range=12.0)
+    log = SensorLog(name="crawler", streams={"imu": d.imu, "wheels": d.wheels, "scanner": scans}, truth=Truth(d.truth))
+    plain, level = make_steps(log), make_steps(log, StepConfig(level_floors=True))
+    np.testing.assert_array_equal(level.tilt, level_on_the_whole(plain.tilt, plain.odometry.increments))
+    assert np.abs(level.tilt - plain.tilt).max() > 1e-3
+    np.testing.assert_array_equal(plain.odometry.increments, level.odometry.increments)
 
 
 def planar_log(**more: object) -> SensorLog:

@@ -122,6 +122,22 @@ def test_one_particle_without_matches_is_dead_reckoning() -> None:
     np.testing.assert_allclose(r.final_pose, _dead_reckoning(steps), atol=1e-9)
 
 
+def test_ground_driven_again_does_not_fill_a_segment() -> None:
+    """One and a half rounds of 37 m without matches: 60 m of way, but 37 m of ground."""
+
+    def cuts(**more: float) -> list[str]:
+        segmentation = SegmentationConfig(
+            window=2.0, max_length=45.0, score=0.0, relative_score=1e-6, excluded=3.0, known_gap=10.0, **more
+        )
+        config = replace(CONFIG, segmentation=segmentation, winnowing=WinnowConfig(gap=1e6))
+        r = run_segslam(world(0, 2, 0.002), GridFilterConfig(particles=10), config, SeedTree(0))
+        return [b.why for b in r.boundaries]
+
+    assert cuts(known_score=0.6) == ["end-of-log"]
+    assert cuts(known_score=1.0) == ["max-length", "end-of-log"]
+    assert cuts(known_score=0.6, known_radius=0.0) == ["max-length", "end-of-log"]  # its path never passed so near
+
+
 def test_decisions_of_each_particle_leave_segments_of_different_lengths() -> None:
     config = replace(CONFIG, segmentation=replace(CONFIG.segmentation, decide="particle", score=0.9))
     r = run(0, 2, config=config)
