@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -48,14 +49,26 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
     spacing = np.diff(known)
     usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else limit
     k = np.flatnonzero((spacing > max(3.0 * usual, 0.05)) & (known[1:] > begin) & (known[:-1] < end))
-    if len(k) and spacing[k].max() > limit:
-        worst = int(k[np.argmax(spacing[k])])
-        raise DataError(
-            f"gap without records: {spacing[worst]:.3f} s after record {worst}",
-            where=where,
-            got=f"{known[worst]:.3f} to {known[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s",
-        )
+    refuse_long(known, k, limit, where)
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
     return Gaps(known[k], known[k + 1])
+
+
+def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str) -> None:
+    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds.
+
+    Raises
+    ------
+    DataError
+        Names the longest.
+    """
+    spacing = np.diff(stamps)
+    if len(gaps) and spacing[gaps].max() > limit:
+        worst = int(gaps[np.argmax(spacing[gaps])])
+        raise DataError(
+            f"gap without records: {spacing[worst]:.3f} s after record {worst}",
+            where=where,
+            got=f"{stamps[worst]:.3f} to {stamps[worst + 1]:.3f} s",
+            wanted=f"gaps of at most {limit:g} s",
+        )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from frontends.gaps import refuse_long
 from frontends.motion import MotionNoise, recorded_odometry
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -123,14 +124,7 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
         return odometry
     spacing = np.diff(odometry.times)
     k = np.flatnonzero(spacing > max(3.0 * float(np.median(spacing)), 1.0))
-    if len(k) and spacing[k].max() > limit:
-        worst = int(k[np.argmax(spacing[k])])
-        raise DataError(
-            f"gap without records: {spacing[worst]:.3f} s after record {worst}",
-            where=where,
-            got=f"{odometry.times[worst]:.3f} to {odometry.times[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s",
-        )
+    refuse_long(odometry.times, k, limit, where)
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
     g = group_of(odometry.increments)
