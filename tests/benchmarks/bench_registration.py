@@ -200,6 +200,10 @@ def times() -> None:
     plain = SearchConfig(refine=False)
     print("search, not refined:", seconds(lambda: correlative_search(scan, field, start, half, steps, config=plain)))
     turn = (*half[:3], np.pi)
+    wide, rough = (30.0, 30.0, 2.4, 0.8), (0.8, 0.8, 0.8, 0.1)
+    coarse = SearchField(points, cell=0.4, sigma=0.6)
+    print("search, ± 30 m, coarse and fine:", seconds(
+        lambda: correlative_search(scan, field, start, wide, rough, coarse=coarse)))  # fmt: skip
     print("search, whole turn:", seconds(lambda: correlative_search(scan, field, start, turn, steps), 3))
 
     def prepare() -> Target:

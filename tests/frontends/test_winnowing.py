@@ -8,7 +8,7 @@ import pytest
 from frontends.segslam.config import WinnowConfig
 from frontends.segslam.sampling import MapSample, grow, root_of_particle, root_of_segment
 from frontends.segslam.segmap import Entry, SegMap
-from frontends.segslam.winnowing import Candidates, Winnowed, winnow
+from frontends.segslam.winnowing import Candidates, Winnowed, winnow, winnow_all
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.evidence.grid import EvidenceGrid
 from tests.reference.segmap_twin import match_entry, straight
@@ -169,3 +169,18 @@ def test_a_closed_root_is_no_candidate_of_itself() -> None:
     s = grow(m, root_of_segment(m, 0), np.random.default_rng(0))
     found = winnow(m, s, np.zeros(3), int(4 * SIDE), WinnowConfig(gap=0.0, sigma=50.0, keep=9))
     assert 0 not in found.segments
+
+
+def test_particles_that_share_a_sample_get_what_each_gets_alone() -> None:
+    m, step = block(0.05), int(4 * SIDE) + 5
+    sample, c = _sample(m, step), WinnowConfig(gap=25.0, keep=3)
+    poses = np.random.default_rng(2).normal([5.0, 0.0, 0.0], [3.0, 3.0, 0.2], (12, 3))
+    together, alone = Winnowed(), Winnowed()
+    found = winnow_all(m, sample, poses, step, c, tally=together)
+    assert len({len(f) for f in found}) > 1
+    for pose, f in zip(poses, found):
+        one = winnow(m, sample, pose, step, c, tally=alone)
+        for name in ("segments", "T_map_body", "distance", "travelled", "sigma", "known"):
+            np.testing.assert_array_equal(getattr(f, name), getattr(one, name))
+    assert together == alone
+    assert [len(f) for f in winnow_all(m, sample, poses, step, WinnowConfig(gap=1e6))] == [0] * 12
