@@ -47,9 +47,11 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
 def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
 
-    Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set.
+    Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
+    (``garage-A``) that of the world.
     """
-    values = cfg.preset(f"{log.name.partition('/')[0]}.{frontend}")
+    name = log.name.partition("/")[0]
+    values = cfg.preset(f"{name}.{frontend}") or cfg.preset(f"{name.rpartition('-')[0]}.{frontend}")
     noise = log.meta.get("noise", {})
     simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
     if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):

@@ -10,8 +10,11 @@ import pandas as pd
 import pytest
 
 from frontends.filter_drift import FilterDrift
-from frontends.rbpf_grid import RbpfResult
+from frontends.rbpf_grid import RbpfGridConfig, RbpfResult
+from frontends.segslam.front_end import SegSlamFrontEndConfig
 from frontends.segslam.result import SegSlamResult
+from graphslam.app import config as cfg
+from graphslam.app.front_ends import recommended
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies import segslam_trial
 from graphslam.app.studies.segslam_building import STUDY as BUILDING
@@ -20,6 +23,7 @@ from graphslam.app.studies.segslam_mine import STUDY as MINE
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
+from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, level
 from graphslam.core.trajectory import Trajectory
 
@@ -341,3 +345,16 @@ def test_small_helpers() -> None:
     assert judge.distinct(np.array([[1, 1], [2, 2], [1, 1], [3, 3]]), 2) == [0, 1]
     assert judge.distinct(np.array([[1, 1], [1, 1], [3, 3]]), 5) == [0, 2]
     assert judge.nearest(np.array([0.0, 1.0, 2.0]), 1.6) == 2
+
+
+@pytest.mark.parametrize("world", ["garage-C", "mine", "building"])
+def test_presets_are_the_settings_of_the_studies(world: str) -> None:
+    """Who simulates a world and runs a front end on it gets what the study has figures of."""
+    study = {**GARAGE.full, **MINE.full, **BUILDING.full}[world]
+    log = SensorLog(name=world, streams={})
+    segslam = cfg.build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    assert (segslam.steps, segslam.filter, segslam.segslam, segslam.drift) == (
+        study.steps, study.filter, study.segslam, study.drift,
+    )  # fmt: skip
+    rbpf = cfg.build(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
+    assert (rbpf.steps, rbpf.filter) == (study.steps, study.filter)
