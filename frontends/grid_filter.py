@@ -139,7 +139,8 @@ class GridFilter:
     first : int
         Step at which the particles stand at the start pose; nothing before it is read.
     start : (7,), (3,), or (N, …), optional
-        ``T_map_body`` at that step; default the origin. Where gravity is measured, roll and pitch are taken from it.
+        ``T_map_body`` at that step; default the origin, in space with gravity `lift` above it. Where gravity is
+        measured, roll and pitch are taken from it.
     pool : GridPool, optional
         Storage of the maps; default one of its own.
     prune_every : int
@@ -172,7 +173,9 @@ class GridFilter:
         empty = EvidenceGrid(
             config.voxel_size, model=config.beam_model(), pool=GridPool() if pool is None else pool, dim=steps.dim
         )
-        at = group.identity if start is None else np.asarray(start, dtype=np.float64)
+        at = np.array(group.identity) if start is None else np.asarray(start, dtype=np.float64)
+        if start is None and steps.dim == 3:
+            at[2] = self.lift
         width = group.size
         if at.shape not in ((width,), (n, width)) or not np.all(np.isfinite(at)):
             raise GeometryError("impossible start of a filter", got=at.shape, wanted=f"({width},) or ({n}, {width})")
@@ -194,6 +197,11 @@ class GridFilter:
 
     def __len__(self) -> int:
         return self.config.particles
+
+    @property
+    def lift(self) -> float:
+        """How far above the lattice of a new map the body stands [m]; 0 where nobody knows what is up."""
+        return self.config.lift * self.config.voxel_size if self.steps.tilt is not None else 0.0
 
     @property
     def pool(self) -> GridPool:

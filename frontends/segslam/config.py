@@ -103,7 +103,7 @@ class WinnowConfig:
     """Segments that ended less than this ago are not candidates [s]."""
     sigma: float = 0.5
     """σ of the path-length model: this [m] …"""
-    sigma_per_metre: float = 0.03
+    sigma_per_metre: float = 0.04
     """… plus this for each metre driven since."""
     sigmas: float = 2.5
     """A candidate is nearer than this many σ."""
@@ -225,7 +225,7 @@ class ChoiceConfig:
     """Weight of the range error of localisation [m], in the same way."""
     spread_sigma: float = 0.3
     """Weight of the spread of localisation [m], in the same way."""
-    null_weight: float = 0.05
+    null_weight: float = 0.01
     """Weight of no match at all, which is always in the draw."""
     position_sigma: float = 0.1
     """Standard deviations of an accepted match: position [m] …"""

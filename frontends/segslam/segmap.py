@@ -4,8 +4,8 @@ A segment covers the steps of an *interval*, from the boundary where a particle 
 left. Particles that are alive at a boundary leave one segment each, so an interval has many, and those of one interval
 are interchangeable: any of them may be followed by any that begins where it ends (A6).
 
-Frames. The frame of a new segment is the body at its entry, levelled where gravity is known. A segment that entered an
-older map works in the frame of that map, on a copy of it. Poses are ``T_segment_body``.
+Frames. The frame of a new segment is the body at its entry, levelled and lowered by `lift` where gravity is known. A
+segment that entered an older map works in the frame of that map, on a copy of it. Poses are ``T_segment_body``.
 """
 
 from __future__ import annotations
@@ -45,13 +45,17 @@ class SegMap:
     dim : {3, 2}
     gravity : bool
         Frames are aligned with gravity: only headings lie between them.
+    lift : float
+        Height of the body over the frame of a new segment at its entry [m].
 
     Raises
     ------
     DataError, GeometryError
     """
 
-    def __init__(self, times: Any, path_length: Any, particles: int, *, dim: int = 3, gravity: bool = True) -> None:
+    def __init__(
+        self, times: Any, path_length: Any, particles: int, *, dim: int = 3, gravity: bool = True, lift: float = 0.0
+    ) -> None:
         self.times = check_times(times, where="steps of a SegMap")
         self.path_length = np.ascontiguousarray(path_length, dtype=np.float64)
         if self.path_length.shape != self.times.shape or np.any(~(np.diff(self.path_length) >= 0)):
@@ -62,6 +66,7 @@ class SegMap:
             raise GeometryError("impossible SegMap", got=f"{particles} particles, dim {dim}", wanted="≥ 1; 2 or 3")
         self.group: Group = SE2 if dim == 2 else SE3
         self.gravity = bool(gravity) and dim == 3
+        self.lift = float(lift) if self.gravity else 0.0
         self.particles = int(particles)
         self.table = Table(self.group.size)
         self.maps = Maps(self.group)

@@ -93,7 +93,9 @@ class _Run:
         tangents = self.group.log(steps.odometry.increments)
         turns = tangents[:, [2]] if steps.dim == 2 else tangents[:, :3]
         self.turned = np.cumsum(np.linalg.norm(turns, axis=1))
-        self.segmap = SegMap(steps.times, self.path_length, n, dim=steps.dim, gravity=steps.tilt is not None)
+        self.segmap = SegMap(
+            steps.times, self.path_length, n, dim=steps.dim, gravity=steps.tilt is not None, lift=self.filter.lift
+        )
         self.matcher = Matcher(self.segmap, config, steps.max_range, threads=filter.threads)
         self.segmenters = [self._segmenter(0) for _ in range(n)]
         self.segmap.open(0, [Entry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
@@ -266,8 +268,11 @@ class _Run:
         pose = self.filter.particles.poses[p]
         if not ended:
             return Entry(T_entry=pose, kind=SAME, source=segment)
-        frame = level(pose) if self.segmap.gravity else pose
-        return Entry(T_entry=self.group.between(frame, pose), kind=NEW)
+        if not self.segmap.gravity:
+            return Entry(T_entry=self.group.identity, kind=NEW)
+        T = self.group.between(level(pose), pose)
+        T[2] += self.segmap.lift
+        return Entry(T_entry=T, kind=NEW)
 
     def _enter(self, k: int, chosen: Ints, entries: Sequence[Entry]) -> None:
         p = self.filter.particles

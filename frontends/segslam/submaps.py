@@ -1,8 +1,8 @@
 """From settled segments to submaps: what SegSLAM hands to the graph.
 
-The base of a submap is the body at its entry, levelled where gravity is known, also where the segment worked in the
-frame of an older map; so the exit of each is the base of the next. Matches go along as hypotheses with their support:
-also those that the particles of the chain itself did not take.
+The base of a submap is the body at its entry, where gravity is known level and lowered to the lattice of its map, also
+where the segment worked in the frame of an older map; so the exit of each is the base of the next. Matches go along as
+hypotheses with their support: also those that the particles of the chain itself did not take.
 """
 
 from __future__ import annotations
@@ -151,9 +151,17 @@ def settle(
     return out
 
 
-def base_of(segmap: SegMap, entry: Array) -> Array:
-    """``T_segment_base``: the body at its entry, level where frames are."""
-    return level(entry) if segmap.gravity else np.array(entry)
+def base_of(segmap: SegMap, body: Array) -> Array:
+    """``T_segment_base`` of a body at its entry, or at its exit, where the next base is.
+
+    The body itself, or where gravity is known level and on the lattice that maps are begun on: they need not be
+    resampled to be handed over.
+    """
+    if not segmap.gravity:
+        return np.array(body)
+    base = level(body)
+    base[..., 2] -= segmap.lift
+    return base
 
 
 def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array, Array]:
@@ -186,8 +194,7 @@ def _submap(
     g = segmap.group
     start, end = s.interval
     base = base_of(segmap, s.T_entry)
-    exit_pose = g.between(base, s.T_exit)
-    exit_pose = level(exit_pose) if segmap.gravity else exit_pose
+    exit_pose = g.between(base, base_of(segmap, s.T_exit))
     exits, weights = exits_of_interval(segmap, s.interval)
     D = drift(start, end, level_end=True)
     exit = exit_covariance(exits, exit_pose, s.length, lambda _: D, weights=weights, drift_scale=config.drift_scale)
@@ -334,8 +341,7 @@ def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Se
         there = cast(Array, t.paths[source])[step - int(t.start[source])]
         T_c_source = frame_between(c.path[step - c.interval[0]], there, gravity=segmap.gravity)
     here = g.compose(T_c_source, T_source_body)
-    here = level(here) if segmap.gravity else here
-    return c, g.between(base_of(segmap, c.T_entry), here)
+    return c, g.between(base_of(segmap, c.T_entry), base_of(segmap, here))
 
 
 def _levelled(segmap: SegMap, entry: Array, covariance: Array) -> Array:

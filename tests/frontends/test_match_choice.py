@@ -60,8 +60,8 @@ def test_weights_follow_fitness_and_shift() -> None:
         j.weights,
         [math.exp(-0.5 * (0.12 / 0.15) ** 2) * math.exp(-0.5 * 1.5**2), math.exp(-0.5 * (0.03 / 0.15) ** 2)],
     )
-    assert j.null == 0.05
-    np.testing.assert_allclose(j.probabilities, np.append(j.weights, 0.05) / (j.weights.sum() + 0.05))
+    assert j.null == 0.01
+    np.testing.assert_allclose(j.probabilities, np.append(j.weights, 0.01) / (j.weights.sum() + 0.01))
     assert j.counts() == {"accepted": 2}
 
 

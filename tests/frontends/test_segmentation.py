@@ -227,7 +227,7 @@ def test_decisions_come_at_their_rate_and_copies_go_their_own_way() -> None:
 def test_configurations_are_checked_and_built_from_tables() -> None:
     c = build(SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}})
     assert (c.segmentation.period, c.winnowing.gap, c.search.starts) == (20.0, 30.0, 3)
-    assert c.winnowing.drift(100.0) == pytest.approx(3.5)
+    assert c.winnowing.drift(100.0) == pytest.approx(4.5)
     assert c.search.yaw_width(1000.0) == 0.8
     for bad in (
         {"segmentation": {"score": 1.5}},
