@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +28,9 @@ class StepConfig:
     """σ of a range, for sensors that do not state theirs [m]."""
     cloud_range: float = 60.0
     """Range of lidars whose records are clouds and do not state theirs [m]."""
+    silent: Literal["free", "unknown"] = "free"
+    """What a beam says that came back with no range at all: that nothing is there as far as it reaches, or nothing. Old
+    laser scanners lose beams on glass and dark walls; taken for free space they wipe rooms out of a map."""
     scanners: tuple[str, ...] = ()
     """Streams of beams; none: all spinning scanners, else all clouds, else all planar scanners."""
     motion: tuple[str, ...] = ()
@@ -70,6 +74,8 @@ class StepConfig:
         for name in ("yaw_bias", "yaw_per_metre"):
             if not np.isfinite(getattr(self, name)):
                 raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted a finite number")
+        if self.silent not in ("free", "unknown"):
+            raise ConfigError(f"steps: silent = {self.silent!r}; known: free, unknown")
         if self.most_points < 1:
             raise ConfigError(f"steps: most_points = {self.most_points}; wanted ≥ 1")
         if self.max_range is not None and self.max_range <= self.min_range:

@@ -187,6 +187,10 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
 
     step = assign(beam_times, times, begin)
     step[~inside] = -1
+    if config.silent == "unknown":
+        silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources]) & inside
+        step[silent] = -1
+        count.drop(", ".join(names), "beam without a range", int(silent.sum()))
     chosen, offsets, thinned = _choose(step, len(times), config.most_points)
     count.drop(", ".join(names), f"beam left out, {config.most_points} a step are kept", thinned)
     count.drop("steps", "step without a beam (kept)", int(np.sum(np.diff(offsets) == 0)))

@@ -211,6 +211,8 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
     fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
     if p.fitness < c.fitness and not any("fitness" in f for f in fails):
         fails.append(f"fitness {p.fitness:.3f} < {c.fitness:g}")
+    if r.fitness_upright < c.fitness_upright and not any("upright" in f for f in fails):  # NaN is not
+        fails.append(f"fitness of upright surfaces {r.fitness_upright:.3f} < {c.fitness_upright:g}")
     if p.height > (height := c.height + p.rise):
         fails.append(f"height {p.height:.2f} m > {height:g}")
     if p.shift > c.shift * p.sigma:

@@ -203,6 +203,9 @@ class ChoiceConfig:
     fitness: float = 0.83
     """Least share of the points that the match explains, besides the gates of the registration: in simulated mines and
     garages right ones had 0.78 to 0.98, and most 0.92 and more; wrong ones up to 0.82."""
+    fitness_upright: float = 0.8
+    """The same of the points on upright surfaces, where it is known: wrong matches that passed all else had 0.75 to 0.79
+    in mines, right ones seldom less than 0.81."""
     height: float = 1.6
     """The match is no farther above or below the prediction [m]."""
     shift: float = 2.5
@@ -243,7 +246,7 @@ class ChoiceConfig:
                 "null_weight", "position_sigma",
                 "angle_sigma",
             ),
-            unit=("fitness", "margin", "rivals"),
+            unit=("fitness", "fitness_upright", "margin", "rivals"),
         )  # fmt: skip
         if self.rivals < self.margin:
             raise ConfigError(f"choice.rivals = {self.rivals}; wanted at least the margin, {self.margin}")

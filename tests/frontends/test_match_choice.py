@@ -109,6 +109,16 @@ def test_a_match_that_nothing_holds_in_some_direction_is_refused() -> None:
     assert j.accepted.tolist() == [0]
 
 
+def test_what_stands_upright_must_fit_too() -> None:
+    """Floors and ceilings fit anywhere. Where no upright surface is seen, nothing is known of them."""
+    seen = [proposal(k, fitness_upright=u) for k, u in enumerate((0.85, 0.78, 0.5, math.nan))]
+    j = judge(seen, C, RULES)
+    assert j.accepted.tolist() == [0, 3]
+    assert all("upright" in j.why[k] and j.why[k].count("upright") == 1 for k in (1, 2))
+    low = judge([proposal(fitness=0.8)], C, RegistrationConfig(gates=Gates(fitness=0.5)))
+    assert low.why == ("fitness 0.800 < 0.83",)
+
+
 def test_a_rival_in_the_same_map_takes_both_out_and_elsewhere_none() -> None:
     """One pillar on, 8 m away, fits as well: nobody knows which. The same fit in another map is another hypothesis."""
     wide = 10.0
