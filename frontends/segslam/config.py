@@ -204,7 +204,7 @@ class ChoiceConfig:
     """Least share of the points that the match explains, besides the gates of the registration: in simulated mines and
     garages right ones had 0.78 to 0.98, and most 0.92 and more; wrong ones up to 0.82."""
     fitness_upright: float = 0.8
-    """The same of the points on upright surfaces, where it is known: wrong matches that passed all else had 0.75 to 0.79
+    """The same of the points on upright surfaces, where known: wrong matches that passed all else had 0.75 to 0.79
     in mines, right ones seldom less than 0.81."""
     height: float = 1.6
     """The match is no farther above or below the prediction [m]."""

@@ -115,7 +115,7 @@ def test_what_stands_upright_must_fit_too() -> None:
     j = judge(seen, C, RULES)
     assert j.accepted.tolist() == [0, 3]
     assert all("upright" in j.why[k] and j.why[k].count("upright") == 1 for k in (1, 2))
-    low = judge([proposal(fitness=0.8)], C, RegistrationConfig(gates=Gates(fitness=0.5)))
+    low = judge([proposal(fitness=0.8, fitness_upright=0.9)], C, RegistrationConfig(gates=Gates(fitness=0.5)))
     assert low.why == ("fitness 0.800 < 0.83",)
 
 
