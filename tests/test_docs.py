@@ -25,6 +25,7 @@ PAGES = [
     "plaza.md",
     "registration.md",
     "segslam-recorded.md",
+    "segslam.md",
     "simulated-robots.md",
     "steps.md",
     "without-truth.md",

@@ -341,6 +341,21 @@ def planar_log(**more: object) -> SensorLog:
     return SensorLog(name="square", streams=streams, truth=Truth(truth))
 
 
+def test_beams_that_came_back_with_nothing_may_say_nothing() -> None:
+    drops = DropCounter()
+    log = planar_log()
+    free, silent = make_steps(log), make_steps(log, StepConfig(silent="unknown"), drops=drops)
+    assert not free.returns.all()  # the corners are farther than the laser sees
+    assert silent.returns.all()
+    assert drops.counts["laser: beam without a range"] == len(free.points) - len(silent.points) > 0
+    np.testing.assert_array_equal(free.points[free.returns], silent.points)
+    # what is cut at a shorter range did come back: it stays, as free space
+    cut = make_steps(log, StepConfig(silent="unknown", max_range=3.5))
+    assert 0 < np.sum(~cut.returns) < len(cut.returns)
+    with pytest.raises(ConfigError, match="silent"):
+        StepConfig(silent="loud")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("period", [0.05, 0.2, 0.7, None])
 @pytest.mark.parametrize("recorded", [True, False])
 def test_in_the_plane(period: float | None, recorded: bool) -> None:
