@@ -68,9 +68,9 @@ class GridFilterConfig:
     its particle takes the mean evidence of the older ones. 12 are 5 s, after which a spun scanner has seen all round
     once and a walking robot's scans overlap."""
 
-    full_walk: int = 20
-    """With fewer particles the walks below are σ times √(N / this): where few stand for many, wide noise throws them
-    farther off than it lets them find."""
+    walk_scale: float = 1.0
+    """Factor on the walks below. A filter over a whole way needs them whole, to undo what the gyro's bias has done;
+    inside the segments of SegSLAM half is better: most of what is left at the end of one is this noise."""
     motion_scale: float = 1.0
     """Factor on the σ of the odometry."""
     position_walk: float = 0.025
@@ -96,7 +96,6 @@ class GridFilterConfig:
             ("threads", 1),
             ("map_beams", 0),
             ("young", 0),
-            ("full_walk", 1),
         ):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ {least}")
@@ -107,7 +106,7 @@ class GridFilterConfig:
         for name in ("voxel_size", "endpoint_effective_beams", "cast_effective_beams", "greatest_exponent"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number above 0")
-        walks = ("position_walk", "height_walk", "heading_walk", "heading_turn", "tilt_walk")
+        walks = ("walk_scale", "position_walk", "height_walk", "heading_walk", "heading_turn", "tilt_walk")
         for name in ("motion_scale", *walks):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number ≥ 0")

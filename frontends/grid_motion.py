@@ -31,7 +31,7 @@ def motion_covariance(increment: Array, covariance: Array, config: GridFilterCon
     """
     planar = len(increment) == 3
     path = float(np.linalg.norm(increment[: 2 if planar else 3]))
-    share = min(1.0, config.particles / config.full_walk)
+    share = config.walk_scale**2
     walks = (config.position_walk, config.height_walk, config.tilt_walk)
     position, height, tilt = (share * w * w * path for w in walks)
     turn = abs(float(increment[2])) if planar else 2.0 * float(np.arctan2(abs(increment[5]), abs(increment[6])))

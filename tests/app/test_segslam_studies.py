@@ -112,7 +112,7 @@ def test_dead_reckoning_is_lost_and_segslam_is_not(tables: dict[str, tuple[pd.Da
     table, timings = tables["segslam-garage"]
     assert (table[table["quantity"] == "failed"]["value"] == 0).all()
     assert mean(table, "dead-reckoning", "final_error") > 3.0
-    assert mean(table, "segslam-5", "final_error") < 0.5 * mean(table, "rbpf-5", "final_error")
+    assert mean(table, "segslam-5", "final_error") < 0.8 * mean(table, "rbpf-5", "final_error")
     assert mean(table, "segslam-5", "matches") > 0
     assert mean(table, "segslam-5", "entropy") < mean(table, "dead-reckoning", "entropy")
     assert mean(table, "segslam-5", "effective_median") < 1.0
@@ -356,7 +356,7 @@ def test_presets_are_the_settings_of_the_studies(world: str) -> None:
     log = SensorLog(name=world, streams={})
     segslam = cfg.build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
     assert (segslam.steps, segslam.filter, segslam.segslam, segslam.drift) == (
-        study.steps, study.filter, study.segslam, study.drift,
+        study.steps, study.segslam_filter, study.segslam, study.drift,
     )  # fmt: skip
     rbpf = cfg.build(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
     assert (rbpf.steps, rbpf.filter) == (study.steps, study.filter)

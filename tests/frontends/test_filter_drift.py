@@ -9,7 +9,7 @@ from frontends.filter_drift import FilterDrift
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.poses import SE2, SE3, Group, level
 
-MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, few=0.4, alone_walk=0.02)
+MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, few=5.0, alone_walk=0.03)
 
 
 def _bend(group: Group, n: int = 60, pitch: float = 0.0) -> np.ndarray:
@@ -31,7 +31,7 @@ def test_covariance_is_that_of_many_drives(group: Group, particles: int) -> None
     rng = np.random.default_rng(1)
     true = _bend(group)
     u = group.log(group.between(true[:-1], true[1:]))
-    m, more, length = 4000, 1.0 if particles >= 20 else 1.0 - 0.4 * (1.0 - particles / 20), 40.0 / len(u)
+    m, more, length = 4000, 1.0 + MODEL.few / particles, 40.0 / len(u)
     T = np.tile(group.identity, (m, 1))
     x = group.position.start
     for k in range(len(u)):
@@ -56,12 +56,11 @@ def test_covariance_is_that_of_many_drives(group: Group, particles: int) -> None
 
 def test_how_many_particles_and_how_far() -> None:
     path = _bend(SE3)
-    few, some, many, more = (np.diag(MODEL.covariance(path, n)) for n in (2, 5, 20, 10_000))
-    assert np.all(few <= some)
-    assert np.all(some <= many)
-    assert some[2] < 0.8 * many[2]
-    np.testing.assert_array_equal(many, more)
-    assert MODEL.covariance(path, 1)[2, 2] > 3.0 * many[2]  # nobody corrects it
+    few, some, many = (np.diag(MODEL.covariance(path, n)) for n in (2, 5, 40))
+    assert np.all(few >= some)
+    assert np.all(some >= many)
+    assert some[2] > 1.5 * many[2]
+    assert MODEL.covariance(path, 1)[2, 2] > few[2]  # nobody corrects it
     lengths = [np.trace(MODEL.covariance(path[: k + 1], 20)) for k in (1, 10, 30, 60)]
     assert np.all(np.diff(lengths) > 0)
 
@@ -79,8 +78,6 @@ def test_frames_at_the_end_are_level_where_submaps_are() -> None:
 def test_impossible_models_and_paths() -> None:
     with pytest.raises(ConfigError, match="heading_walk"):
         FilterDrift(heading_walk=-1.0)
-    with pytest.raises(ConfigError, match="few = 2"):
-        FilterDrift(few=2.0)
     with pytest.raises(ConfigError, match="singular"):
         FilterDrift(tilt=0.0)
     with pytest.raises(DataError, match="no path or no particle"):

@@ -31,13 +31,12 @@ def test_noise_is_the_odometrys_plus_walks_of_the_path() -> None:
     assert np.array_equal(still, np.zeros((6, 6)))
 
 
-def test_few_particles_walk_less() -> None:
+def test_walks_are_scaled_and_the_odometrys_own_noise_is_not() -> None:
     step, none = np.array([1.0, 0.0, 0.2]), np.zeros((3, 3))
-    full = motion_covariance(step, none, GridFilterConfig(particles=20))
-    np.testing.assert_allclose(motion_covariance(step, none, GridFilterConfig(particles=5)), full / 4)
-    np.testing.assert_allclose(motion_covariance(step, none, GridFilterConfig(particles=100)), full)
-    odometry = np.diag([1e-4, 1e-4, 1e-6])  # stated, not walked: whole for any number
-    added = motion_covariance(step, odometry, GridFilterConfig(particles=5)) - odometry
+    full = motion_covariance(step, none, GridFilterConfig())
+    np.testing.assert_allclose(motion_covariance(step, none, GridFilterConfig(walk_scale=0.5)), full / 4)
+    odometry = np.diag([1e-4, 1e-4, 1e-6])
+    added = motion_covariance(step, odometry, GridFilterConfig(walk_scale=0.5)) - odometry
     np.testing.assert_allclose(added, full / 4)
 
 

@@ -86,7 +86,9 @@ class GridTrialConfig:
     steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))
     """How its log becomes steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
-    """Of both families; the number of particles is the algorithm's."""
+    """Of the RBPF; the number of particles is the algorithm's."""
+    segslam_filter: GridFilterConfig = field(default_factory=lambda: GridFilterConfig(walk_scale=0.5))
+    """Of SegSLAM: each family has the noise that suits it."""
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
     """What SegSLAM adds."""
     drift: FilterDrift = field(default_factory=FilterDrift)
@@ -171,7 +173,8 @@ class GridTrial:
         if family == DEAD_RECKONING:
             path = judge.dead_reckoned(self.steps)
             return Outcome(path, path.poses[-1], {})
-        filter = replace(self.config.filter, particles=particles)
+        settings = self.config.filter if family == "rbpf" else self.config.segslam_filter
+        filter = replace(settings, particles=particles)
         seed = SeedTree(self.seed).child("filter", family)
         begin = perf_counter()
         if family == "rbpf":
@@ -342,6 +345,7 @@ QUICK = GridTrialConfig(
     crawler=CrawlerConfig(drift=0.08, max_range=8.0),
     steps=StepConfig(max_range=8.0, most_points=240),
     filter=GridFilterConfig(weight_beams=120),
+    segslam_filter=GridFilterConfig(weight_beams=120, walk_scale=0.5),
     segslam=SegSlamConfig(
         segmentation=SegmentationConfig(window=2.0, min_seconds=6.0, min_length=5.0, max_length=14.0, excluded=3.0),
         winnowing=WinnowConfig(gap=15.0),
