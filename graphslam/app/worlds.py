@@ -49,7 +49,7 @@ class MeshWorld:
 
 
 MESH_WORLDS: dict[str, MeshWorld] = {
-    "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C")),
+    "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
     "mine": MeshWorld("graphslam.sim.mine", "mine"),
     "building": MeshWorld("graphslam.sim.building", "building"),
 }

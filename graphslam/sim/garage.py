@@ -31,7 +31,7 @@ def garage(layout: str = "A", *, seed: int = 0) -> World:
     Parameters
     ----------
     layout : str
-        "A" or "B"; "C" is kept for tests that nothing was tuned on.
+        "A", "B" or "C"; "D" is kept for tests that nothing was tuned on.
     seed : int
         Moves parked cars and clutter; building and way stay.
 

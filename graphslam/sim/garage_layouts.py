@@ -129,8 +129,14 @@ LAYOUTS = {
         first_aisle=12.9, turn=43.3, last_aisle=23.9, road=-7.4, yard=-7.7,
         cores=((58.0, 28.0, 63.7, 32.7), (52.0, 0.3, 56.0, 4.2)), mirrored=True, turned=True,
     ),
+    "D": GarageLayout(
+        name="D", length=60.0, width=38.0, pitch=6.6, first=3.0, rows=(5.2, 11.6, 26.4, 32.8),
+        bays=(2.6, 13.9, 24.1, 35.4), west=6.3, east=52.5, low_aisle=8.4, ramp=(40.0, 13.0, 19.0), ramp_width=4.6,
+        first_aisle=8.4, turn=45.9, last_aisle=29.6, road=-7.2, yard=-5.0, cores=((54.6, 0.3, 59.7, 4.4),),
+        turned=True,
+    ),
 }  # fmt: skip
-"""A and B to develop with; C is held out: it is never looked at while anything is tuned."""
+"""A and B to develop with, C to look at now and then; D is held out: nothing is tuned on it."""
 
 
 def garage_layout(name: str) -> GarageLayout:

@@ -91,7 +91,7 @@ def test_the_garage_is_compared_at_the_papers_numbers_of_particles() -> None:
         names = GARAGE.full[world].algorithms
         for family in ("rbpf", "segslam"):
             assert [family_of(a)[1] for a in names if family_of(a)[0] == family] == [1, 5, 10, 20, 40, 100]
-    assert {GARAGE.full[w].layout for w in GARAGE.worlds(False)} == {"A", "B", "C"}
+    assert {GARAGE.full[w].layout for w in GARAGE.worlds(False)} == {"A", "B", "C", "D"}
 
 
 def test_names_of_algorithms() -> None:

@@ -16,12 +16,13 @@ from graphslam.sim.tunnels import surface_nets
 from graphslam.sim.world import World, find_revisits
 from tests.sim.solid import Solid
 
-GARAGES = ["garage-A", "garage-B", "garage-C"]
+GARAGES = ["garage-A", "garage-B", "garage-C", "garage-D"]
 NAMES = [*GARAGES, "mine", "building"]
 LENGTH = {
     "garage-A": (303.0, 10.0),
     "garage-B": (303.0, 10.0),
     "garage-C": (303.0, 10.0),
+    "garage-D": (303.0, 10.0),
     "mine": (1300.0, 15.0),
     "building": (892.0, 20.0),
 }
