@@ -86,7 +86,7 @@ def test_they_are_studies_that_can_be_sent_elsewhere(name: str) -> None:
 
 
 def test_the_garage_is_compared_at_the_papers_numbers_of_particles() -> None:
-    assert GARAGE.worlds(False) == ("garage-A", "garage-B", "garage-C")
+    assert GARAGE.worlds(False) == ("garage-A", "garage-B", "garage-C", "garage-D")
     for world in GARAGE.worlds(False):
         names = GARAGE.full[world].algorithms
         for family in ("rbpf", "segslam"):

@@ -74,7 +74,7 @@ def test_seed_layout_and_world_seed(log: SensorLog) -> None:
     ("arguments", "kind", "what"),
     [
         ({"world": "garag"}, UnknownNameError, "did you mean garage"),
-        ({"world": "garage", "layout": "D"}, UnknownNameError, "known: A, B, C"),
+        ({"world": "garage", "layout": "Z"}, UnknownNameError, "known: A, B, C, D"),
         ({"world": "mine", "layout": "A"}, ConfigError, "one layout only"),
         ({"world": "landmark-field", "layout": "A"}, ConfigError, "neither layout"),
         ({"world": "garage", "seed": -1}, ConfigError, "seed = -1"),
