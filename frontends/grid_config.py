@@ -70,7 +70,7 @@ class GridFilterConfig:
 
     walk_scale: float = 1.0
     """Factor on the walks below. A filter over a whole way needs them whole, to undo what the gyro's bias has done;
-    inside the segments of SegSLAM half is better: most of what is left at the end of one is this noise."""
+    inside the segments of SegSLAM about half is better: most of what is left at the end of one is this noise."""
     motion_scale: float = 1.0
     """Factor on the σ of the odometry."""
     position_walk: float = 0.025

@@ -57,7 +57,7 @@ class StepConfig:
     """Time over which errors of these stay alike [s]."""
     level_floors: bool = False
     """The floors driven on are level on the whole, as in buildings: what gravity's roll and pitch show in the median
-    over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did."""
+    over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did, or less."""
     longest_record: float = 20.0
     """Longest time that one record of odometry may take: it tells the whole motion, not how it went [s]."""
 

@@ -22,7 +22,7 @@ from frontends.segslam.localisation import localise
 from frontends.segslam.sampling import draw_weights, grow, root_of_particle
 from frontends.segslam.segmap import NEW, Entry, SegMap
 from frontends.segslam.window import Ahead
-from frontends.segslam.winnowing import Candidates, Winnowed, winnow_all
+from frontends.segslam.winnowing import Candidates, Winnowed, winnow
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
@@ -176,7 +176,7 @@ class Matcher:
             )  # fmt: skip
             entry = segmap.entries[members[0]]
             held = self._held(-1 if entry is None or entry.kind == NEW else entry.source)
-            found = winnow_all(
+            found = winnow(
                 segmap, sample, poses[members], step, config.winnowing, exclude=held, tally=self.winnowed
             )  # fmt: skip
             out.update(zip(members, found))

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment
+from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
 from frontends.segslam.store import Maps, Table
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
@@ -208,7 +208,10 @@ class SegMap:
         chosen = self._which(which, len(grids), "grids")
         self._which(which, len(paths), "paths")
         w = normalised(weights, self.particles)
-        rows = [self._check_path(p, step, path) for p, path in zip(chosen, paths)]
+        last = len(self.times) - 1
+        rows = [
+            check_path(path, self.entries[p], p, (int(self.start[p]), step), last) for p, path in zip(chosen, paths)
+        ]
         known: dict[tuple[Any, ...], int] = {}
         out = np.empty(len(chosen), np.int64)
         for k, (p, grid, path) in enumerate(zip(chosen, grids, rows)):
@@ -393,25 +396,3 @@ class SegMap:
                 raise CovarianceError(f"particle {p} enters segment {e.source} by a match without a covariance")
             check_covariance(e.covariance, what=f"covariance of a match into segment {e.source}", dim=self.group.dof)
         return np.array(self.table.T_map[e.source])
-
-    def _check_path(self, p: int, step: int, path: Any) -> Array:
-        e = self.entries[p]
-        if e is None:
-            raise DataError(f"particle {p} leaves a segment that it never entered", where=f"step {step}")
-        n = step - int(self.start[p]) + 1
-        if n < 2 or step >= len(self.times):
-            raise DataError(
-                f"segment of particle {p} is empty or ends outside the path", got=f"steps {self.start[p]} … {step}"
-            )
-        rows = np.ascontiguousarray(path, dtype=np.float64)
-        if rows.shape != (n, self.group.size) or not np.all(np.isfinite(rows)):
-            raise GeometryError(
-                f"path of particle {p} is impossible", got=rows.shape, wanted=f"({n}, {self.group.size}) finite poses"
-            )
-        if np.abs(self.group.log(self.group.between(e.T_entry, rows[0]))).max() > 1e-6:
-            raise GeometryError(
-                f"path of particle {p} does not begin where it entered: is it in the frame of the segment before?",
-                got=rows[0].tolist(),
-                wanted=np.asarray(e.T_entry).tolist(),
-            )
-        return rows

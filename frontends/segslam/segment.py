@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+
+from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 
 NEW, MATCH, SAME = 0, 1, 2
 """How a segment was entered (A2): an empty map; an older one, by registration; the one it comes from, which goes on."""
@@ -79,3 +84,47 @@ class Segment:
     match_covariance: Array | None
     fitness: float
     locked: bool
+
+
+def check_path(path: Any, entry: Entry | None, particle: int, interval: tuple[int, int], last: int) -> Array:
+    """The path of a particle through a segment that it leaves ``(n, 7)`` or ``(n, 3)``, in the frame of that segment.
+
+    Parameters
+    ----------
+    path : (n, 7) or (n, 3)
+    entry : Entry or None
+        How the particle entered.
+    particle : int
+    interval : (start, end)
+        Steps.
+    last : int
+        The last step there is.
+
+    Raises
+    ------
+    DataError
+        A segment that was never entered, is empty, or ends outside the path.
+    GeometryError
+        A path of the wrong shape, not finite, or in another frame.
+    """
+    start, step = interval
+    if entry is None:
+        raise DataError(f"particle {particle} leaves a segment that it never entered", where=f"step {step}")
+    n = step - start + 1
+    if n < 2 or step > last:
+        raise DataError(
+            f"segment of particle {particle} is empty or ends outside the path", got=f"steps {start} … {step}"
+        )
+    group = group_of(entry.T_entry)
+    rows = np.ascontiguousarray(path, dtype=np.float64)
+    if rows.shape != (n, group.size) or not np.all(np.isfinite(rows)):
+        raise GeometryError(
+            f"path of particle {particle} is impossible", got=rows.shape, wanted=f"({n}, {group.size}) finite poses"
+        )
+    if np.abs(group.log(group.between(entry.T_entry, rows[0]))).max() > 1e-6:
+        raise GeometryError(
+            f"path of particle {particle} does not begin where it entered: is it in the frame of the segment before?",
+            got=rows[0].tolist(),
+            wanted=np.asarray(entry.T_entry).tolist(),
+        )
+    return rows

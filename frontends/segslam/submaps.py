@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from frontends.filter_drift import FilterDrift
 from frontends.segslam.config import HandoverConfig
-from frontends.segslam.covariance import Drift as LengthDrift
 from frontends.segslam.covariance import exit_covariance
 from frontends.segslam.sampling import nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
@@ -47,15 +46,6 @@ class _Errors(Protocol):
     def between(
         self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
     ) -> tuple[Array, Array]: ...
-
-
-def drift_by_length(path_length: Array, model: LengthDrift) -> Drift:
-    """A drift that knows the length of the path only: ``model(metres)`` gives ``(d, d)``."""
-
-    def drift(start: int, end: int, *, level_end: bool) -> Array:
-        return np.asarray(model(float(path_length[end] - path_length[start])), dtype=np.float64)
-
-    return drift
 
 
 def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift) -> Drift:

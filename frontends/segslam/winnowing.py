@@ -124,39 +124,24 @@ def winnow(
     *,
     exclude: frozenset[int] | set[int] = frozenset(),
     tally: Winnowed | None = None,
-) -> Candidates:
-    """Candidates of one particle at one step; of several that share a sample see :func:`winnow_all`.
+) -> list[Candidates]:
+    """Candidates, at one step, of particles that share a map sample.
 
     Parameters
     ----------
     segmap : SegMap
     sample : MapSample
-        Its root is the segment the particle is in.
-    T_root_body : (7,) or (3,)
-        The particle's pose.
+        Its root is the segment the particles are in.
+    T_root_body : (n, 7) or (n, 3)
+        Their poses.
     step : int
         The step of now.
     config : WinnowConfig
     exclude : set of int
-        Segments that are not asked for, such as the one whose map the particle works in already.
+        Segments that are not asked for, such as the one whose map the particles work in already.
     tally : Winnowed, optional
         Counts are added.
     """
-    poses = np.asarray(T_root_body, dtype=np.float64)[None]
-    return winnow_all(segmap, sample, poses, step, config, exclude=exclude, tally=tally)[0]
-
-
-def winnow_all(
-    segmap: SegMap,
-    sample: MapSample,
-    T_root_body: ArrayLike,
-    step: int,
-    config: WinnowConfig,
-    *,
-    exclude: frozenset[int] | set[int] = frozenset(),
-    tally: Winnowed | None = None,
-) -> list[Candidates]:
-    """Candidates of particles ``(n, 7)`` or ``(n, 3)`` that share a sample, and what they do not ask for."""
     T = np.asarray(T_root_body, dtype=np.float64)
     tally = Winnowed() if tally is None else tally
     # 1. temporal separation

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.segmap import SAME, Entry, SegMap
-from frontends.segslam.submaps import drift_by_errors, drift_by_length, settle, settled_chain
+from frontends.segslam.submaps import Drift, drift_by_errors, settle, settled_chain
 from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse
@@ -21,6 +22,15 @@ from tests.reference.segmap_twin import flat_grid, mark, marked, match_entry, sm
 
 ZERO = np.zeros(3)
 D = np.diag([0.01, 0.02, 1e-4])
+
+
+def drift_by_length(path_length: np.ndarray, model: Callable[[float], np.ndarray]) -> Drift:
+    """A drift that knows the length of the path only."""
+
+    def drift(start: int, end: int, *, level_end: bool) -> np.ndarray:
+        return model(float(path_length[end] - path_length[start]))
+
+    return drift
 
 
 def drift(start: int, end: int, *, level_end: bool) -> np.ndarray:

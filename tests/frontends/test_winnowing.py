@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from frontends.segslam.config import WinnowConfig
 from frontends.segslam.sampling import MapSample, grow, root_of_particle, root_of_segment
 from frontends.segslam.segmap import Entry, SegMap
-from frontends.segslam.winnowing import Candidates, Winnowed, winnow, winnow_all
+from frontends.segslam.winnowing import Candidates, Winnowed
+from frontends.segslam.winnowing import winnow as winnow_all
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.evidence.grid import EvidenceGrid
 from tests.reference.segmap_twin import match_entry, straight
 
 SIDE = 20.0  # metres of a side, a step a metre
+
+
+def winnow(segmap: SegMap, sample: MapSample, body: np.ndarray, *rest: Any, **more: Any) -> Candidates:
+    """Of one particle."""
+    return winnow_all(segmap, sample, body[None], *rest, **more)[0]
 
 
 def seen_around(path: np.ndarray, dim: int = 2) -> EvidenceGrid:
