@@ -1,27 +1,44 @@
-"""Truncated least squares on a pose network: graduated non-convexity, then a tight solve of the inliers.
+"""Truncated least squares on a pose network: which measurements are wrong, and the tight solve of the rest.
 
-A measurement pays at most the χ² quantile of its dimension (Yang, Antonante, Tzoumas & Carlone 2020, TLS cost).
-GNC chooses the inliers; the plain batch optimum, trimmed by the same rule, is the competitor, because GNC is a
-heuristic and may end above what it was given.
+A measurement pays at most ``s² χ²_d(p)`` (Yang, Antonante, Tzoumas & Carlone 2020, TLS cost), where s² is how far the
+file misstates its variance. Graduated non-convexity finds a good local minimum if it begins near one; least squares of
+everything, its usual start, is no such place when a third of the loops are wrong. So it begins from the loops that
+their neighbours bear out (:mod:`~graphslam.solve.network_consensus`), with the schedule as late as the residuals there
+allow. Plain trimming from every start is the competitor, and the lowest truncated cost wins.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
+from tqdm import tqdm
 
-from graphslam.core.errors import ConfigError, SolverError
+from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, Polished, polish
+from graphslam.solve.network_consensus import Consensus, loop_consensus, odometry_edges
+from graphslam.solve.network_diagnose import check_determined
 from graphslam.solve.network_model import edge_costs, observation_costs
+from graphslam.solve.network_start import chordal_start, landmarks_from, odometry_start
+
+log = logging.getLogger(__name__)
 
 Mask = npt.NDArray[np.bool_]
 ROUNDS = 20
+# Growth of μ, descent steps at each, and when to stop (Yang et al. 2020 use 1.4).
+GROWTH, STEPS, STAGES = 1.4, 4, 100
+# Residuals of the loops believed at the start are taken to be at most so many times the limit: μ starts there.
+WORST = 1e3
+# Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
+START_STEPS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,76 +53,196 @@ class Robust:
         Of the inliers alone.
     end : Polished
         Its objective is that of the inliers.
-    truncated, truncated_before : float
-        Truncated cost here, and at the values that were given.
+    truncated : float
+        Truncated cost here.
+    limit : (m + k,)
+        What a measurement pays at most; infinite for trusted ones.
+    scale : float
+        True over stated variance of the edges, as estimated or given.
+    start : str
+        Which start led here.
+    reached : dict of str to float
+        Truncated cost by start.
     """
 
     inliers: Mask
     problem: BatchProblem
     end: Polished
     truncated: float
-    truncated_before: float
+    limit: Array
+    scale: float
+    start: str
+    reached: dict[str, float]
+
+
+def truncated_cost(network: PoseNetwork, arrays: tuple[Array, Array], limit: Array) -> float:
+    """``Σ min(rᵀ Ω r, limit)`` over edges and observations."""
+    return float(np.minimum(_costs(network, *arrays), limit).sum())
 
 
 def truncated_least_squares(
-    problem: BatchProblem, values: gtsam.Values, probability: float = 0.99, trust_odometry: bool = True
+    problem: BatchProblem,
+    given: dict[str, Any] | None = None,
+    probability: float = 0.99,
+    *,
+    trust_odometry: bool = True,
+    noise_scale: float | None = None,
+    progress: bool = False,
 ) -> Robust:
-    """Minimise ``Σ min(rᵀ Ω r, χ²_d(probability))`` from ``values``.
+    """Minimise ``Σ min(rᵀ Ω r, s² χ²_d(p))``.
 
     Parameters
     ----------
+    problem : BatchProblem
+        Of the whole network.
+    given : dict of str to gtsam.Values, optional
+        Further starts.
     probability : float
-        An inlier is kept with this probability.
+        An inlier is kept with this probability, if noise is Gaussian.
     trust_odometry : bool
-        Edges between neighbours in id order are never outliers (they are not loop closures).
+        Edges between neighbours in id order are never outliers (they are not loop closures), if they join nearly all
+        vertices; where they do not, nothing is trusted.
+    noise_scale : float, optional
+        s², true over stated variance of the edges. Estimated from the network if not given. Observations of landmarks
+        are always taken at their word.
 
     Raises
     ------
     ConfigError
-        Probability outside (0, 1).
-    SolverError
-        GTSAM's optimiser failed.
+        Probability outside (0, 1), or a scale that is not positive.
+    IndeterminateError
+        No start could be made.
     """
     if not 0.0 < probability < 1.0:
         raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
+    if noise_scale is not None and not (np.isfinite(noise_scale) and noise_scale > 0.0):
+        raise ConfigError(f"noise_scale must be positive, got {noise_scale}")
     network, m = problem.network, len(problem.network.edges)
-    limit = np.full(m + len(network.observations), stats.chi2.ppf(probability, 2))
-    limit[:m] = stats.chi2.ppf(probability, network.tangent_dim)
-    trusted = np.zeros(len(limit), dtype=np.bool_)
+    consensus = loop_consensus(network)
+    trusted = np.zeros(m + len(network.observations), dtype=np.bool_)
     if trust_odometry:
-        trusted[:m] = np.abs(np.diff(network.edges, axis=1)[:, 0]) == 1
-        limit[trusted] = np.inf
-    before = _costs(network, *problem.arrays(values))
-    weights, found = _graduated(problem, values, probability, np.flatnonzero(trusted))
-    competitors = [
-        _trim(network, found, (weights > 0.5) | trusted, limit),
-        _trim(network, values, before <= limit, limit),
-    ]
-    inliers, inner, end, cost = min(competitors, key=lambda c: c[3])
-    return Robust(inliers, inner, end, cost, float(np.minimum(before, limit).sum()))
+        trusted[:m] = odometry_edges(network)
+    guess = trusted.copy()
+    guess[:m] |= consensus.odometry | consensus.likely
+    guess[m:] = True
+    starts: dict[str, tuple[gtsam.Values, Mask]] = {}
+    scale = 1.0 if noise_scale is None else noise_scale
+    for name, used in (("consensus", guess), ("odometry", trusted)):
+        begun = _from(problem, used, consensus) if used[:m].any() else None
+        if begun is not None:
+            starts[name] = (begun, used)
+            if name == "consensus" and noise_scale is None and consensus.likely.any():
+                scale = _scale(network, problem.arrays(begun), consensus)
+            if name == "consensus" and consensus.likely.any():
+                break  # dead reckoning is worth trying only where loops bear nothing out
+    limit = _limits(network, probability, scale, trusted)
+    starts |= {name: (values, np.ones_like(guess)) for name, values in (given or {}).items()}
+    found: list[tuple[str, _Trimmed]] = []
+    for name, (values, believed) in tqdm(
+        starts.items(), desc="robust starts", unit="start", disable=not progress, leave=False
+    ):
+        costs = _costs(network, *problem.arrays(values))
+        found.append((name, _trim(network, values, (costs <= limit) | trusted, limit)))
+        weights, annealed = _anneal(network, values, limit, believed)
+        found.append((name, _trim(network, annealed, (weights > 0.5) | trusted, limit)))
+    if not found:
+        raise IndeterminateError(f"{network.source}: no robust start could be made")
+    reached: dict[str, float] = {}
+    for name, trimmed in found:
+        reached[name] = min(trimmed.cost, reached.get(name, np.inf))
+    name, best = min(found, key=lambda f: f[1].cost)
+    return Robust(best.inliers, best.problem, best.end, best.cost, limit, scale, name, reached)
 
 
-def _graduated(
-    problem: BatchProblem, values: gtsam.Values, probability: float, trusted: npt.NDArray[np.intp]
-) -> tuple[Array, gtsam.Values]:
-    anchors = len(problem.network.anchors)
-    lm = gtsam.LevenbergMarquardtParams()
-    lm.setLinearSolverType(f"MULTIFRONTAL_{problem.factorization}")
-    params = gtsam.GncLMParams(lm)
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers([*range(anchors), *(anchors + trusted).tolist()])
+def _from(problem: BatchProblem, used: Mask, consensus: Consensus) -> gtsam.Values | None:
+    """Least squares of the measurements in ``used`` alone: rotations first; dead reckoning where that is all."""
+    network, m = problem.network, len(problem.network.edges)
+    part = _part(network, used)
     try:
-        optimizer = gtsam.GncLMOptimizer(problem.graph, values, params)
-        optimizer.setInlierCostThresholdsAtProbability(probability)
-        found = optimizer.optimize()
-    except RuntimeError as error:
-        raise SolverError(f"{problem.network.source}: GNC failed ({error})") from None
-    return np.asarray(optimizer.getWeights())[anchors:], found
+        check_determined(part)
+        if not consensus.likely.any() or len(network.observations):
+            poses = odometry_start(part)
+            arrays = poses, landmarks_from(part, poses)
+        else:
+            arrays = chordal_start(part)
+        return polish(BatchProblem(part), problem.values(*arrays), max_iterations=START_STEPS).values
+    except (IndeterminateError, RuntimeError) as error:
+        log.info("%s: %d of %d edges make no start: %s", network.source, int(used[:m].sum()), m, error)
+        return None
 
 
-def _trim(
-    network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array
-) -> tuple[Mask, BatchProblem, Polished, float]:
+def _part(network: PoseNetwork, used: Mask) -> PoseNetwork:
+    m = len(network.edges)
+    e, o = np.flatnonzero(used[:m]), np.flatnonzero(used[m:])
+    return replace(
+        network,
+        edges=network.edges[e],
+        measurements=network.measurements[e],
+        information=network.information[e],
+        observations=network.observations[o],
+        observation_values=network.observation_values[o],
+        observation_information=network.observation_information[o],
+    )
+
+
+def _scale(network: PoseNetwork, arrays: tuple[Array, Array], consensus: Consensus) -> float:
+    """True over stated variance of the loops, from the median cost of the likely ones after least squares.
+
+    A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
+    left of ``rows``.
+    """
+    used = consensus.likely | consensus.odometry
+    rows = int(used.sum()) * network.tangent_dim + 2 * len(network.observations)
+    left = max(rows - network.states, 1) / rows
+    median = float(np.median(edge_costs(network, arrays[0])[consensus.likely]))
+    return max(median / (left * float(stats.chi2.median(network.tangent_dim))), np.finfo(float).tiny)
+
+
+def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mask) -> Array:
+    limit = np.full(len(trusted), stats.chi2.ppf(probability, 2))
+    limit[: len(network.edges)] = scale * stats.chi2.ppf(probability, network.tangent_dim)
+    limit[trusted] = np.inf
+    return limit
+
+
+def _anneal(network: PoseNetwork, values: gtsam.Values, limit: Array, believed: Mask) -> tuple[Array, gtsam.Values]:
+    """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the values they lead to."""
+    m = len(network.edges)
+    problem = BatchProblem(network)
+    costs = _costs(network, *problem.arrays(values))
+    loose = np.isfinite(limit)
+    ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
+    worst = float(min(ratio[believed].max(initial=0.0), WORST))
+    mu = 1.0 / max(2.0 * worst - 1.0, 1.0)
+    weights = np.ones(len(limit))
+    for _ in range(STAGES):
+        fresh = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
+        fresh[ratio <= mu / (mu + 1.0)] = 1.0
+        fresh[ratio >= (mu + 1.0) / mu] = 0.0
+        weights = np.where(loose, fresh, 1.0)
+        weighted = replace(
+            network,
+            information=weights[:m, None, None] * network.information,
+            observation_information=weights[m:, None, None] * network.observation_information,
+        )
+        values = polish(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
+        costs = _costs(network, *problem.arrays(values))
+        ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
+        if not ((weights > 0.0) & (weights < 1.0)).any():
+            break
+        mu *= GROWTH
+    return weights, values
+
+
+@dataclass(frozen=True, slots=True)
+class _Trimmed:
+    inliers: Mask
+    problem: BatchProblem
+    end: Polished
+    cost: float
+
+
+def _trim(network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array) -> _Trimmed:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
     Neither step raises the truncated cost, so it ends.
@@ -118,8 +255,13 @@ def _trim(
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values
-    return inliers, inner, end, float(np.where(inliers, costs, limit).sum())
+    return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
 
 
 def _costs(network: PoseNetwork, poses: Array, landmarks: Array) -> Array:
     return np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])
+
+
+def start_names(given: Sequence[str] | None) -> tuple[str, ...]:
+    """Starts that a user asked for."""
+    return tuple(given or ())

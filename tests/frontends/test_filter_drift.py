@@ -9,7 +9,7 @@ from frontends.filter_drift import FilterDrift
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.poses import SE2, SE3, Group, level
 
-MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, few=5.0, alone_walk=0.03)
+MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
 
 
 def _bend(group: Group, n: int = 60, pitch: float = 0.0) -> np.ndarray:
@@ -27,20 +27,24 @@ def _bend(group: Group, n: int = 60, pitch: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize(("group", "particles"), [(SE2, 40), (SE3, 5)])
 def test_covariance_is_that_of_many_drives(group: Group, particles: int) -> None:
-    """A heading that walks, positions that walk, and a height told by a gravity that is off by the same all the way."""
+    """A heading that walks, positions that walk, wheels that are off by a factor, and a height told by a gravity that
+    is off by the same all the way."""
     rng = np.random.default_rng(1)
     true = _bend(group)
     u = group.log(group.between(true[:-1], true[1:]))
     m, more, length = 4000, 1.0 + MODEL.few / particles, 40.0 / len(u)
     T = np.tile(group.identity, (m, 1))
     x = group.position.start
+    wheels = 1.0 + MODEL.position_scale * rng.standard_normal((m, 1))
     for k in range(len(u)):
         noise = np.zeros((m, group.dof))
         noise[:, group.heading] = MODEL.heading_walk * np.sqrt(more * length) * rng.standard_normal(m)
         noise[:, x : x + 2] = MODEL.position_walk * np.sqrt(more * length) * rng.standard_normal((m, 2))
         if group.dim == 3:
             noise[:, 5] = MODEL.height_walk * np.sqrt(length) * rng.standard_normal(m)
-        T = group.compose(group.compose(T, np.broadcast_to(group.exp(u[k]), T.shape)), group.exp(noise))
+        driven = np.repeat(u[k][None], m, axis=0)
+        driven[:, group.position] *= wheels
+        T = group.compose(group.compose(T, group.exp(driven)), group.exp(noise))
     T[:, 2] += 0.0 if group.dim == 2 else MODEL.height_scale * 40.0 * rng.standard_normal(m)
     e = group.log(group.between(np.broadcast_to(true[-1], T.shape), T))
     drawn = e.T @ e / m
