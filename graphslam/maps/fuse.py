@@ -1,0 +1,370 @@
+"""FusedMap: one evidence grid of many pieces, made anew only where pieces moved. No scan is read again.
+
+Each piece (:mod:`graphslam.maps.pieces`) is posed on the lattice of the world once, and kept so: every voxel of the
+world takes the value of the voxel of the piece that its centre lies in, as `EvidenceGrid.merge` does. The map is the
+sum of the posed pieces (SegSLAM A12: maps are merged by adding their log-odds), **added up in full and clamped once at
+the end**. So the map does not depend on the order of the pieces, as it would if it were clamped after each, which is
+what merging one after another does; of two pieces both give the same. A clamped sum cannot be taken apart: when a piece
+moves, the bricks that it touched before or touches now are summed anew, from all pieces that touch them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, GridError
+from graphslam.core.geometry import Array
+from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.poses import SE2, SE3
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.compact import compact
+from graphslam.evidence.contents import entropy_of_counts
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import BRICK_VOXELS
+from graphslam.evidence.pool import GridPool
+from graphslam.evidence.scan import pose_rows
+from graphslam.maps.fuse_kernels import count_changes, find_bricks
+from graphslam.maps.pieces import Piece, PieceId, checked_poses
+from graphslam.maps.posed import Posed, Poser
+
+Ints = npt.NDArray[np.int64]
+Names = Iterable[PieceId]
+
+TOLERANCE = 0.25
+"""Default of :class:`FusedMap` [voxels]: half of what rounding to the lattice does to a point."""
+_NONE = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a change of a fused map came to.
+
+    Parameters
+    ----------
+    added, removed, moved : int
+        Pieces.
+    held : int
+        Pieces that were asked to move by less than the tolerance, and stay.
+    summed : int
+        Bricks made anew.
+    written : int
+        Of these, bricks that are others now.
+    """
+
+    added: int
+    removed: int
+    moved: int
+    held: int
+    summed: int
+    written: int
+
+
+class FusedMap:
+    """Pieces, where they are, and the evidence grid they make together.
+
+    Parameters
+    ----------
+    voxel_size : float
+        Of the pieces and of the map [m].
+    dim : {3, 2}
+    model : BeamModel, optional
+        Its clamp bounds the sums; its threshold says what is occupied.
+    tolerance : float
+        A piece stays where it is until some point of it would move by more than this [voxels]. Distances are from
+        where it *is*, so that many small moves do not add up. 0 follows every move.
+    pool : GridPool, optional
+        Storage of the grid; give one of more levels for a world beyond ± 819 m of 0.2 m voxels.
+
+    Raises
+    ------
+    GridError
+        Impossible voxel size or dimension.
+    ConfigError
+        Impossible tolerance.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from graphslam.evidence.grid import EvidenceGrid
+    >>> from graphslam.maps.pieces import whole
+    >>> grid = EvidenceGrid(0.1)
+    >>> _ = grid.insert_scan([[2.0, 0.0, 0.0], [2.0, 0.5, 0.0]])
+    >>> fused = FusedMap(0.1)
+    >>> at = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    >>> _ = fused.add({"a": whole(grid)}, {"a": at})
+    >>> fused.move({"a": at + [1.0, 0, 0, 0, 0, 0, 0]}).moved
+    1
+    """
+
+    def __init__(
+        self,
+        voxel_size: float,
+        *,
+        dim: int = 3,
+        model: BeamModel | None = None,
+        tolerance: float = TOLERANCE,
+        pool: GridPool | None = None,
+    ) -> None:
+        if not (np.isfinite(tolerance) and tolerance >= 0):
+            raise ConfigError(f"tolerance of a fused map is {tolerance} voxels; wanted ≥ 0")
+        self._grid = EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim)
+        self.tolerance = float(tolerance)
+        self._poser = Poser(self._grid.voxel_size, dim, self._grid.pool.half)
+        self._pieces: dict[PieceId, Piece] = {}
+        self._posed: dict[PieceId, Posed] = {}
+        self._wanted: dict[PieceId, Array] = {}
+        # voxels by value of the map as it was when they were last asked for, and what was written since
+        self._counts = np.zeros(65536, np.int64)
+        self._counted = self._grid.copy()
+        self._uncounted: list[Ints] = []
+        self._written = 0
+
+    # --- reading ---------------------------------------------------------------------------------------------
+
+    @property
+    def voxel_size(self) -> float:
+        """[m]."""
+        return self._grid.voxel_size
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self._grid.dim
+
+    @property
+    def grid(self) -> EvidenceGrid:
+        """The map as it is now, in constant time: what comes later does not change what was given out."""
+        return self._grid.copy()
+
+    @property
+    def pieces(self) -> Mapping[PieceId, Piece]:
+        """All pieces by name."""
+        return MappingProxyType(self._pieces)
+
+    @property
+    def poses(self) -> dict[PieceId, Array]:
+        """``T_world_node`` of all pieces, where they *are* in the map."""
+        return {name: p.T_world_node.copy() for name, p in self._posed.items()}
+
+    @property
+    def wanted(self) -> dict[PieceId, Array]:
+        """``T_world_node`` of all pieces as last asked for: within the tolerance of where they are."""
+        return {name: T.copy() for name, T in self._wanted.items()}
+
+    def entropy(self) -> float:
+        """Entropy of the map (A11) [nat m³; 2-D: nat m²], that of ``grid`` to the last bit.
+
+        Only bricks that changed since it was last asked for are looked at.
+        """
+        return entropy_of_counts(self._count()) * self.voxel_size**self.dim
+
+    def known_volume(self) -> float:
+        """Volume of the voxels that are known [m³], in 2-D their area [m²]."""
+        return float(self._count().sum()) * self.voxel_size**self.dim
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of pieces, posed bricks and the grid [bytes]; what copies share is in each."""
+        held = sum(p.nbytes for p in self._pieces.values()) + sum(p.nbytes for p in self._posed.values())
+        return held + 2 * BRICK_VOXELS * len(self._grid.brick_coordinates())
+
+    def __len__(self) -> int:
+        return len(self._pieces)
+
+    def __repr__(self) -> str:
+        return f"FusedMap({self.voxel_size:g} m, {self.dim}-D, {len(self)} pieces, {self.known_volume():.0f} known)"
+
+    def copy(self) -> FusedMap:
+        """A second map of the same pieces, for another hypothesis: shares all that neither changes."""
+        twin = FusedMap.__new__(FusedMap)
+        twin._grid = self._grid.copy()
+        twin.tolerance = self.tolerance
+        twin._poser = Poser(self.voxel_size, self.dim, self._grid.pool.half)
+        twin._pieces, twin._posed, twin._wanted = dict(self._pieces), dict(self._posed), dict(self._wanted)
+        twin._counts, twin._counted = self._counts, self._counted.copy()
+        twin._uncounted, twin._written = list(self._uncounted), self._written
+        return twin
+
+    # --- changing --------------------------------------------------------------------------------------------
+
+    def add(self, pieces: Mapping[PieceId, Piece], poses: Mapping[PieceId, Any]) -> Change:
+        """Add pieces at ``T_world_node``; see :meth:`update`."""
+        return self.update(add=pieces, poses=poses)
+
+    def remove(self, names: Names) -> Change:
+        """Take pieces out; see :meth:`update`."""
+        return self.update(remove=names)
+
+    def move(self, poses: Mapping[PieceId, Any], *, tolerance: float | None = None) -> Change:
+        """Move pieces to ``T_world_node``; see :meth:`update`. Pieces that are not named stay."""
+        return self.update(poses=poses, tolerance=tolerance)
+
+    def update(
+        self,
+        *,
+        add: Mapping[PieceId, Piece] | None = None,
+        remove: Names = (),
+        poses: Mapping[PieceId, Any] | None = None,
+        tolerance: float | None = None,
+    ) -> Change:
+        """Add, remove and move pieces at once: the map is made anew once, or, after an error, not at all.
+
+        Parameters
+        ----------
+        add : mapping of name to Piece
+        remove : names
+            A name may be removed and added in one change: a piece is replaced.
+        poses : mapping of name to (7,) or (3,)
+            ``T_world_node`` of all that are added, and of those that move. Names of the map that has no piece of that
+            name are refused.
+        tolerance : float, optional
+            Instead of the map's own [voxels]. ``move(map.wanted, tolerance=0)`` puts every piece where it was last
+            wanted, exactly.
+
+        Raises
+        ------
+        DataError
+            A name that is not there, is there already, or has no pose.
+        GeometryError
+            An impossible pose.
+        GridError
+            Another voxel size or dimension, or a piece that would reach out of the addressable cube.
+        """
+        add, poses = dict(add or {}), dict(poses or {})
+        limit = self.tolerance if tolerance is None else float(tolerance)
+        if not limit >= 0:
+            raise ConfigError(f"tolerance of a move is {tolerance} voxels; wanted ≥ 0")
+        gone = list(dict.fromkeys(remove))
+        self._check(add, gone, poses)
+        wanted = dict(zip(poses, self._checked(poses)))
+        movers = [name for name in wanted if name not in add]
+        moved = self._beyond(movers, wanted, limit)
+        with self._grid.pool.lock:
+            fresh = self._pose({**{n: self._pieces[n] for n in moved}, **add}, wanted)
+            old = [self._posed[name] for name in (*gone, *moved)]
+            left = set(gone)
+            posed = {n: p for n, p in self._posed.items() if n not in left} | fresh
+            keys = np.unique(np.concatenate([_NONE, *(p.keys for p in (*old, *fresh.values()))]))
+            written, values = self._poser.sum(
+                keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
+            )
+            with deferred_interrupts():
+                if len(written):
+                    self._grid.write_packed(written, values)
+                self._posed = posed
+                for name in gone:
+                    del self._pieces[name], self._wanted[name]
+                self._pieces |= add
+                self._wanted |= wanted
+                self._uncounted.append(written)
+        self._tidy(len(written))
+        return Change(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(written))
+
+    # --- inside ----------------------------------------------------------------------------------------------
+
+    def _check(self, add: Mapping[PieceId, Piece], gone: list[PieceId], poses: Mapping[PieceId, Any]) -> None:
+        for name in gone:
+            if name not in self._pieces:
+                raise DataError(f"there is no piece {name!r} in this map", wanted="the name of a piece")
+        left = self._pieces.keys() - set(gone)
+        for name, piece in add.items():
+            if name in left:
+                raise DataError(f"piece {name!r} is in this map already", wanted="another name, or remove it as well")
+            if name not in poses:
+                raise DataError(f"piece {name!r} is added without a pose", wanted="T_world_node")
+            if piece.voxel_size != self.voxel_size or piece.dim != self.dim:
+                raise GridError(
+                    f"piece {name!r} is of another voxel size or dimension",
+                    got=f"{piece.voxel_size} m, {piece.dim}-D",
+                    wanted=f"{self.voxel_size} m, {self.dim}-D",
+                )
+        for name in poses:
+            if name not in left and name not in add:
+                raise DataError(f"there is no piece {name!r} to be moved in this map", wanted="the name of a piece")
+
+    def _checked(self, poses: Mapping[PieceId, Any]) -> Array:
+        """Poses ``(n, 7)`` or ``(n, 3)`` in their order."""
+        size = 7 if self.dim == 3 else 3
+        for name, T in poses.items():
+            if np.shape(T) != (size,):
+                raise DataError(f"pose of piece {name!r} has the wrong shape", got=np.shape(T), wanted=f"({size},)")
+        return checked_poses(np.array([np.asarray(T) for T in poses.values()]).reshape(-1, size), self.dim)
+
+    def _beyond(self, names: list[PieceId], wanted: Mapping[PieceId, Array], limit: float) -> list[PieceId]:
+        """Those of the pieces of which some point would move by more than the limit [voxels].
+
+        How far a point moves is a convex function of the point, so a corner of the box moves farthest.
+        """
+        names = [n for n in names if self._pieces[n].known]
+        if not names:
+            return []
+        corners = np.stack([self._pieces[n].corners for n in names])  # (n, corners, dim)
+        step = pose_rows(np.array([wanted[n] for n in names]), self.dim)
+        step = step - pose_rows(np.array([self._posed[n].T_world_node for n in names]), self.dim)
+        d = self.dim
+        R, t = step[:, :9].reshape(-1, 3, 3)[:, :d, :d], step[:, 9 : 9 + d]
+        far = np.linalg.norm(corners @ R.transpose(0, 2, 1) + t[:, None], axis=2).max(axis=1)
+        return [n for n, f in zip(names, far.tolist()) if f > limit * self.voxel_size]
+
+    def _pose(self, pieces: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> dict[PieceId, Posed]:
+        """Pieces on the lattice of the world."""
+        if not pieces:
+            return {}
+        group = SE3 if self.dim == 3 else SE2
+        at = np.array([wanted[n] for n in pieces])
+        inner = np.array([p.T_base_node for p in pieces.values()])
+        T = pose_rows(group.compose(at, group.inverse(inner)), self.dim)
+        return {n: self._poser.pose(piece, row, pose) for (n, piece), row, pose in zip(pieces.items(), T, at)}
+
+    def _tidy(self, written: int) -> None:
+        """Now and then drop the bricks that nobody touches any more."""
+        self._written += written
+        if self._written > 4 * (1000 + len(self._grid.brick_coordinates())):
+            compact(self._grid)
+            self._written = 0
+
+    def _count(self) -> Ints:
+        """Voxels by value, brought up to date."""
+        if self._uncounted:
+            keys = np.unique(np.concatenate(self._uncounted))
+            pool = self._grid.pool
+            with pool.lock:
+                before, after = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
+                find_bricks(self._counted.root, keys, pool.levels, pool.children, before)
+                find_bricks(self._grid.root, keys, pool.levels, pool.children, after)
+                counts = self._counts.copy()  # another map may hold the same ones
+                count_changes(before, after, pool.bricks, counts)
+            counts[0] = 0  # the unknown
+            self._counts, self._counted, self._uncounted = counts, self._grid.copy(), []
+        return self._counts
+
+
+def fuse(
+    pieces: Mapping[PieceId, Piece],
+    poses: Mapping[PieceId, Any],
+    *,
+    model: BeamModel | None = None,
+    tolerance: float = TOLERANCE,
+    pool: GridPool | None = None,
+) -> FusedMap:
+    """A fused map of pieces at ``T_world_node``, from scratch.
+
+    Raises
+    ------
+    DataError
+        No pieces (then there is no voxel size), or a piece without a pose.
+    GridError, GeometryError
+        See :meth:`FusedMap.update`.
+    """
+    if not pieces:
+        raise DataError("a fused map of no pieces has no voxel size", wanted="a FusedMap, and pieces later")
+    first = next(iter(pieces.values()))
+    fused = FusedMap(first.voxel_size, dim=first.dim, model=model, tolerance=tolerance, pool=pool)
+    fused.add(pieces, {name: poses[name] for name in pieces if name in poses})
+    return fused

@@ -1,0 +1,356 @@
+"""Pieces of maps: what a submap knows, divided among the nodes of the graph that lie along its path.
+
+A submap is rigid only as long as the graph bends at its ends alone. With nodes inside, each known voxel goes with the
+node whose stretch of the path saw it most plausibly, and moves with that node.
+
+**Whose voxel?** The nearest place of the path decides, with three amendments:
+
+* *Storeys.* Heights count more than distances along the floor (`DivisionConfig.stretch`): of two paths one above the
+  other, the floor slab between them goes with the upper one, which it carries, although the lower one may pass nearer.
+* *Out and back.* Where the path comes within `DivisionConfig.retrace` of a place where it was before, the earlier visit
+  owns. Voxels there hold the evidence of both visits, added up, and cannot be divided; the nearest place would deal a
+  wall out by centimetres, and the graph could then tear it into dust. So the whole wall goes with one.
+* *Maps that were entered again.* A segment that enters an older map begins with a copy of it. What lies farther from
+  its path than its sensor reaches (`DivisionConfig.reach`) it cannot have seen; :mod:`graphslam.maps.added` takes the
+  rest of the older evidence out.
+
+Stretches meet half-way between nodes, measured along the path, so that no voxel is led by a node that is farther along
+than another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
+from graphslam.maps.piece_kernels import count_owned, deal_out, known_extents, own_voxels
+
+Ints = npt.NDArray[np.int64]
+Steps = npt.NDArray[np.int16]
+PieceId: TypeAlias = Hashable
+"""What a piece is called: anything that may be a key of a mapping; of submaps ``(key of the submap, node)``."""
+
+MARGIN = 3
+"""Bricks of nothing around the box of a piece. A brick of the world that meets the box around a turned brick of the
+piece reaches at most 1 + √3/2 bricks along each axis from its middle, √3 times as far in all: 3.23, less than 3.5."""
+TABLE_LIMIT = 1 << 26
+"""Bricks of the box around a piece at most: what is wider than that is a stray beam, not a place."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DivisionConfig:
+    """How the voxels of a submap are divided among its nodes."""
+
+    stretch: float = 4.0
+    """By how much more heights count than distances along the floor."""
+    retrace: float = 1.0
+    """A place within this of one where the path was before owns nothing [m]; 0 turns it off."""
+    reach: float = float("inf")
+    """Voxels farther from the nearest place belong to nobody [m]."""
+    spacing: float = 0.25
+    """Places of the path nearer to the one before are left out [m]."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.stretch) and self.stretch > 0 and self.reach > 0 and self.spacing >= 0):
+            raise ConfigError(
+                f"division of a map: stretch {self.stretch}, reach {self.reach}, spacing {self.spacing}; wanted > 0"
+            )
+        if not (np.isfinite(self.retrace) and self.retrace >= 0 and np.isfinite(self.spacing)):
+            raise ConfigError(f"division of a map: retrace {self.retrace}, spacing {self.spacing}; wanted ≥ 0 m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """Voxels that move with one node: a frozen value, in the lattice of the frame of its submap's base.
+
+    Parameters
+    ----------
+    voxel_size : float
+        [m].
+    dim : {2, 3}
+    coordinates : (n, 3) int64
+        Signed, of the bricks; each once.
+    values : (n, 512) int16
+        In units of `evidence.layout.STEP`, x fastest; `layout.UNKNOWN` where the piece knows nothing.
+    T_base_node : (7,) or (3,)
+        Pose of the node in the base's frame; default the identity: a submap in one piece, led by its base.
+
+    Raises
+    ------
+    GridError
+        Shapes that do not fit, a brick twice, 2-D bricks off the layer 0, or a piece too wide.
+    GeometryError
+        An impossible pose.
+    """
+
+    voxel_size: float
+    dim: int
+    coordinates: Ints
+    values: Steps
+    T_base_node: Array = field(default_factory=lambda: np.zeros(0))
+    first: Ints = field(init=False, repr=False)
+    """Coordinates ``(3,)`` of the first brick of the box around the piece, its `MARGIN` included."""
+    table: npt.NDArray[np.int32] = field(init=False, repr=False)
+    """Rows of ``lookup`` of the bricks of that box ``(nz, ny, nx)``, 0 where there is none."""
+    lookup: Steps = field(init=False, repr=False)
+    """``values`` after a row that is all unknown ``(n + 1, 512)``."""
+    extents: npt.NDArray[np.int8] = field(init=False, repr=False)
+    """Of the known voxels of each brick: first one, and the one after the last ``(n, 6)``."""
+    corners: Array = field(init=False, repr=False)
+    """Of the box of the known voxels, in the node's frame ``(8, 3)`` or ``(4, 2)`` [m]; none of an empty piece."""
+    known: int = field(init=False)
+    """Known voxels."""
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        c = np.ascontiguousarray(self.coordinates, dtype=np.int64)
+        v = np.ascontiguousarray(self.values)
+        if self.dim not in (2, 3) or not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
+            raise GridError("impossible piece of a map", got=f"{self.dim}-D, voxels of {self.voxel_size} m")
+        if c.ndim != 2 or c.shape[1] != 3 or v.shape != (len(c), BRICK_VOXELS) or v.dtype != np.int16:
+            raise GridError(
+                "bricks of a piece have the wrong shape or type",
+                got=f"{c.shape}, {v.shape} {v.dtype}",
+                wanted=f"(n, 3) and (n, {BRICK_VOXELS}) int16",
+            )
+        first = (c.min(axis=0) if len(c) else np.zeros(3, np.int64)) - MARGIN
+        shape = ((c.max(axis=0) - first) if len(c) else np.zeros(3, np.int64)) + 1 + MARGIN
+        if float(np.prod(shape.astype(np.float64))) > TABLE_LIMIT:
+            raise GridError(
+                "a piece of a map is too wide: is there a stray voxel in it?",
+                got=f"{(shape * BRICK_EDGE * self.voxel_size).round().tolist()} m",
+                wanted=f"at most {TABLE_LIMIT} bricks in the box around it",
+            )
+        table = np.zeros(shape[::-1], np.int32)
+        at = c - first
+        table[at[:, 2], at[:, 1], at[:, 0]] = np.arange(1, len(c) + 1)
+        if np.count_nonzero(table) != len(c):
+            raise GridError("a brick stands twice in a piece", wanted="each brick once")
+        if self.dim == 2 and len(c) and (np.any(c[:, 2]) or np.any(v[:, 64:] != UNKNOWN)):
+            raise GridError("a 2-D piece leaves its layer", got=f"bricks {np.unique(c[:, 2]).tolist()}", wanted="k = 0")
+        group = SE3 if self.dim == 3 else SE2
+        T = checked_poses(self.T_base_node if np.size(self.T_base_node) else group.identity, self.dim)
+        lookup = np.empty((len(c) + 1, BRICK_VOXELS), np.int16)
+        lookup[0], lookup[1:] = UNKNOWN, v
+        box, extents = np.empty(6, np.int64), np.empty((len(c), 6), np.int8)
+        known = int(known_extents(c, lookup[1:], extents, box))
+        put(self, "voxel_size", float(self.voxel_size))
+        put(self, "coordinates", c)
+        put(self, "lookup", lookup)
+        put(self, "values", lookup[1:])
+        put(self, "T_base_node", T)
+        put(self, "first", first)
+        put(self, "table", table)
+        put(self, "extents", extents)
+        put(self, "known", known)
+        ends = box.reshape(2, 3)[:, : self.dim] * self.voxel_size
+        which = np.stack(np.meshgrid(*[[0, 1]] * self.dim, indexing="ij"), axis=-1).reshape(-1, self.dim)
+        base = ends[which, np.arange(self.dim)] if known else np.zeros((0, self.dim))
+        put(self, "corners", group.transform(group.inverse(np.broadcast_to(T, (len(base), group.size))), base))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return self.lookup.nbytes + self.table.nbytes + self.coordinates.nbytes
+
+    def __repr__(self) -> str:
+        return f"Piece({self.voxel_size:g} m, {self.dim}-D, {len(self.coordinates)} bricks, {self.known} known voxels)"
+
+
+def checked_poses(poses: Any, dim: int) -> Array:
+    """Poses ``(..., 7)``, or ``(..., 3)`` in 2-D, as floats, quaternions of unit length.
+
+    Raises
+    ------
+    GeometryError
+        Another shape, not finite, or no rotation.
+    """
+    T = np.array(poses, dtype=np.float64)
+    size = 7 if dim == 3 else 3
+    if T.ndim < 1 or T.shape[-1] != size:
+        raise GeometryError(f"a pose of a {dim}-D map has the wrong shape", got=T.shape, wanted=f"(..., {size})")
+    if not np.all(np.isfinite(T)):
+        raise GeometryError("a pose of a map is not finite", got=T[~np.isfinite(T).all(axis=-1)][:1].tolist())
+    if dim == 3:
+        T[..., 3:] = se3.quat_normalize(T[..., 3:])
+    return T
+
+
+def whole(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
+    """A grid in one piece.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+    T_base_node : (7,) or (3,), optional
+        Default the identity.
+    """
+    return Piece(
+        grid.voxel_size,
+        grid.dim,
+        grid.brick_coordinates(),
+        grid.brick_values(),
+        np.zeros(0) if T_base_node is None else T_base_node,
+    )
+
+
+def divide(
+    grid: EvidenceGrid,
+    path: Trajectory,
+    node_times: Any,
+    *,
+    T_base_nodes: Any = None,
+    config: DivisionConfig | None = None,
+) -> list[Piece]:
+    """A submap's grid, one piece for each node (see the module).
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        In the base's frame.
+    path : Trajectory
+        ``T_base_body(t)``.
+    node_times : (m,)
+        Ascending, within the path [s].
+    T_base_nodes : (m, 7) or (m, 3), optional
+        Poses of the nodes; default the body's at those times.
+    config : DivisionConfig, optional
+
+    Returns
+    -------
+    list of Piece
+        As many as nodes, in their order; a node that owns nothing has an empty piece.
+
+    Raises
+    ------
+    DataError
+        No nodes, times that do not ascend or lie outside the path, or another dimension of the path.
+    GeometryError
+        Impossible poses of nodes.
+    """
+    config = DivisionConfig() if config is None else config
+    times = np.asarray(node_times, dtype=np.float64)
+    if times.ndim != 1 or len(times) == 0 or not np.all(np.diff(times) > 0):
+        raise DataError("times of the nodes of a submap", got=times, wanted="(m,), m ≥ 1, ascending")
+    if path.dim != grid.dim:
+        raise DataError("a path and a grid of different dimensions", got=f"{path.dim}-D", wanted=f"{grid.dim}-D")
+    T_nodes = checked_poses(path.interpolate(times) if T_base_nodes is None else T_base_nodes, grid.dim)
+    if len(T_nodes) != len(times):
+        raise DataError("poses and times of the nodes differ in number", got=len(T_nodes), wanted=len(times))
+    coordinates, values = grid.brick_coordinates(), grid.brick_values()
+    places, nodes = owning_places(path, times, config)
+    owners = np.empty((len(values), BRICK_VOXELS), np.int32)
+    points = np.zeros((len(places), 3))
+    points[:, : grid.dim] = places / grid.voxel_size
+    if grid.dim == 2:
+        points[:, 2] = 0.5  # the middle of the only layer
+    points[:, 2] *= config.stretch
+    own_voxels(
+        coordinates, values, config.stretch, points, nodes, config.reach / grid.voxel_size,
+        1 if grid.dim == 2 else BRICK_EDGE, owners,
+    )  # fmt: skip
+    counts = np.zeros(len(times), np.int64)
+    count_owned(owners, counts)
+    ends = np.cumsum(counts)
+    dealt = np.full((int(ends[-1]), BRICK_VOXELS), UNKNOWN, np.int16)
+    rows = np.empty(int(ends[-1]), np.int64)
+    deal_out(owners, values, ends - counts, rows, dealt)
+    return [
+        Piece(grid.voxel_size, grid.dim, coordinates[rows[a:b]], dealt[a:b], T)
+        for a, b, T in zip((ends - counts).tolist(), ends.tolist(), T_nodes)
+    ]
+
+
+def owning_places(path: Trajectory, node_times: Array, config: DivisionConfig) -> tuple[Array, Ints]:
+    """Places ``(p, dim)`` of a path that own voxels, and their nodes ``(p,)``: thinned, first visits only.
+
+    Stretches meet half-way between nodes along the path; where the body stands, half-way in time.
+    """
+    positions = path.positions
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    clock = 1e-6 * (path.times - path.times[0]) / max(path.times[-1] - path.times[0], 1e-9)  # [m]: tells standing apart
+    along = arc + clock
+    node_arc = np.interp(node_times, path.times, along)
+    nodes = np.searchsorted(0.5 * (node_arc[:-1] + node_arc[1:]), along, side="right")
+    keep: list[int] = []
+    for k in range(len(positions)):
+        last = keep[-1] if keep else -1
+        if last < 0 or nodes[k] != nodes[last] or np.linalg.norm(positions[k] - positions[last]) >= config.spacing:
+            keep.append(k)
+    p, owner, s = positions[keep], nodes[keep].astype(np.int64), arc[keep]
+    first = np.ones(len(p), bool)
+    if config.retrace > 0:
+        for k in range(len(p)):
+            # π·r of way within r is a turn and no more: the far side of a half circle of that radius
+            earlier = first[:k] & (s[:k] < s[k] - np.pi * config.retrace)
+            first[k] = not np.any(np.linalg.norm(p[:k][earlier] - p[k], axis=1) < config.retrace)
+    return p[first], owner[first]
+
+
+def node_times_every(path: Trajectory, distance: float) -> Array:
+    """Times ``(m,)`` along a path about every ``distance`` metres, beginning at its first.
+
+    Raises
+    ------
+    ConfigError
+        A distance that is not positive.
+    """
+    if not (np.isfinite(distance) and distance > 0):
+        raise ConfigError(f"nodes every {distance} m; wanted > 0")
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+    count = max(round(float(arc[-1]) / distance), 1)
+    index = np.searchsorted(arc, arc[-1] * np.arange(count) / count, side="left")
+    return path.times[np.unique(index)]
+
+
+def pieces_of_submap(
+    submap: Submap,
+    node_times: Any = None,
+    *,
+    T_base_nodes: Any = None,
+    names: Sequence[PieceId] | None = None,
+    config: DivisionConfig | None = None,
+) -> dict[PieceId, Piece]:
+    """The pieces of a submap by name; nodes that own nothing are left out.
+
+    Parameters
+    ----------
+    submap : Submap
+        With an evidence grid.
+    node_times : (m,), optional
+        Without, the submap is one piece led by its base.
+    T_base_nodes : (m, 7) or (m, 3), optional
+    names : sequence, optional
+        Default ``(key, 0)``, ``(key, 1)`` …
+    config : DivisionConfig, optional
+
+    Raises
+    ------
+    DataError
+        No evidence grid, no path where it is needed, or names that differ in number from the nodes.
+    """
+    grid = submap.grid
+    if not isinstance(grid, EvidenceGrid):
+        raise DataError(f"submap {submap.key} has no evidence grid", got=type(grid).__name__, wanted="EvidenceGrid")
+    if node_times is None:
+        pieces = [whole(grid)]
+    elif submap.trajectory is None:
+        raise DataError(f"submap {submap.key} has no path to divide it along", wanted="a trajectory")
+    else:
+        pieces = divide(grid, submap.trajectory, node_times, T_base_nodes=T_base_nodes, config=config)
+    called: Sequence[PieceId] = [(submap.key, k) for k in range(len(pieces))] if names is None else names
+    if len(called) != len(pieces) or len(set(called)) != len(called):
+        raise DataError("names of pieces differ in number, or stand twice", got=called, wanted=f"{len(pieces)} names")
+    return {name: piece for name, piece in zip(called, pieces) if piece.known}
