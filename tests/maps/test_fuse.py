@@ -10,33 +10,12 @@ from hypothesis import strategies as st
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import pieces_of
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.maps.fuse import FusedMap, fuse
 from graphslam.maps.pieces import Piece, whole
 from tests.reference.plain_fuse import fused_voxels, voxels_of_grid
-
-
-def scanned(rng: np.random.Generator, dim: int, scans: int = 3, size: float = 0.25) -> EvidenceGrid:
-    """A small room from a few places, walls and noise."""
-    grid = EvidenceGrid(size, dim=dim)
-    for _ in range(scans):
-        points = rng.normal(size=(40, dim))
-        points *= (2.0 + 0.2 * rng.random((40, 1))) / np.linalg.norm(points, axis=1, keepdims=True)
-        grid.insert_scan(points, pose=SE3.exp(np.r_[0, 0, rng.normal(), 0.5 * rng.normal(size=3)]) if dim == 3 else
-                         SE2.exp(rng.normal(size=3) * [0.5, 0.5, 1.0]))  # fmt: skip
-    return grid
-
-
-def some_pose(rng: np.random.Generator, dim: int, spread: float = 1.0) -> np.ndarray:
-    group = SE3 if dim == 3 else SE2
-    return group.exp(spread * rng.normal(size=group.dof))
-
-
-def same_map(a: EvidenceGrid, b: EvidenceGrid) -> bool:
-    x, y = pieces_of(a), pieces_of(b)
-    return all(np.array_equal(getattr(x, n), getattr(y, n)) for n in ("bricks", "values", "cubes", "log_edges"))
+from tests.reference.small_maps import same_map, scanned, some_pose
 
 
 @pytest.mark.parametrize("dim", [2, 3])

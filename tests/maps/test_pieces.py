@@ -21,16 +21,8 @@ from graphslam.maps.pieces import (
     pieces_of_submap,
     whole,
 )
-from tests.maps.test_fuse import same_map, scanned, some_pose
 from tests.reference.plain_fuse import nearest_owner, voxels_of, voxels_of_grid
-
-
-def straight(dim: int, length: float = 9.0, n: int = 46, lift: float = 0.0) -> Trajectory:
-    poses = np.zeros((n, 7 if dim == 3 else 3))
-    poses[:, 0] = np.linspace(0.0, length, n)
-    if dim == 3:
-        poses[:, 2], poses[:, 6] = lift, 1.0
-    return Trajectory(np.linspace(0.0, 10.0, n), poses)
+from tests.reference.small_maps import same_map, scanned, some_pose, straight
 
 
 def corridor(path: Trajectory, rng: np.random.Generator, size: float = 0.25) -> EvidenceGrid:

@@ -19,11 +19,12 @@ from frontends.segslam.segmap import MATCH, SegMap
 from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 from frontends.steps import Steps
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.poses import SE2, SE3, group_of, heading_of, level
+from graphslam.core.poses import group_of, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.entropy import Clarity, clarity_of, placements
 from graphslam.sim.route import Route
 
 Ints = npt.NDArray[np.int64]
@@ -302,43 +303,6 @@ def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: Bea
     return grid
 
 
-def placements(count: int, voxel_size: float, dim: int) -> Array:
-    """Poses ``(count, 7)`` or ``(count, 3)`` of a path's frame in a grid, none of them favoured.
-
-    Headings over a quarter turn, and positions, heights foremost, over a voxel, both spread evenly. A single one is the
-    identity.
-    """
-    group = SE3 if dim == 3 else SE2
-    tangents = np.zeros((count, group.dof))
-    if count > 1:
-        share = (np.arange(count) + 0.5) / count
-        tangents[:, group.heading] = 0.5 * np.pi * share
-    poses = group.exp(tangents)
-    if count > 1:
-        # of a golden section the multiples fill a voxel evenly, whatever their number
-        golden = 0.5 * (np.sqrt(5.0) - 1.0)
-        shares = np.stack([golden * np.arange(1, count + 1) % 1.0, golden**2 * np.arange(1, count + 1) % 1.0, share], 1)
-        poses[:, :dim] = voxel_size * shares[:, :dim]
-    return poses
-
-
-@dataclass(frozen=True, slots=True)
-class Clarity:
-    """How clear a map is.
-
-    Parameters
-    ----------
-    entropy : float
-        Mean over the placements [nat m³].
-    volume : float
-        Volume of what was observed, likewise [m³]: a map that is folded onto itself knows less of the world, and has
-        less entropy for that.
-    """
-
-    entropy: float
-    volume: float
-
-
 def clarity(
     steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None, count: int = 1
 ) -> Clarity:
@@ -353,9 +317,7 @@ def clarity(
         fused_grid(steps, group.compose(np.broadcast_to(T, path.shape), path), voxel_size=voxel_size, model=model)
         for T in placements(count, voxel_size, steps.dim)
     ]
-    return Clarity(
-        entropy=float(np.mean([g.entropy() for g in grids])), volume=float(np.mean([g.known_volume() for g in grids]))
-    )
+    return clarity_of(grids)
 
 
 def quarters(seconds: Array) -> tuple[float, float]:

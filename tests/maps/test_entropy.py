@@ -1,0 +1,174 @@
+"""Entropy of fused maps, contradictions of pieces, and the clearest of several candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.core.errors import ConfigError, DataError, GridError
+from graphslam.core.poses import SE2, SE3
+from graphslam.evidence.beams import BeamModel
+from graphslam.maps.entropy import clarity, clarity_of, disagreement, placements
+from graphslam.maps.fuse import fuse
+from graphslam.maps.minimum_entropy import Candidate, rank_by_entropy, visiting_order
+from graphslam.maps.pieces import whole
+from tests.reference.plain_fuse import fused_voxels, plain_disagreement
+from tests.reference.small_maps import room, same_map, scanned, some_pose
+
+
+def plain_entropy(voxels: dict[tuple[int, int, int], int], volume: float) -> float:
+    """Eq. 20-22, a voxel at a time."""
+    total = 0.0
+    for value in voxels.values():
+        p = 1.0 / (1.0 + np.exp(-value / 2048))
+        total += volume * -(p * np.log(p) + (1 - p) * np.log(1 - p))
+    return total
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_entropy_is_that_of_the_voxels_one_by_one(dim: int, rng: np.random.Generator) -> None:
+    pieces = {k: whole(scanned(rng, dim)) for k in range(2)}
+    poses = {k: some_pose(rng, dim) for k in pieces}
+    fused = fuse(pieces, poses)
+    voxels = fused_voxels(pieces, poses, BeamModel().clamp_steps)
+    assert fused.entropy() == pytest.approx(plain_entropy(voxels, 0.25**dim), rel=1e-12)
+    assert clarity(pieces, poses).volume == pytest.approx(len(voxels) * 0.25**dim)
+    # the same seen twice is clearer; of the same volume
+    twice = fuse(dict.fromkeys("ab", pieces[0]), dict.fromkeys("ab", poses[0]))
+    once = fuse({0: pieces[0]}, {0: poses[0]})
+    assert twice.entropy() < 0.9 * once.entropy()
+    assert twice.known_volume() == once.known_volume()
+
+
+def test_clarity_is_the_mean_over_placements(rng: np.random.Generator) -> None:
+    pieces = {k: whole(scanned(rng, 3)) for k in range(2)}
+    poses = {k: some_pose(rng, 3) for k in pieces}
+    maps = [
+        fuse(pieces, {k: SE3.compose(T, p) for k, p in poses.items()}, tolerance=0.0) for T in placements(3, 0.25, 3)
+    ]
+    mean = clarity_of(maps)
+    got = clarity(pieces, poses, count=3)
+    assert (got.entropy, got.volume) == pytest.approx((mean.entropy, mean.volume), rel=1e-12)
+    assert got.entropy != clarity(pieces, poses).entropy
+    assert got.per_volume == got.entropy / got.volume
+    with pytest.raises(DataError):
+        clarity_of([])
+    with pytest.raises(DataError):
+        clarity({}, {})
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("slack", [0, 1])
+def test_disagreement_is_its_slow_twin(dim: int, slack: int, rng: np.random.Generator) -> None:
+    a, b = whole(scanned(rng, dim), some_pose(rng, dim)), whole(scanned(rng, dim))
+    T_a, T_b = some_pose(rng, dim, 0.2), some_pose(rng, dim, 0.2)
+    got = disagreement(a, T_a, b, T_b, slack=slack, doubt=0.4)
+    margin = round(0.4 * 2048)
+    wanted = plain_disagreement(a, T_a, b, T_b, margin, -margin, slack)
+    assert (got.overlap, got.agreeing, got.contradicting, got.free, got.sure) == wanted
+    assert min(got.overlap, got.contradicting, got.free) > 0
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_pieces_of_one_room_agree_and_displaced_ones_contradict(dim: int) -> None:
+    group = SE3 if dim == 3 else SE2
+    poses = [group.identity, group.exp(np.r_[np.zeros(group.dof - 3), 0.3, 0.2, 0.4] if dim == 2 else
+                                       np.r_[0, 0, 0.4, 0.3, 0.2, 0.0])]  # fmt: skip
+    pieces = [whole(room(p, dim=dim, beams=4000 if dim == 3 else 600)) for p in poses]
+    right = disagreement(pieces[0], poses[0], pieces[1], poses[1])
+    assert right.share < 0.05
+    assert right.agreeing > 50
+    off = np.zeros(group.dof)
+    off[group.position.start] = 1.0
+    wrong = disagreement(pieces[0], poses[0], pieces[1], group.compose(group.exp(off), poses[1]))
+    assert wrong.share > max(0.06, 3 * right.share)
+    assert 0 < wrong.share_of_overlap < wrong.share
+    apart = np.zeros(group.dof)
+    apart[group.position.start] = 50.0
+    nothing = disagreement(pieces[0], poses[0], pieces[1], group.exp(apart))
+    assert nothing.overlap == 0
+    assert np.isnan(nothing.share)
+    assert np.isnan(nothing.share_of_overlap)
+
+
+def test_impossible_comparisons_are_refused(rng: np.random.Generator) -> None:
+    a, flat, fine = whole(scanned(rng, 3)), whole(scanned(rng, 2)), whole(scanned(rng, 3, size=0.5))
+    for other in (flat, fine):
+        with pytest.raises(GridError):
+            disagreement(a, SE3.identity, other, SE3.identity)
+    for wrong in ({"slack": -1}, {"slack": 9}, {"doubt": float("nan")}, {"doubt": -0.1}):
+        with pytest.raises(ConfigError):
+            disagreement(a, SE3.identity, a, SE3.identity, **wrong)
+
+
+def candidates(rng: np.random.Generator, dim: int) -> list[Candidate]:
+    """A room seen five times; the right poses are the third, the others move one or two of the views."""
+    group = SE3 if dim == 3 else SE2
+    views = []
+    for _ in range(5):
+        xi = np.zeros(group.dof)
+        xi[group.heading] = 0.3 * rng.normal()
+        xi[group.position.start : group.position.start + 2] = 0.2 * rng.normal(size=2)
+        views.append(group.exp(xi))
+    pieces = {k: whole(room(T, dim=dim, beams=3000 if dim == 3 else 600)) for k, T in enumerate(views)}
+    out = []
+    for wrong in ([1, 2], [2], [], [4], [1, 2, 3]):
+        poses = dict(enumerate(views))
+        for k in wrong:
+            off = np.zeros(group.dof)
+            off[group.position.start] = 0.5
+            poses[k] = group.compose(group.exp(off), views[k])
+        out.append(Candidate(pieces, poses, f"{wrong}"))
+    return out
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_candidates_come_in_the_order_of_maps_from_scratch(dim: int, rng: np.random.Generator) -> None:
+    given = candidates(rng, dim)
+    ranking = rank_by_entropy(given)
+    scratch = [fuse(c.pieces, c.poses) for c in given]
+    by_index = {r.index: r for r in ranking.order}
+    for k, f in enumerate(scratch):
+        assert by_index[k].clarity.entropy == f.entropy()  # to the last bit
+        assert by_index[k].clarity.volume == f.known_volume()
+    assert [r.index for r in ranking.order] == sorted(range(5), key=lambda k: scratch[k].entropy())
+    assert ranking.order[0].index == 2  # the truth is the clearest
+    assert same_map(ranking.best.grid, scratch[2].grid)
+    # what is equal is not made twice: five views once, and of the other four candidates no more than differs
+    assert sum(r.changed for r in ranking.order) <= 5 + 1 + 1 + 2 + 3
+
+
+def test_candidates_may_have_other_pieces(rng: np.random.Generator) -> None:
+    given = candidates(rng, 3)
+    fewer = Candidate({k: given[2].pieces[k] for k in (0, 3)}, given[2].poses, "fewer")
+    other = Candidate({**given[2].pieces, 1: whole(scanned(rng, 3, size=0.2))}, given[0].poses, "other")
+    ranking = rank_by_entropy([given[0], fewer, other, given[2]])
+    for r in ranking.order:
+        c = [given[0], fewer, other, given[2]][r.index]
+        scratch = fuse(c.pieces, {k: c.poses[k] for k in c.pieces})
+        assert r.clarity.entropy == scratch.entropy()
+        assert r.name == c.name
+    mean = rank_by_entropy([given[0], given[2]], count=2)
+    for r in mean.order:
+        c = [given[0], given[2]][r.index]
+        assert r.clarity.entropy == pytest.approx(clarity(c.pieces, c.poses, count=2).entropy, rel=1e-12)
+    best = [given[0], given[2]][mean.order[0].index]
+    assert same_map(mean.best.grid, fuse(best.pieces, best.poses).grid)  # the map itself stands as it was given
+
+
+def test_visiting_order_goes_to_the_nearest() -> None:
+    sets = [frozenset(s) for s in ("abc", "xyz", "abd", "abe", "xyw")]
+    way = visiting_order(sets)
+    assert sorted(way) == list(range(5))
+    assert way[:3] == [0, 2, 3]
+    assert visiting_order([frozenset()]) == [0]
+
+
+def test_impossible_candidates_are_refused(rng: np.random.Generator) -> None:
+    piece = whole(scanned(rng, 2))
+    good = Candidate({0: piece}, {0: np.zeros(3)})
+    for wrong in ([], [good, Candidate({}, {})], [Candidate({0: piece}, {1: np.zeros(3)})]):
+        with pytest.raises(DataError):
+            rank_by_entropy(wrong)
+    with pytest.raises(ConfigError):
+        rank_by_entropy([good], count=0)
