@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +18,12 @@ import numpy.typing as npt
 from frontends.segslam.config import ChoiceConfig
 from frontends.segslam.localisation import Localisation
 from frontends.segslam.segmap import MATCH, Entry
-from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.registration import gates
 from graphslam.registration.config import RegistrationConfig
-from graphslam.registration.register import Registration, gate
+from graphslam.registration.gates import height_between, match_fails, shift_between, tilt_between
+from graphslam.registration.register import Registration
 
 NULL = -1
 """The draw's answer for no match."""
@@ -68,24 +69,17 @@ class Proposal:
     @property
     def shift(self) -> float:
         """From the prediction to the match, horizontally [m]."""
-        return float(np.hypot(*(self.T[:2] - np.asarray(self.T_prior)[:2])))
+        return shift_between(self.T, self.T_prior)
 
     @property
     def height(self) -> float:
         """From the prediction to the match, vertically [m]; 0 in two dimensions."""
-        return float(abs(self.T[2] - self.T_prior[2])) if len(self.T) == 7 else 0.0
+        return height_between(self.T, self.T_prior)
 
     @property
     def tilt(self) -> float:
-        """Between the vertical of the match and that of the prediction [rad]; 0 in two dimensions.
-
-        Not between the body and the map: a body on a ramp is tilted where the match is right.
-        """
-        if len(self.T) == 3:
-            return 0.0
-        up = np.array([[0.0, 0.0, 1.0]])
-        here, there = (se3.quat_rotate(np.asarray(q)[3:], up)[0] for q in (self.T, self.T_prior))
-        return math.atan2(float(np.linalg.norm(np.cross(here, there))), float(here @ there))
+        """Between the vertical of the match and that of the prediction [rad]; 0 in two dimensions."""
+        return tilt_between(self.T, self.T_prior)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,23 +170,9 @@ def judge(
 
 
 def second_modes(proposals: Sequence[Proposal], apart: float) -> Array:
-    """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``.
-
-    1 where there is no other. Results that are no results do not compete.
-    """
-    m = len(proposals)
-    out = np.ones(m)
-    if m < 2:
-        return out
-    segment = np.array([p.segment for p in proposals])
-    fitness = np.array([p.fitness if p.registration.converged else -np.inf for p in proposals])
-    dim = group_of(proposals[0].T).dim
-    at = np.stack([p.registration.T_target_source[:dim] for p in proposals])
-    rival = (segment[:, None] == segment[None]) & (np.linalg.norm(at[:, None] - at[None], axis=2) >= apart)
-    best = np.where(rival, fitness[None], -np.inf).max(axis=1)
-    some = np.isfinite(best) & np.isfinite(fitness)
-    out[some] = fitness[some] - best[some]
-    return out
+    """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``; see
+    :func:`graphslam.registration.gates.second_modes`."""
+    return gates.second_modes([p.registration for p in proposals], [p.segment for p in proposals], apart)
 
 
 def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
@@ -205,25 +185,12 @@ def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
 
 
 def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
-    r, g = p.registration, group_of(p.T)
-    if not r.converged or not np.all(np.isfinite(p.T)):
-        return ["nothing: " + (r.why or "the result is not finite").replace("; ", ", ")]
-    fails = [text] if (text := gate(replace(r, tilt=p.tilt), rules)) else []
-    if p.fitness < c.fitness and not any("fitness" in f for f in fails):
-        fails.append(f"fitness {p.fitness:.3f} < {c.fitness:g}")
-    if r.fitness_upright < c.fitness_upright and not any("upright" in f for f in fails):  # NaN is not
-        fails.append(f"fitness of upright surfaces {r.fitness_upright:.3f} < {c.fitness_upright:g}")
-    if p.height > (height := c.height + p.rise):
-        fails.append(f"height {p.height:.2f} m > {height:g}")
-    if p.shift > c.shift * p.sigma:
-        fails.append(f"shift {p.shift:.2f} m > {c.shift:g} σ of {p.sigma:.2f} m")
-    sigma = np.sqrt(np.diag(r.covariance))
-    if p.localisation is None and (
-        sigma[g.position].max() > c.vague_position or np.delete(sigma, g.position).max() > c.vague_angle
-    ):
-        fails.append("vague")
-    if margin < c.margin:
-        fails.append(f"margin {margin:.3f} < {c.margin:g}")
+    fails = match_fails(
+        p.registration, p.T_prior, c, rules, sigma=p.sigma, margin=margin, rise=p.rise, T=p.T,
+        ask_vague=p.localisation is None,
+    )  # fmt: skip
+    if fails and fails[0].startswith("nothing"):
+        return fails
     if c.method != "registration" and p.localisation is None:
         fails.append("localisation: there is none")
     return fails
