@@ -1,0 +1,395 @@
+"""Where the surroundings of a place in one submap lie in another submap: search, registration, gates, covariance.
+
+The source is what one submap knows around one of its places, the target the whole of the other. Where the place may lie
+is known as a Gaussian, ``T_target_source`` with a covariance in its right tangent: that is where it is searched, and a
+match that it contradicts is refused. All good places in that region are tried, because in a building that repeats
+itself the true one must be among them, or an alias wins; and one that is hardly better than the next is refused too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from graphslam.core.errors import GeometryError
+from graphslam.core.gaussian import check_covariance
+from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.poses import Group, group_of
+from graphslam.registration.gates import match_fails, second_modes
+from graphslam.registration.pair_config import PairConfig
+from graphslam.registration.points import check_pose, spread
+from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.search import SearchConfig, correlative_search
+from graphslam.registration.search_field import SearchField
+from graphslam.registration.target import Target
+
+
+class MapGrid(Protocol):
+    """What is asked of a submap's grid; an evidence grid has it."""
+
+    @property
+    def dim(self) -> int: ...
+    def occupied_cloud(self) -> Any: ...
+    def binned_cloud(self, level: int) -> Any: ...
+    def known_at(self, points: Any) -> npt.NDArray[np.bool_]: ...
+    def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]: ...
+
+
+class PreparedMap:
+    """A submap's grid made ready to be matched; everything is made when it is first asked for.
+
+    Parameters
+    ----------
+    grid : MapGrid
+        In the frame of the submap's base.
+    config : PairConfig
+    """
+
+    def __init__(self, grid: MapGrid, config: PairConfig) -> None:
+        self.grid, self.config = grid, config
+
+    @cached_property
+    def points(self) -> Array:
+        """Occupied voxels gathered in cells ``(m, dim)`` [m]."""
+        return np.asarray(self.grid.binned_cloud(self.config.cloud_level).points)
+
+    @cached_property
+    def target(self) -> Target:
+        """The points with their tree and shapes."""
+        return Target(self.points)
+
+    @cached_property
+    def fields(self) -> tuple[SearchField, SearchField]:
+        """Fine and coarse."""
+        c = self.config
+        occupied, cell = self.grid.occupied_cloud(), c.grid / 4.0
+        return (
+            SearchField(occupied, cell=cell, sigma=c.field_sigma),
+            SearchField(occupied, cell=2.0 * cell, sigma=2.0 * c.field_sigma),
+        )
+
+    def around(self, T_base_place: ArrayLike) -> Array:
+        """Points ``(m, dim)`` around a place, in the frame of the place [m]; thinned evenly if there are too many."""
+        T = np.asarray(T_base_place, dtype=np.float64)
+        g, p = group_of(T), self.points
+        near = np.hypot(*(p[:, :2] - T[:2]).T) <= self.config.radius
+        if g.dim == 3:
+            near &= np.abs(p[:, 2] - T[2]) <= self.config.height
+        chosen = spread(p[near], self.config.source_points)
+        return g.transform(np.broadcast_to(g.inverse(T), (len(chosen), g.size)), chosen)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairMatch:
+    """What came of matching a place of one submap to another.
+
+    Parameters
+    ----------
+    T_target_source : (7,) or (3,)
+        The match; the prediction where there is none.
+    covariance : (d, d)
+        Right tangent; NaN where there is no result.
+    why : str
+        The gates it fails; empty for one that is accepted.
+    registration : Registration or None
+        What the match rests on.
+    chi2 : float
+        Of the match against the prediction, both uncertain; NaN without a result.
+    margin : float
+        How much better than the best rival: mean of the fitness and that of upright surfaces, where known.
+    contradiction : float
+        Share of voxels that the two maps contradict each other in; NaN without a result.
+    modes : int
+        Distinct places that were compared.
+    points : int
+        Of the source.
+    loose : bool
+        One direction is not held by the match, and is as uncertain as the prediction had it.
+    half_widths : tuple of float
+        Of the search: x, y[, z] [m], heading [rad].
+    """
+
+    T_target_source: Array
+    covariance: Array
+    why: str
+    registration: Registration | None = None
+    chi2: float = math.nan
+    margin: float = math.nan
+    contradiction: float = math.nan
+    modes: int = 0
+    points: int = 0
+    loose: bool = False
+    half_widths: tuple[float, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Passes all gates."""
+        return not self.why
+
+    def gates(self) -> dict[str, Any]:
+        """The figures that were judged, ready for JSON."""
+        r = self.registration
+        nan = math.nan
+        return {
+            "fitness": nan if r is None else r.fitness,
+            "fitness_known": nan if r is None else r.fitness_known,
+            "fitness_upright": nan if r is None else r.fitness_upright,
+            "known_share": nan if r is None else r.known_share,
+            "degeneracy": nan if r is None else r.degeneracy,
+            "margin": self.margin,
+            "contradiction": self.contradiction,
+            "chi2": self.chi2,
+            "modes": self.modes,
+            "points": self.points,
+            "loose": self.loose,
+        }
+
+
+def match_pair(
+    source: PreparedMap,
+    T_base_place: ArrayLike,
+    target: PreparedMap,
+    T_target_place: ArrayLike,
+    covariance: ArrayLike,
+    config: PairConfig | None = None,
+) -> PairMatch:
+    """Match the surroundings of a place of one submap to another submap.
+
+    Parameters
+    ----------
+    source, target : PreparedMap
+    T_base_place : (7,) or (3,)
+        The place in the frame of the source's base.
+    T_target_place : (7,) or (3,)
+        Where it should lie in the frame of the target's base.
+    covariance : (d, d)
+        Of that, right tangent.
+    config : PairConfig, optional
+        Of the target, by default.
+
+    Returns
+    -------
+    PairMatch
+        ``T_target_source`` is that of the place. Never an exception because a match fails.
+
+    Raises
+    ------
+    CovarianceError, GeometryError
+        An impossible prediction.
+    """
+    c = target.config if config is None else config
+    g = group_of(T_target_place)
+    if g.dim != target.grid.dim or g.dim != source.grid.dim:
+        raise GeometryError("pair of submaps: dimensions differ", got=(source.grid.dim, target.grid.dim), wanted=g.dim)
+    T = check_pose(T_target_place, g.dim, what="prediction of a pair of submaps")
+    P = check_covariance(covariance, what="covariance of a pair of submaps", dim=g.dof)
+    points = source.around(T_base_place)
+    least = c.registration.least_points
+    if len(points) < least or len(target.points) < least:
+        why = f"nothing: {len(points)} points around the place and {len(target.points)} in the map, wanted {least}"
+        return _nothing(T, why, len(points))
+    half = half_widths(T, P, c)
+    fine, coarse = target.fields
+    steps = [*[c.grid] * g.dim, c.yaw_step]
+    found = correlative_search(points, fine, T, half, steps, c.starts, coarse=coarse, config=SearchConfig())
+    best = max((s.score for s in found), default=0.0)
+    starts = [s.T for s in found if s.score >= max(c.least_score, best - c.score_margin)]
+    if not starts:
+        return _nothing(T, f"nothing: no place explains more than {best:.2f} of the points", len(points), tuple(half))
+    # a body may be tilted: what tilts against the prediction is refused later
+    rules = replace(c.registration, gates=replace(c.registration.gates, tilt=math.pi))
+    cloud = Target(points)
+    results = register_starts(cloud, target.target, starts, rules, known=target.grid.known_at)
+    results = [_upright_in_known(r, cloud, target, c) for r in results]
+    place = np.asarray(T_base_place, dtype=np.float64)
+    return _judge(results, points, source, place, target, T, P, c, tuple(half))
+
+
+def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:
+    """Half widths of the search for a prediction: x, y[, z] [m] along the target's axes, heading [rad]."""
+    g = group_of(T)
+    at = g.position
+    R = axes_of(T, g)
+    s = config.sigmas * np.sqrt(np.diag(R @ P[at, at] @ R.T))
+    # heading about the vertical of the target, of a body that may be tilted
+    up = R.T[:, 2] if g.dim == 3 else None
+    turn = config.sigmas * math.sqrt(P[2, 2] if up is None else float(up @ P[:3, :3] @ up))
+    low, high = config.least, config.most
+    out = [float(np.clip(v, low[0], high[0])) for v in s[:2]]
+    if g.dim == 3:
+        out.append(float(np.clip(s[2], low[1], high[1])))
+    return [*out, float(np.clip(turn, low[2], high[2]))]
+
+
+def axes_of(T: Array, g: Group) -> Array:
+    """Rotation matrix ``(dim, dim)`` of a pose."""
+    corner = g.transform(np.broadcast_to(T, (g.dim, g.size)), np.eye(g.dim))
+    return np.asarray((corner - T[: g.dim]).T)
+
+
+def _judge(
+    results: Sequence[Registration],
+    points: Array,
+    source: PreparedMap,
+    T_base_place: Array,
+    target: PreparedMap,
+    T: Array,
+    P: Array,
+    c: PairConfig,
+    half: tuple[float, ...],
+) -> PairMatch:
+    """The best of the modes that the prediction allows, and whether it is to be believed."""
+    g = group_of(T)
+    modes = distinct(results)
+    if not modes:
+        return _nothing(T, "nothing: no start led to a result", len(points), half)
+    own = [_covariance(r, P, c) for r in modes]
+    chi2 = np.array([prediction_chi2(r.T_target_source, C, T, P) for r, (C, _) in zip(modes, own)])
+    limit = float(stats.chi2.ppf(c.chi2_level, g.dof))
+    fit = np.array([_likeness(r) for r in modes])
+    allowed = np.flatnonzero(chi2 <= limit)
+    allowed = allowed[np.argsort(-fit[allowed], kind="stable")]  # best first
+    k = int(allowed[0]) if len(allowed) else int(np.argmin(chi2))
+    best, (covariance, loose) = modes[k], own[k]
+    T_found = best.T_target_source
+    clash = contradiction(source, T_base_place, target, T_found, points)
+    out = PairMatch(
+        T_target_source=T_found, covariance=covariance, why="", registration=best, chi2=float(chi2[k]),
+        contradiction=clash, modes=len(allowed), points=len(points), loose=loose, half_widths=half,
+    )  # fmt: skip
+    if not len(allowed):
+        return replace(out, why=f"prediction: χ² {chi2[k]:.1f} > {limit:.1f}")
+    margin = _margin([modes[i] for i in allowed], loose, c)
+    rules = c.registration
+    if loose:  # known to be so, and said in the covariance
+        rules = replace(rules, gates=replace(rules.gates, degeneracy=0.0, degeneracy_planar=0.0))
+    R = axes_of(T, g)
+    rise = c.sigmas * math.sqrt(float((R @ P[g.position, g.position] @ R.T)[-1, -1])) if g.dim == 3 else 0.0
+    fails = match_fails(best, T, c.gates, rules, sigma=1.0, margin=margin, rise=rise, ask_vague=not loose)
+    if clash > c.contradiction:
+        fails.append(f"contradiction {clash:.3f} > {c.contradiction:g}")
+    return replace(out, why="; ".join(fails), margin=margin)
+
+
+def contradiction(
+    source: PreparedMap, T_base_place: Array, target: PreparedMap, T_target_place: Array, points: Array,
+    *, firm: float = 1.0, near: float = 0.5,
+) -> float:  # fmt: skip
+    """Share of what one map has occupied, and the other knows, that the other has free; the greater of both ways.
+
+    Parameters
+    ----------
+    source, target : PreparedMap
+    T_base_place, T_target_place : (7,) or (3,)
+        The place in both.
+    points : (m, dim)
+        Of the source, around the place and in its frame [m].
+    firm : float
+        Log-odds of −this and less are free.
+    near : float
+        … unless something is occupied so near [m].
+
+    Returns
+    -------
+    float
+        0 where the maps know nothing of each other.
+    """
+    g = group_of(T_target_place)
+
+    def share(held: PreparedMap, p: Array) -> float:
+        values = np.asarray(held.grid.log_odds_at(p), dtype=np.float64)
+        known = ~np.isnan(values)
+        if not np.any(known):
+            return 0.0
+        far = ~np.isfinite(held.target.tree.query(p[known], distance_upper_bound=near)[0])
+        return float(np.mean(far & (values[known] <= -firm)))
+
+    there = target.around(T_target_place)  # in the frame of the place
+    return max(
+        share(target, g.transform(np.broadcast_to(T_target_place, (len(points), g.size)), points)),
+        share(source, g.transform(np.broadcast_to(T_base_place, (len(there), g.size)), there)),
+    )
+
+
+def _upright_in_known(r: Registration, cloud: Target, target: PreparedMap, c: PairConfig) -> Registration:
+    """With the fitness of upright surfaces over those in known space: the place may reach out of the map."""
+    if cloud.dim == 2:
+        return r
+    T, rules = r.T_target_source, c.registration
+    normals, _ = cloud.normals(np.arange(len(cloud)))
+    up = axes_of(T, group_of(T))[2]  # the target's vertical in the frame of the place
+    steep = (np.abs(normals @ up) < math.sqrt(0.5)) & np.any(normals != 0.0, axis=1)
+    moved = group_of(T).transform(np.broadcast_to(T, (len(cloud), 7)), cloud.points)
+    steep &= target.grid.known_at(moved)
+    if np.sum(steep) < rules.least_points:
+        return replace(r, fitness_upright=math.nan)
+    near = target.target.tree.query(moved[steep], distance_upper_bound=rules.near)[0] < rules.near
+    return replace(r, fitness_upright=float(np.mean(near)))
+
+
+def prediction_chi2(T: ArrayLike, C: ArrayLike, T_prior: ArrayLike, P: ArrayLike) -> float:
+    """χ² of a match against a prediction, ``e = Log(T_prior⁻¹ T)``, ``eᵀ (P + Ad(T_prior⁻¹ T) C Ad(…)ᵀ)⁻¹ e``.
+
+    Parameters
+    ----------
+    T, T_prior : (7,) or (3,)
+    C, P : (d, d)
+        Their covariances, each in its own right tangent.
+    """
+    g = group_of(T)
+    D = g.between(T_prior, T)
+    A = g.adjoint(D)
+    e = g.log(D)
+    return float(e @ np.linalg.solve(np.asarray(P) + A @ np.asarray(C) @ A.T, e))
+
+
+def _covariance(r: Registration, P: Array, c: PairConfig) -> tuple[Array, bool]:
+    """Covariance of a match, and whether one direction is loose: then it says nothing along that.
+
+    The registration has such a direction as unknown as it may shift; a prediction may be worse than that. Ten of its σ
+    are so much that nothing is learnt along that axis, and the χ² of the rest is still asked.
+    """
+    C = c.inflation * r.covariance
+    dim = len(r.weakest)
+    gates = c.registration.gates
+    least = gates.degeneracy_planar if dim == 2 else gates.degeneracy
+    if not c.loose or r.degeneracy >= least:
+        return C, False
+    axis = np.zeros(len(C))
+    axis[group_of(r.T_target_source).position] = r.weakest
+    unknown = 100.0 * float(axis @ P @ axis)
+    return C + max(unknown - float(axis @ C @ axis), 0.0) * np.outer(axis, axis), True
+
+
+def _likeness(r: Registration) -> float:
+    """What modes are compared by: the fitness, and as much that of upright surfaces, where it is known. Floors and
+    ceilings are most of the points, and fit anywhere."""
+    return r.best_fitness if math.isnan(r.fitness_upright) else 0.5 * (r.best_fitness + r.fitness_upright)
+
+
+def _margin(modes: list[Registration], loose: bool, c: PairConfig) -> float:
+    """Likeness of the first of the modes less that of the next place; where it may slide, what lies along that
+    direction is no rival."""
+    modes = [replace(r, fitness_known=_likeness(r)) for r in modes]
+    best = modes[0]
+    if loose:
+        g = group_of(best.T_target_source)
+        v = axes_of(best.T_target_source, g) @ best.weakest
+        d = np.stack([m.T_target_source[: g.dim] - best.T_target_source[: g.dim] for m in modes])
+        across = np.linalg.norm(d - np.outer(d @ v, v), axis=1)
+        modes = [best, *(m for m, a in zip(modes[1:], across[1:]) if a >= c.gates.mode_distance)]
+    return float(second_modes(modes, np.zeros(len(modes)), c.gates.mode_distance)[0])
+
+
+def _nothing(T: Array, why: str, points: int, half: tuple[float, ...] = ()) -> PairMatch:
+    d = group_of(T).dof
+    return PairMatch(
+        T_target_source=T, covariance=np.full((d, d), math.nan), why=why, points=points, half_widths=half
+    )  # fmt: skip
