@@ -43,9 +43,9 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.compact import pieces_of
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load
-from graphslam.maps.added import own_evidence
 from graphslam.maps.fuse import FusedMap, fuse
-from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
+from graphslam.maps.pieces import DivisionConfig, PieceId
+from graphslam.maps.submaps import divide_submaps
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
@@ -83,32 +83,23 @@ def scene(name: str) -> Scene:
 
 
 def submaps_of(s: Scene, steps: Steps) -> list[Submap]:
-    """The settled chain of one particle, each submap with what it saw itself."""
+    """The settled chain of one particle."""
     filter = dataclasses.replace(s.config.filter, particles=1)
     result = run_segslam(steps, filter, s.config.segslam, SeedTree(9))
-    chain = settled(result, s.config.drift, s.config.segslam)
-    grids, _ = own_evidence(chain)
-    return [dataclasses.replace(m, grid=grids[m.key]) for m in chain]
+    return settled(result, s.config.drift, s.config.segslam)
 
 
-def place(submaps: Sequence[Submap], steps: Steps) -> tuple[dict[PieceId, Piece], dict[PieceId, Any], Any]:
-    """Pieces, their poses along the chain, and the poses of the body at the steps."""
+def bodies_of(submaps: Sequence[Submap], steps: Steps) -> Any:
+    """Poses of the body at the steps, along the chain."""
     group = group_of(submaps[0].exit_pose)
-    pieces: dict[PieceId, Piece] = {}
-    poses: dict[PieceId, Any] = {}
     bodies = np.tile(group.identity, (len(steps), 1))
     base = group.identity
-    reach = DivisionConfig(reach=1.0 + (steps.max_range or np.inf))
     for m in submaps:
         assert m.trajectory is not None
-        times = node_times_every(m.trajectory, NODE_EVERY)
-        nodes = m.trajectory.interpolate(times)
-        pieces |= pieces_of_submap(m, times, config=reach)
-        poses |= {(m.key, k): group.compose(base, T) for k, T in enumerate(nodes)}
         at = np.searchsorted(steps.times, m.trajectory.times)
         bodies[at] = group.compose(np.broadcast_to(base, m.trajectory.poses.shape), m.trajectory.poses)
         base = group.compose(base, m.exit_pose)
-    return pieces, {name: poses[name] for name in pieces}, bodies
+    return bodies
 
 
 def insert(steps: Steps, bodies: Any, size: float, model: Any) -> EvidenceGrid:
@@ -152,7 +143,9 @@ def measure(s: Scene, turns: int) -> dict[str, float]:
     submaps = submaps_of(s, steps)
     first: Any = submaps[0].grid
     size, model = first.voxel_size, first.model
-    pieces, poses, bodies = place(submaps, steps)
+    reach = DivisionConfig(reach=1.0 + (steps.max_range or np.inf))
+    divided = divide_submaps(submaps, every=NODE_EVERY, config=reach)
+    pieces, poses, bodies = divided.pieces, divided.poses, bodies_of(submaps, steps)
     loops = {"third": corrected(poses, 1 / 3), "all": corrected(poses, 1.0)}
     fuse(pieces, poses, model=model).move(loops["third"])  # compiled and warm
     found: dict[str, list[float]] = {}

@@ -1,0 +1,122 @@
+"""From a chain of submaps to pieces with a pose each: what a fused map of a run begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3, level
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.maps.added import own_evidence
+from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
+
+
+@dataclass(frozen=True, slots=True)
+class DividedSubmaps:
+    """Pieces of a chain of submaps. Names are ``(key of the submap, node)``.
+
+    Parameters
+    ----------
+    pieces : by name
+        Nodes that own nothing are left out.
+    poses : by name
+        ``T_world_node`` along the open chain, the first base at the identity.
+    local : by name
+        ``T_base_node``.
+    times : by name
+        Of the nodes [s].
+    level_nodes : bool
+        Nodes stand level.
+    """
+
+    pieces: dict[PieceId, Piece]
+    poses: dict[PieceId, Array]
+    local: dict[PieceId, Array]
+    times: dict[PieceId, float]
+    level_nodes: bool
+
+    def along(self, path: Trajectory) -> dict[PieceId, Array]:
+        """``T_world_node`` where a path ``T_world_body(t)`` has the body at the times of the nodes.
+
+        Raises
+        ------
+        DataError
+            A node outside the path's time.
+        """
+        poses = path.interpolate(np.array(list(self.times.values())))
+        return dict(zip(self.times, level(poses) if self.level_nodes else poses))
+
+    def from_bases(self, bases: dict[int, Array]) -> dict[PieceId, Array]:
+        """``T_world_node`` from ``T_world_base`` by key: submaps that stay rigid.
+
+        Raises
+        ------
+        DataError
+            A submap without a pose.
+        """
+        missing = sorted({name[0] for name in self.pieces} - set(bases))  # type: ignore[index]
+        if missing:
+            raise DataError("submaps have no pose", got=missing)
+        group = SE3 if next(iter(self.pieces.values())).dim == 3 else SE2
+        return {name: group.compose(bases[name[0]], self.local[name]) for name in self.pieces}  # type: ignore[index]
+
+
+def divide_submaps(
+    submaps: Sequence[Submap],
+    *,
+    every: float | None = 3.0,
+    config: DivisionConfig | None = None,
+    own: bool = True,
+    level_nodes: bool = True,
+) -> DividedSubmaps:
+    """Pieces of a chain of submaps with evidence grids, and where the chain has them.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        Each base is the exit of the one before.
+    every : float, optional
+        Way between nodes, about [m]; None: one piece a submap, led by its base.
+    config : DivisionConfig, optional
+        Give its ``reach``: the sensor's.
+    own : bool
+        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.added`).
+    level_nodes : bool
+        Nodes have the body's position and heading and stand level (3-D): otherwise what one instant says wrong of roll
+        and pitch tilts a piece whose far end may be 25 m off.
+
+    Raises
+    ------
+    DataError
+        No submaps, or one without an evidence grid or, where it is divided, without a path.
+    """
+    if not submaps:
+        raise DataError("there are no submaps to make a map of", wanted="one at least")
+    if own:
+        grids, _ = own_evidence(submaps)
+        submaps = [replace(s, grid=grids[s.key]) for s in submaps]
+    group = SE3 if submaps[0].dim == 3 else SE2
+    out = DividedSubmaps({}, {}, {}, {}, level_nodes)
+    base = group.identity
+    for s in submaps:
+        if every is None:
+            times, local = np.array([s.interval[0]]), group.identity[None]
+            pieces = pieces_of_submap(s)
+        else:
+            if s.trajectory is None:
+                raise DataError(f"submap {s.key} has no path to divide it along", wanted="a trajectory")
+            times = node_times_every(s.trajectory, every)
+            local = s.trajectory.interpolate(times)
+            local = level(local) if level_nodes else local
+            pieces = pieces_of_submap(s, times, T_base_nodes=local, config=config)
+        for name, piece in pieces.items():
+            k = name[1]  # type: ignore[index]
+            out.pieces[name], out.local[name], out.times[name] = piece, local[k], float(times[k])
+            out.poses[name] = group.compose(base, local[k])
+        base = group.compose(base, s.exit_pose)
+    return out
