@@ -11,6 +11,7 @@ moves, the bricks that it touched before or touches now are summed anew, from al
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -66,7 +67,7 @@ class Change:
 
 
 class FusedMap:
-    """Pieces, where they are, and the evidence grid they make together.
+    """Pieces, where they are, and the evidence grid they make together. Of one thread at a time.
 
     Parameters
     ----------
@@ -80,6 +81,8 @@ class FusedMap:
         where it *is*, so that many small moves do not add up. 0 follows every move.
     pool : GridPool, optional
         Storage of the grid; give one of more levels for a world beyond ± 819 m of 0.2 m voxels.
+    threads : int
+        That put pieces on the lattice; the map is the same with any number.
 
     Raises
     ------
@@ -110,12 +113,15 @@ class FusedMap:
         model: BeamModel | None = None,
         tolerance: float = TOLERANCE,
         pool: GridPool | None = None,
+        threads: int = 1,
     ) -> None:
         if not (np.isfinite(tolerance) and tolerance >= 0):
             raise ConfigError(f"tolerance of a fused map is {tolerance} voxels; wanted ≥ 0")
         self._grid = EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim)
         self.tolerance = float(tolerance)
-        self._poser = Poser(self._grid.voxel_size, dim, self._grid.pool.half)
+        if not (isinstance(threads, int) and threads >= 1):
+            raise ConfigError(f"a fused map of {threads} threads; wanted ≥ 1")
+        self._posers = [Poser(self._grid.voxel_size, dim, self._grid.pool.half) for _ in range(threads)]
         self._pieces: dict[PieceId, Piece] = {}
         self._posed: dict[PieceId, Posed] = {}
         self._wanted: dict[PieceId, Array] = {}
@@ -123,7 +129,7 @@ class FusedMap:
         self._counts = np.zeros(65536, np.int64)
         self._counted = self._grid.copy()
         self._uncounted: list[Ints] = []
-        self._written = 0
+        self._empty = 0
 
     # --- reading ---------------------------------------------------------------------------------------------
 
@@ -185,10 +191,10 @@ class FusedMap:
         twin = FusedMap.__new__(FusedMap)
         twin._grid = self._grid.copy()
         twin.tolerance = self.tolerance
-        twin._poser = Poser(self.voxel_size, self.dim, self._grid.pool.half)
+        twin._posers = [Poser(self.voxel_size, self.dim, self._grid.pool.half) for _ in self._posers]
         twin._pieces, twin._posed, twin._wanted = dict(self._pieces), dict(self._posed), dict(self._wanted)
         twin._counts, twin._counted = self._counts, self._counted.copy()
-        twin._uncounted, twin._written = list(self._uncounted), self._written
+        twin._uncounted, twin._empty = list(self._uncounted), self._empty
         return twin
 
     # --- changing --------------------------------------------------------------------------------------------
@@ -251,7 +257,7 @@ class FusedMap:
             left = set(gone)
             posed = {n: p for n, p in self._posed.items() if n not in left} | fresh
             keys = np.unique(np.concatenate([_NONE, *(p.keys for p in (*old, *fresh.values()))]))
-            written, values = self._poser.sum(
+            written, values, empty = self._posers[0].sum(
                 keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
             )
             with deferred_interrupts():
@@ -263,7 +269,7 @@ class FusedMap:
                 self._pieces |= add
                 self._wanted |= wanted
                 self._uncounted.append(written)
-        self._tidy(len(written))
+        self._tidy(empty)
         return Change(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(written))
 
     # --- inside ----------------------------------------------------------------------------------------------
@@ -320,14 +326,29 @@ class FusedMap:
         at = np.array([wanted[n] for n in pieces])
         inner = np.array([p.T_base_node for p in pieces.values()])
         T = pose_rows(group.compose(at, group.inverse(inner)), self.dim)
-        return {n: self._poser.pose(piece, row, pose) for (n, piece), row, pose in zip(pieces.items(), T, at)}
+        work = list(zip(pieces.items(), T, at))
+        if len(self._posers) == 1 or len(work) < 2:
+            return {n: self._posers[0].pose(piece, row, pose) for (n, piece), row, pose in work}
+        # like loads: every thread takes the next largest in turn; each has scratch memory of its own
+        by_size = sorted(range(len(work)), key=lambda k: -work[k][0][1].known)
+        shares = [by_size[i :: len(self._posers)] for i in range(len(self._posers))]
 
-    def _tidy(self, written: int) -> None:
-        """Now and then drop the bricks that nobody touches any more."""
-        self._written += written
-        if self._written > 4 * (1000 + len(self._grid.brick_coordinates())):
+        def run(poser: Poser, share: list[int]) -> list[Posed]:
+            return [poser.pose(work[k][0][1], work[k][1], work[k][2]) for k in share]
+
+        with ThreadPoolExecutor(len(self._posers)) as executor:
+            done = list(executor.map(run, self._posers, shares))
+        made = {k: posed for share, found in zip(shares, done) for k, posed in zip(share, found)}
+        return {work[k][0][0]: made[k] for k in range(len(work))}
+
+    def _tidy(self, empty: int) -> None:
+        """Now and then drop the bricks in which nothing is known any more, and what was noted of changes twice."""
+        self._empty += empty
+        if self._empty > 1000 and 2 * self._empty > len(self._grid.brick_coordinates()):
             compact(self._grid)
-            self._written = 0
+            self._empty = 0
+        if sum(map(len, self._uncounted[1:])) > 2 * len(self._uncounted[0]) + 100_000:
+            self._uncounted = [np.unique(np.concatenate(self._uncounted))]
 
     def _count(self) -> Ints:
         """Voxels by value, brought up to date."""
@@ -352,6 +373,7 @@ def fuse(
     model: BeamModel | None = None,
     tolerance: float = TOLERANCE,
     pool: GridPool | None = None,
+    threads: int = 1,
 ) -> FusedMap:
     """A fused map of pieces at ``T_world_node``, from scratch.
 
@@ -365,6 +387,6 @@ def fuse(
     if not pieces:
         raise DataError("a fused map of no pieces has no voxel size", wanted="a FusedMap, and pieces later")
     first = next(iter(pieces.values()))
-    fused = FusedMap(first.voxel_size, dim=first.dim, model=model, tolerance=tolerance, pool=pool)
+    fused = FusedMap(first.voxel_size, dim=first.dim, model=model, tolerance=tolerance, pool=pool, threads=threads)
     fused.add(pieces, {name: poses[name] for name in pieces if name in poses})
     return fused

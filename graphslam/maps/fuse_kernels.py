@@ -115,8 +115,8 @@ def sum_bricks(starts, begins, ends, entries, low, high, ids, bricks, out, chang
     """Sum of the entries that touch each brick, clamped once at the end; returns how many bricks change.
 
     Of brick k these are the ranges ``begins, ends [starts[k]:starts[k + 1]]`` of ``entries``. Unknown is what no entry
-    names. Where the sum is not what the map's brick ``ids[k]`` holds already, ``changed`` gets k and ``out (n, 512)``
-    the values, from row 0 on.
+    names. Where the sum is not what the map's brick ``ids[k]`` holds already, ``changed`` gets k, or ~k where nothing
+    is known any more, and ``out (n, 512)`` the values, from row 0 on.
 
     A total counts its entries above its 32nd bit, so that 0 is unknown.
     """
@@ -129,8 +129,9 @@ def sum_bricks(starts, begins, ends, entries, low, high, ids, bricks, out, chang
             for e in range(begins[r], ends[r]):
                 entry = entries[e]
                 total[np.uint64(entry >> np.uint32(16))] += np.int64(np.int16(entry)) + np.int64(4294967296)
-        differs = 0
+        differs, known = np.int64(0), np.int64(0)
         for v in range(512):
+            known |= total[v]
             s = np.int64(np.int32(total[v]))
             s = low if s < low else s
             s = high if s > high else s
@@ -138,7 +139,7 @@ def sum_bricks(starts, begins, ends, entries, low, high, ids, bricks, out, chang
             differs |= np.int64(value) ^ np.int64(bricks[ids[k], v])
             out[n, v] = value
         if differs != 0:
-            changed[n] = k
+            changed[n] = k if known != 0 else ~k
             n += 1
     return n
 

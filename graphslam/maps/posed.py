@@ -110,14 +110,15 @@ class Poser:
 
     def sum(
         self, keys: Ints, posed: Sequence[Posed], root: int, pool: GridPool, clamp: tuple[int, int]
-    ) -> tuple[Ints, npt.NDArray[np.int16]]:
-        """Those of the bricks ``keys`` (ascending) that are others now than in the tree ``root``, and their values.
+    ) -> tuple[Ints, npt.NDArray[np.int16], int]:
+        """Those of the bricks ``keys`` (ascending) that are others now than in the tree ``root``, their values, and in
+        how many of them nothing is known any more.
 
         Values are in scratch memory: of use until the next sum. Hold the pool's lock.
         """
         nothing = np.zeros(0, np.int64)
         if not len(keys):
-            return nothing, self._sums[:0]
+            return nothing, self._sums[:0], 0
         every = np.concatenate([nothing, *(p.keys for p in posed)])
         whose = np.repeat(np.arange(len(posed)), [len(p.keys) for p in posed])
         at = np.searchsorted(keys, every)
@@ -143,4 +144,5 @@ class Poser:
             self._sums = np.empty((5 * len(keys) // 4 + 1, BRICK_VOXELS), np.int16)
         changed = np.empty(len(keys) + 1, np.int64)
         n = sum_bricks(starts, begins, ends, self._sources, *clamp, ids, pool.bricks, self._sums, changed)
-        return keys[changed[:n]], self._sums[:n]
+        empty = changed[:n] < 0
+        return keys[np.where(empty, ~changed[:n], changed[:n])], self._sums[:n], int(empty.sum())

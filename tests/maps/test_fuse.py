@@ -153,9 +153,33 @@ def test_bricks_that_nobody_touches_any_more_go(rng: np.random.Generator) -> Non
         fused.move({0: np.r_[5.0 * (k % 7), 3.0 * (k % 3), 0, 0, 0, 0, 1.0]})
     assert same_map(fused.grid, fuse(dict(fused.pieces), fused.poses).grid)
     many = len(fused.grid.brick_coordinates())
-    fused._written = 10**9
+    fused._empty = 10**9
     fused.move({0: SE3.identity})
     assert len(fused.grid.brick_coordinates()) < many
+
+
+def test_changes_that_nobody_counts_do_not_pile_up(rng: np.random.Generator) -> None:
+    fused = fuse({0: whole(scanned(rng, 3))}, {0: SE3.identity})
+    assert fused.entropy() > 0
+    for k in range(3000):
+        fused._uncounted.append(np.repeat(fused._posed[0].keys, 4))
+        if k % 500 == 0:
+            fused.move({0: np.r_[0.1 * k, 0, 0, 0, 0, 0, 1.0]})
+    assert sum(map(len, fused._uncounted)) < 400_000
+    assert fused.entropy() == fused.grid.entropy()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_threads_make_the_same_map(dim: int, rng: np.random.Generator) -> None:
+    pieces = {k: whole(scanned(rng, dim)) for k in range(5)}
+    poses = {k: some_pose(rng, dim) for k in pieces}
+    one, three = (fuse(pieces, poses, threads=n) for n in (1, 3))
+    assert same_map(one.grid, three.grid)
+    again = {k: some_pose(rng, dim) for k in pieces}
+    assert one.move(again) == three.move(again)
+    assert same_map(one.grid, three.copy().grid)
+    with pytest.raises(ConfigError):
+        FusedMap(0.25, threads=0)
 
 
 def test_what_is_refused_changes_nothing(rng: np.random.Generator) -> None:
