@@ -21,7 +21,7 @@ from graphslam.graph.symmetric_factor import SymmetricFactor
 
 
 class JointCovariance:
-    """Covariance ``A⁻¹`` of all variables, by blocks; pose blocks are in the right tangent (x, y, θ).
+    """Covariance ``A⁻¹`` of all variables, by blocks; those of poses in the right tangent (in space rotation first).
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ class JointCovariance:
 
     def marginal(self, name: str) -> Array:
         """Covariance of one variable; zeros for the fixed ``x0``."""
-        return np.zeros((3, 3)) if name == "x0" else self.joint([name])
+        d = self.layout.pose_dof
+        return np.zeros((d, d)) if name == "x0" else self.joint([name])
 
     def pose_and_points(self, pose: npt.ArrayLike, first: npt.ArrayLike) -> tuple[Array, Array, Array]:
         """Blocks of one pose and of each of many points, never of two points together.
@@ -112,13 +113,14 @@ class JointCovariance:
         return self.columns(np.arange(self.layout.size))
 
     def poses(self) -> Array:
-        """Marginal of every node ``(m + 1, 3, 3)``, zeros for the fixed first base."""
-        blocks = self._diagonal_blocks(0, self.layout.landmark_start, 3)
-        return np.concatenate([np.zeros((1, 3, 3)), blocks])
+        """Marginal of every node ``(m + 1, d, d)``, d = 3 or 6; zeros for the fixed first base."""
+        d = self.layout.pose_dof
+        blocks = self._diagonal_blocks(0, self.layout.landmark_start, d)
+        return np.concatenate([np.zeros((1, d, d)), blocks])
 
     def landmarks(self) -> Array:
-        """Marginal of every landmark ``(n, 2, 2)``."""
-        return self._diagonal_blocks(self.layout.landmark_start, self.layout.datum_start, 2)
+        """Marginal of every landmark ``(n, dim, dim)``."""
+        return self._diagonal_blocks(self.layout.landmark_start, self.layout.datum_start, self.layout.dim)
 
     def _diagonal_blocks(self, start: int, stop: int, d: int) -> Array:
         if self._inverse_factor is not None:

@@ -130,6 +130,8 @@ def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
         out.append(
             f"x{first} is not tied to x{first - 1}: add a submap or a between-factor from x{first - 1} to it, "
             "or two landmarks that both sides saw."
+            if flat.layout.dim == 2
+            else f"x{first} is not tied to x{first - 1}: add a submap or a between-factor from x{first - 1} to it."
         )
     landmarks = [n for n in lost if n[0] == "l"]
     if landmarks and not nodes:
@@ -137,6 +139,8 @@ def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
     if "datum" in lost:
         fixes = sum(r.group == "gps" for r in flat.records)
         out.append(f"the GPS datum hangs on {fixes} fixes ({waiting} waiting): it needs two that are metres apart.")
+    if "tilt" in lost:
+        out.append("nothing says where up is: add the attitude of a node that is tied to x0.")
     if any(n.startswith("bias") for n in lost):
         out.append("a GPS bias has neither a prior nor a fix of its own: set bias_sigma.")
     return out

@@ -18,6 +18,8 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
+from graphslam.core.poses import group_of
+from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.state import Values
@@ -69,7 +71,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiedFix:
-    """A fix with its place in a submap: all it needs but a datum."""
+    """A fix with its node in a submap: all it needs but a datum."""
 
     fix: Fix
     node: int
@@ -85,24 +87,51 @@ def arm_of(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, A
     trajectory : Trajectory
         ``T_start_body(t)``; covariances in the right tangent, none = the arm is taken as exact.
     times : (q,)
-    lever : (2,)
+    lever : (dim,)
         Antenna in the body frame [m].
 
     Returns
     -------
-    arm : (q, 2)
-    covariance : (q, 2, 2)
-        ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, the derivative of ``T Exp(ξ) · lever``.
+    arm : (q, dim)
+    covariance : (q, dim, dim)
+        See :func:`lever_arm`.
     """
-    T = trajectory.interpolate(times)
-    arm = se2_transform(T, np.broadcast_to(lever, (len(T), 2)))
-    if trajectory.covariances is None:
-        return arm, np.zeros((len(T), 2, 2))
-    G = np.zeros((len(T), 2, 3))
-    R = rotation2(T[:, 2])
-    G[:, :, :2] = R
-    G[:, :, 2] = R @ np.array([-lever[1], lever[0]])
-    return arm, G @ trajectory.interpolate_covariance(times) @ np.swapaxes(G, 1, 2)
+    covariances = None if trajectory.covariances is None else trajectory.interpolate_covariance(times)
+    return lever_arm(trajectory.interpolate(times), covariances, lever)
+
+
+def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array, Array]:
+    """Antennas ``T · lever`` and their covariances, in the plane or in space.
+
+    Parameters
+    ----------
+    T : (q, 3) or (q, 7)
+        ``T_node_body``.
+    covariances : (q, d, d) or None
+        Right tangent; None = exact.
+    lever : (dim,)
+
+    Returns
+    -------
+    arm : (q, dim)
+    covariance : (q, dim, dim)
+        ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, in space ``R [-[l]× | I]``: the derivative of
+        ``T Exp(ξ) · lever``.
+    """
+    group = group_of(T)
+    dim = group.dim
+    arm = group.transform(T, np.broadcast_to(lever, (len(T), dim)))
+    if covariances is None:
+        return arm, np.zeros((len(T), dim, dim))
+    G = np.zeros((len(T), dim, group.dof))
+    if dim == 2:
+        R = rotation2(T[:, 2])
+        G[:, :, :2] = R
+        G[:, :, 2] = R @ np.array([-lever[1], lever[0]])
+    else:
+        R = quat_to_matrix(T[:, 3:])
+        G[:, :, :3], G[:, :, 3:] = -R @ skew(lever), R
+    return arm, G @ covariances @ np.swapaxes(G, 1, 2)
 
 
 def gps_residual(pose: Array, datum: Array, bias: Array, arm: Array, z: Array) -> Array:

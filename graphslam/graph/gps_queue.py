@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, se2_transform
-from graphslam.core.trajectory import Trajectory
-from graphslam.graph.gps import Fix, TiedFix, arm_of, spread, start_datum
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.graph.gps import Fix, TiedFix, lever_arm, spread, start_datum
+from graphslam.graph.submap_node import SubmapNode
 
 
 @dataclass(slots=True)
@@ -29,45 +30,47 @@ class GpsQueue:
         """Queue fixes, keeping the order of time."""
         self.waiting = sorted([*self.waiting, *fixes], key=lambda f: f.time)
 
-    def tie(
-        self, node: int, interval: tuple[float, float], trajectory: Trajectory | None, *, closed: bool = False
-    ) -> list[tuple[int, str]]:
-        """Move the fixes of one submap to its base; returns (factor_id, reason) of those that have no place.
+    def tie(self, submap: SubmapNode, *, closed: bool = False) -> list[tuple[int, str]]:
+        """Move the fixes of one submap to its nodes; returns (factor_id, reason) of those that have no place.
 
         Parameters
         ----------
-        node : int
-        interval : (t_start, t_end)
-        trajectory : Trajectory or None
-            ``T_start_body(t)``.
+        submap : SubmapNode
         closed : bool
             Take ``t == t_end`` as well.
         """
-        t0, t1 = interval
+        t0, t1 = submap.interval
         times = np.array([f.time for f in self.waiting])
         inside = (times >= t0) & ((times <= t1) if closed else (times < t1))
         mine = [f for f, m in zip(self.waiting, inside) if m]
         self.waiting = [f for f, m in zip(self.waiting, inside) if not m]
         dropped = []
-        if mine and trajectory is None:
+        if mine and submap.trajectory is None:
             return [(f.factor_id, "submap has no trajectory") for f in mine]
         for f in mine:
-            assert trajectory is not None
+            t = np.array([f.time])
+            at = submap.nearest(t)
             try:
-                arm, cov = arm_of(trajectory, np.array([f.time]), f.lever)
+                arm, cov = lever_arm(*submap.local(t, at), f.lever)
             except DataError:
                 dropped.append((f.factor_id, "outside the submap's trajectory"))
                 continue
             sigma = f.sigma if f.config.sigma is None else f.config.sigma
-            self.tied.append(TiedFix(f, node, arm[0], sigma**2 * np.eye(2) + cov[0]))
+            covariance = sigma**2 * np.eye(len(f.lever)) + cov[0]
+            self.tied.append(TiedFix(f, submap.nodes[int(at[0])], arm[0], covariance))
         return dropped
 
     def datum_if_ready(self, poses: Array, origin: Array, baseline: float) -> Array | None:
         """First ``T_gps_world`` from the tied fixes, once they span ``baseline`` on the ground and in the map."""
         if len(self.tied) < 2:
             return None
-        world = se2_transform(poses[[t.node for t in self.tied]], np.array([t.arm for t in self.tied]))
+        group = group_of(poses)
+        world = group.transform(poses[[t.node for t in self.tied]], np.array([t.arm for t in self.tied]))
         fixes = np.array([t.fix.position for t in self.tied]) - origin
-        if min(spread(world), spread(fixes)) < baseline:
+        if min(spread(world[:, :2]), spread(fixes[:, :2])) < baseline:  # only a level way says where north is
             return None
-        return start_datum(world, fixes, np.array([np.sqrt(t.covariance[0, 0]) for t in self.tied]))
+        sigma = np.array([np.sqrt(t.covariance[0, 0]) for t in self.tied])
+        level = start_datum(world[:, :2], fixes[:, :2], sigma)
+        if group.dim == 2:
+            return level
+        return np.array([*level[:2], np.median(fixes[:, 2] - world[:, 2]), level[2]])

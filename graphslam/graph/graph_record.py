@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
 from graphslam.core.geometry import Array, se2_transform
-from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.flat import FlatGraph
@@ -20,17 +19,7 @@ from graphslam.graph.ledger import Ledger
 from graphslam.graph.records import BiasPriorRecord, GpsRecord, Record, SubmapRecord
 from graphslam.graph.score import Score, score
 from graphslam.graph.state import Values
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SubmapNode:
-    """What the graph keeps of a submap besides its factor."""
-
-    key: int
-    node: int
-    interval: tuple[float, float]
-    trajectory: Trajectory | None
-    factor_id: int
+from graphslam.graph.submap_node import SubmapNode
 
 
 class GraphRecord:
@@ -39,7 +28,7 @@ class GraphRecord:
     Parameters
     ----------
     dim : int
-        2.
+        2 or 3.
 
     Attributes
     ----------
@@ -55,11 +44,11 @@ class GraphRecord:
     """
 
     def __init__(self, dim: int = 2) -> None:
-        if dim != 2:
-            raise ConfigError(f"PoseGraph works in two dimensions, got dim={dim}")
+        if dim not in (2, 3):
+            raise ConfigError(f"a graph is in two or in three dimensions, got dim={dim}")
         self.dim = dim
-        self.origin = np.zeros(3)
-        self.values = Values(np.zeros((1, 3)), np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+        self.values = Values.empty(dim)
+        self.origin = self.values.poses[0].copy()
         self.records: dict[int, Record] = {}
         self.ledger = Ledger()
         self.events: list[dict[str, Any]] = []
@@ -81,11 +70,32 @@ class GraphRecord:
         """Take a factor out and give its evidence back; landmarks that nothing sees any more go with it.
 
         Removing a submap also removes the GPS fixes inside it, whose arms come from its trajectory, and, if it is the
-        last one, the last node.
+        last one, its nodes. The factors of a chain are one submap: with one of them all go.
         """
-        record = self.records.pop(factor_id, None)
-        if record is None:
+        if factor_id not in self.records:
             raise DataError(f"factor {factor_id} is not in the graph", wanted="the id of a factor")
+        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
+        for fid in (factor_id,) if owner is None else owner.factor_ids:
+            if fid in self.records:
+                self._take_out(fid, reason)
+        if owner is not None:
+            self._remove_fixes_of(owner)
+            used = {n for r in self.records.values() for n in r.variables()}
+            if owner is self.submaps[-1] and not any(f"x{n}" in used for n in owner.nodes[1:]):
+                self.values.poses = self.values.poses[: owner.node + 1].copy()
+                self.submaps.pop()
+        if self.values.datum is not None and not any(isinstance(r, GpsRecord) for r in self.records.values()):
+            for fid in [k for k, r in self.records.items() if isinstance(r, BiasPriorRecord)]:
+                self.ledger.refund(fid)
+                del self.records[fid]
+            self.values.datum, self.values.biases = None, np.zeros((0, self.dim))
+            self.revision += 1
+        if self.values.tilt is not None and not any("tilt" in r.variables() for r in self.records.values()):
+            self.values.tilt = None
+            self.revision += 1
+
+    def _take_out(self, factor_id: int, reason: str) -> None:
+        record = self.records.pop(factor_id)
         self.ledger.refund(factor_id)
         self.revision += 1
         if isinstance(record, SubmapRecord):
@@ -93,19 +103,6 @@ class GraphRecord:
                 self._seen_in[i].discard(factor_id)
             self._drop_landmarks([i for i in set(record.landmark_ids.tolist()) if not self._seen_in[i]])
         self._event("removed", factor_id=factor_id, factor=record.label(), reason=reason)
-        owner = next((s for s in self.submaps if s.factor_id == factor_id), None)
-        if owner is not None:
-            self._remove_fixes_of(owner)
-            used = {n for r in self.records.values() for n in r.variables()}
-            if owner is self.submaps[-1] and f"x{owner.node + 1}" not in used:
-                self.values.poses = self.values.poses[:-1].copy()
-                self.submaps.pop()
-        if self.values.datum is not None and not any(isinstance(r, GpsRecord) for r in self.records.values()):
-            for fid in [k for k, r in self.records.items() if isinstance(r, BiasPriorRecord)]:
-                self.ledger.refund(fid)
-                del self.records[fid]
-            self.values.datum, self.values.biases = None, np.zeros((0, 2))
-            self.revision += 1
 
     def merge_landmarks(self, keep: int, drop: int) -> None:
         """Two landmarks turned out to be one: factors on ``drop`` become factors on ``keep``."""
@@ -171,9 +168,19 @@ class GraphRecord:
 
     def node_of(self, submap_key: int) -> int:
         """Node at the base of a submap."""
+        return self.submap(submap_key).node
+
+    def submap(self, submap_key: int) -> SubmapNode:
+        """A submap's nodes, by its key.
+
+        Raises
+        ------
+        DataError
+            It is not in the graph.
+        """
         for s in self.submaps:
             if s.key == submap_key:
-                return s.node
+                return s
         raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")
 
     def landmark(self, landmark_id: int) -> Array:
@@ -262,11 +269,12 @@ class GraphRecord:
             self._retired.add(i)
 
     def _remove_fixes_of(self, s: SubmapNode) -> None:
-        inside = [r for r in self.records.values() if isinstance(r, GpsRecord) and r.node == s.node]
+        own = set(s.nodes[:-1])
+        inside = [r for r in self.records.values() if isinstance(r, GpsRecord) and r.node in own]
         for r in inside:
             del self.records[r.factor_id]
-        tied = [t.fix.factor_id for t in self.gps.tied if t.node == s.node]
-        self.gps.tied = [t for t in self.gps.tied if t.node != s.node]
+        tied = [t.fix.factor_id for t in self.gps.tied if t.node in own]
+        self.gps.tied = [t for t in self.gps.tied if t.node not in own]
         self._drop_fixes([(i, "its submap was removed") for i in [*tied, *(r.factor_id for r in inside)]])
 
     def _drop_fixes(self, dropped: Sequence[tuple[int, str]]) -> None:

@@ -9,10 +9,14 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphslam.core.geometry import Array, se2_compose
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.graph.attitude import attitude_terms
+from graphslam.graph.gps_family import gps_terms_in_space
+from graphslam.graph.gtsam_values import gtsam_pose, pose_array
 from graphslam.graph.noise import Robust
-from graphslam.graph.records import BetweenRecord, BiasPriorRecord, GpsRecord, Record, SubmapRecord
-from graphslam.graph.state import Layout, Values, gtsam_key
+from graphslam.graph.records import AttitudeRecord, BetweenRecord, BiasPriorRecord, GpsRecord, Record, SubmapRecord
+from graphslam.graph.state import gtsam_key
 from graphslam.graph.submap_factor import submap_factor
 
 
@@ -30,7 +34,7 @@ def gtsam_factor(record: Record, origin: Array) -> Any:
     Parameters
     ----------
     record : Record
-    origin : (3,)
+    origin : (3,) or (7,)
         Pose of the fixed first base: factors on it lose that key.
     """
     if isinstance(record, SubmapRecord):
@@ -38,38 +42,46 @@ def gtsam_factor(record: Record, origin: Array) -> Any:
     if isinstance(record, BetweenRecord):
         return _between(record, origin)
     if isinstance(record, GpsRecord):
-        return _gps(record, origin)
+        return _gps(record, origin) if len(record.z) == 2 else _gps_in_space(record, origin)
+    if isinstance(record, AttitudeRecord):
+        return _attitude(record, origin)
     assert isinstance(record, BiasPriorRecord)
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, record.sigma)
-    return gtsam.PriorFactorPoint2(gtsam_key(f"bias{record.bias}"), np.zeros(2), noise)
+    noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
+    prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
+    return prior(gtsam_key(f"bias{record.bias}"), np.zeros(record.dim), noise)
 
 
 def _between(record: BetweenRecord, origin: Array) -> Any:
     # Not SqrtInformation(W): GTSAM wants that upper triangular and of a lower one silently keeps the diagonal alone.
     information = record.whitener.T @ record.whitener
     noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
+    group = group_of(record.T_ij)
+    plane = group.dim == 2
     if record.i and record.j:
         ki, kj = gtsam_key(f"x{record.i}"), gtsam_key(f"x{record.j}")
-        return gtsam.BetweenFactorPose2(ki, kj, gtsam.Pose2(*record.T_ij), noise)
+        between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
+        return between(ki, kj, gtsam_pose(record.T_ij), noise)
     if record.j:  # from the fixed base: the same residual Log(T⁻¹ x_0⁻¹ x_j) is that of a prior on x_j
-        return gtsam.PriorFactorPose2(gtsam_key(f"x{record.j}"), gtsam.Pose2(*se2_compose(origin, record.T_ij)), noise)
+        prior = gtsam.PriorFactorPose2 if plane else gtsam.PriorFactorPose3
+        return prior(gtsam_key(f"x{record.j}"), gtsam_pose(group.compose(origin, record.T_ij)), noise)
     # To the fixed base: Log(T⁻¹ x_i⁻¹ x_0) is not a prior's residual, so the base stays a key held by the caller's
     # constant through a custom factor.
-    T, x0, key = gtsam.Pose2(*record.T_ij), gtsam.Pose2(*origin), gtsam_key(f"x{record.i}")
+    T, x0, key, d = gtsam_pose(record.T_ij), gtsam_pose(origin), gtsam_key(f"x{record.i}"), group.dof
+    Pose = gtsam.Pose2 if plane else gtsam.Pose3
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         try:
-            H1, H2 = np.zeros((3, 3), order="F"), np.zeros((3, 3), order="F")
-            H3, H4 = np.zeros((3, 3), order="F"), np.zeros((3, 3), order="F")
-            h = values.atPose2(key).between(x0, H1, H2)
-            r = gtsam.Pose2.Logmap(T.between(h, H3, H4), H2)
+            H1, H2, H3, H4 = (np.zeros((d, d), order="F") for _ in range(4))
+            x = values.atPose2(key) if plane else values.atPose3(key)
+            h = x.between(x0, H1, H2)
+            r = Pose.Logmap(T.between(h, H3, H4), H2)
             if H is not None:
                 H[0] = H2 @ H4 @ H1
             return np.asarray(r)
         except Exception:
             if H is not None:
-                H[0] = np.zeros((3, 3))
-            return np.full(3, np.nan)
+                H[0] = np.zeros((d, d))
+            return np.full(d, np.nan)
 
     return gtsam.CustomFactor(noise, [key], error)
 
@@ -130,45 +142,59 @@ def _gps_error(keys: list[int], record: GpsRecord, origin: Array) -> Callable[..
     return error
 
 
-def insert_value(out: gtsam.Values, name: str, values: Values, row_of: dict[int, int]) -> None:
-    """Insert one variable of ``values`` into GTSAM's."""
-    key = gtsam_key(name)
-    if name == "datum":
-        assert values.datum is not None
-        out.insert(key, gtsam.Pose2(*values.datum))
-    elif name.startswith("bias"):
-        out.insert(key, values.biases[int(name[4:])])
-    elif name[0] == "x":
-        out.insert(key, gtsam.Pose2(*values.poses[int(name[1:])]))
-    else:
-        out.insert(key, values.landmarks[row_of[int(name[1:])]])
+def _gps_in_space(record: GpsRecord, origin: Array) -> Any:
+    """A fix in space (:mod:`graphslam.graph.gps_family`): pose, datum, and bias and tilt where it has them."""
+    names = record.variables()
+    W, none = record.whitener, np.zeros(3)
+    at = {"datum": slice(6, 10), "tilt": slice(13, 15)}
+    columns = [slice(0, 6) if n[0] == "x" else at.get(n, slice(10, 13)) for n in names]
+
+    def terms(found: dict[str, Array]) -> tuple[Array, list[Array]]:
+        bias = none if record.bias is None else found[f"bias{record.bias}"]
+        r, J = gps_terms_in_space(
+            found[names[0]][None], found["datum"], bias[None], found.get("tilt"), record.arm[None], record.z[None]
+        )
+        return W @ r[0], [W @ J[0, :, c] for c in columns]
+
+    return _custom(names, terms, origin, 3, record.robust)
 
 
-def to_gtsam(values: Values) -> gtsam.Values:
-    """All free variables as GTSAM values."""
-    out, layout = gtsam.Values(), values.layout()
-    for name in layout.names():
-        insert_value(out, name, values, layout.row_of)
-    return out
+def _attitude(record: AttitudeRecord, origin: Array) -> Any:
+    names = record.variables()
+
+    def terms(found: dict[str, Array]) -> tuple[Array, list[Array]]:
+        r, J = attitude_terms(found[names[0]][None], found["tilt"], record.direction[None])
+        return record.whitener @ r[0], [record.whitener @ J[0, :, :6], record.whitener @ J[0, :, 6:]]
+
+    return _custom(names, terms, origin, 2, record.robust)
 
 
-def from_gtsam(estimate: gtsam.Values, like: Values, layout: Layout | None = None) -> Values:
-    """GTSAM values → ours; variables that GTSAM does not hold keep their value in ``like``."""
-    out = like.copy()
-    row_of = (layout or like.layout()).row_of
-    keys = np.array(list(estimate.keys()), dtype=np.uint64)
-    letter = (keys >> np.uint64(56)).astype(np.int64)
-    index = (keys & np.uint64((1 << 56) - 1)).astype(np.int64)
-    # bulk extraction comes in the order of the keys, one array a type
-    posed, pointed = np.isin(letter, [ord("g"), ord("x")]), np.isin(letter, [ord("b"), ord("l")])
-    P = np.asarray(gtsam.utilities.extractPose2(estimate)).reshape(-1, 3)
-    p = np.asarray(gtsam.utilities.extractPoint2(estimate)).reshape(-1, 2)
-    x = letter[posed] == ord("x")
-    out.poses[index[posed][x]] = P[x]
-    if np.any(~x):
-        out.datum = P[~x][0].copy()
-    l = letter[pointed] == ord("l")
-    rows = np.array([row_of[int(i)] for i in index[pointed][l]], dtype=np.intp)
-    out.landmarks[rows] = p[l]
-    out.biases[index[pointed][~l]] = p[~l]
-    return out
+def _custom(
+    names: list[str],
+    terms: Callable[[dict[str, Array]], tuple[Array, list[Array]]],
+    origin: Array,
+    rows: int,
+    robust: Robust,
+) -> Any:
+    """A factor in space from whitened residual and Jacobians by variable; never raises, fills every Jacobian."""
+    free = [(i, n, gtsam_key(n)) for i, n in enumerate(names) if n != "x0"]
+    width = {"x": 6, "d": 4, "t": 2, "b": 3}
+
+    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+        try:
+            found = {"x0": origin}
+            for _i, n, key in free:
+                found[n] = pose_array(values.atPose3(key)) if n[0] == "x" else values.atVector(key)
+            r, J = terms(found)
+            if H is not None:
+                for k, (i, _n, _key) in enumerate(free):
+                    H[k] = np.asfortranarray(J[i])
+            return r
+        except Exception:  # whatever it is, GTSAM must not see it: nan is refused by the solver instead
+            if H is not None:
+                for k, (_i, n, _key) in enumerate(free):
+                    H[k] = np.zeros((rows, width[n[0]]))
+            return np.full(rows, np.nan)
+
+    noise = with_kernel(gtsam.noiseModel.Unit.Create(rows), robust)
+    return gtsam.CustomFactor(noise, [key for _, _, key in free], error)

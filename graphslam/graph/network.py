@@ -15,7 +15,7 @@ def to_network(graph: PoseGraph) -> PoseNetwork:
 
     A landmark submap becomes one edge between its nodes and one observation per entry, each with its own marginal
     information: the correlations between them have no place in such a file, so its optimum is near the graph's but
-    not the same. GPS factors and robust kernels have no place either.
+    not the same. GPS factors, attitudes and robust kernels have no place either.
 
     Returns
     -------
@@ -24,6 +24,7 @@ def to_network(graph: PoseGraph) -> PoseNetwork:
         file knows one space of vertex numbers only.
     """
     v = graph.values
+    d = v.group.dof
     row_of = graph.flat().layout.row_of
     edges: list[tuple[int, int]] = []
     measured: list[Array] = []
@@ -49,16 +50,16 @@ def to_network(graph: PoseGraph) -> PoseNetwork:
                 seen_information.append(np.asarray(np.linalg.inv(P[c, c])))
     n = len(v.poses)
     return PoseNetwork(
-        dim=2,
+        dim=graph.dim,
         ids=np.arange(n),
         poses=v.poses,
         has_initial=np.ones(n, dtype=bool),
         edges=np.array(edges, dtype=np.intp).reshape(-1, 2),
-        measurements=np.array(measured).reshape(-1, 3),
-        information=np.array(information).reshape(-1, 3, 3),
+        measurements=np.array(measured).reshape(-1, v.group.size),
+        information=np.array(information).reshape(-1, d, d),
         fixed=np.arange(n) == 0,
         landmark_ids=n + np.arange(len(v.landmarks)),
-        landmarks=v.landmarks,
+        landmarks=v.landmarks.reshape(-1, 2),
         has_landmark=np.ones(len(v.landmarks), dtype=bool),
         observations=np.array(seen, dtype=np.intp).reshape(-1, 2),
         observation_values=np.array(where).reshape(-1, 2),

@@ -26,42 +26,44 @@ The path of a pipeline, once per finished submap, and the end of a run::
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
-from graphslam.core.geometry import ArrayLike, se2_compose, se2_transform
-from graphslam.core.records import Gps
+from graphslam.core.geometry import Array, ArrayLike, se2_transform
+from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.gps import Fix, GpsConfig
-from graphslam.graph.graph_record import GraphRecord, SubmapNode
+from graphslam.graph.gps_verbs import GpsVerbs
+from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, whitener
-from graphslam.graph.records import BetweenRecord, BiasPriorRecord, GpsRecord, Record, SubmapRecord
+from graphslam.graph.records import BetweenRecord, Record, SubmapRecord
+from graphslam.graph.submap_node import SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
 
 
-class PoseGraph(GraphRecord):
-    """A 2-D graph of submaps, landmarks and GPS: the verbs that add factors.
+class PoseGraph(GpsVerbs):
+    """A graph of submaps, landmarks and GPS, in the plane or in space: the verbs that add factors.
 
-    The first base is fixed at the origin. What it holds and what can be asked of it is in
+    The first base is fixed at the origin. What the graph holds and what can be asked of it is in
     :class:`~graphslam.graph.graph_record.GraphRecord`.
 
     Parameters
     ----------
     dim : int
-        2.
+        2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
     """
 
-    def __init__(self, dim: int = 2) -> None:
-        super().__init__(dim)
-        self._gps_config = GpsConfig()
-
     def add_submap(
-        self, submap: Submap, landmark_ids: npt.ArrayLike | None = None, *, covariance_scale: float = 1.0
+        self,
+        submap: Submap,
+        landmark_ids: npt.ArrayLike | None = None,
+        *,
+        covariance_scale: float = 1.0,
+        spacing: float | None = None,
     ) -> int:
         """Append a submap: a new node, new landmarks, and one factor with the full joint covariance.
 
@@ -69,16 +71,19 @@ class PoseGraph(GraphRecord):
         ----------
         submap : Submap
             Starts where the last one ended, or where :meth:`start_session` put its base. Without landmarks it becomes
-            a between-factor.
+            a between-factor, or a chain of them.
         landmark_ids : (n,) int, optional
             Graph landmark of every entry, -1 = new; by default the submap's own ids. An id may stand twice.
         covariance_scale : float
             Factor on the covariance.
+        spacing : float, optional
+            A submap without landmarks gets an inner node about every so many metres of its path
+            (:mod:`graphslam.graph.inner_nodes`), so that loops can bend it; the chain composes to its exit.
 
         Returns
         -------
         int
-            Factor id.
+            Factor id: the first one of a chain, whose factors come and go together.
 
         Raises
         ------
@@ -86,13 +91,23 @@ class PoseGraph(GraphRecord):
             Its streams were already spent over an overlapping interval (nothing is changed then).
         CovarianceError, GeometryError, DataError
         """
-        if submap.dim != 2:
-            raise GeometryError(f"submap {submap.key} has the wrong dimension", got=submap.dim, wanted=2)
+        if submap.dim != self.dim:
+            raise GeometryError(f"submap {submap.key} has the wrong dimension", got=submap.dim, wanted=self.dim)
         if any(s.key == submap.key for s in self.submaps):
             raise DataError(f"submap {submap.key} is already in the graph", wanted="each submap once")
+        if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
+            raise ConfigError(f"inner nodes need a positive spacing, got {spacing}")
+        if submap.landmarks is None:
+            return self._add_dense(submap, covariance_scale, spacing)
+        if self.dim != 2:
+            raise GeometryError(f"submap {submap.key} has landmarks in space", wanted="landmark submaps in the plane")
+        return self._add_landmarks(submap, landmark_ids, covariance_scale)
+
+    def _add_landmarks(self, submap: Submap, landmark_ids: npt.ArrayLike | None, covariance_scale: float) -> int:
         lm = submap.landmarks
-        n = 0 if lm is None else len(lm)
-        ids = np.array(landmark_ids if landmark_ids is not None else ([] if lm is None else lm.ids), dtype=np.int64)
+        assert lm is not None
+        n = len(lm)
+        ids = np.array(landmark_ids if landmark_ids is not None else lm.ids, dtype=np.int64)
         if ids.shape != (n,):
             raise GeometryError(f"landmark ids of submap {submap.key} do not fit", got=ids.shape, wanted=(n,))
         gone = [int(i) for i in ids if int(i) in self._retired]
@@ -102,11 +117,9 @@ class PoseGraph(GraphRecord):
                 got=f"merged-away ids {gone}" if gone else int(ids.min()),
                 wanted="-1 for new, or an id of the graph or a fresh one",
             )
-        what = f"covariance of submap {submap.key}"
-        if lm is None:
-            W = whitener(submap.exit_covariance, what=what, dim=3, scale=covariance_scale)
-        else:
-            W = whitener(lm.dense_covariance(), what=what, dim=3 + 2 * n, scale=covariance_scale)
+        W = whitener(
+            lm.dense_covariance(), what=f"covariance of submap {submap.key}", dim=3 + 2 * n, scale=covariance_scale
+        )
         node, fid = len(self.values.poses) - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         # from here on nothing fails
@@ -114,27 +127,59 @@ class PoseGraph(GraphRecord):
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
-        record: Record
-        if lm is None:
-            record = BetweenRecord(fid, node, node + 1, submap.exit_pose, W, group="dense-submap")
-        else:
-            record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
-            self._start_landmarks(ids, se2_transform(self.values.poses[-1], lm.positions))
-        self.values.poses = np.vstack([self.values.poses, se2_compose(self.values.poses[-1], submap.exit_pose)])
-        self.submaps.append(SubmapNode(submap.key, node, submap.interval, submap.trajectory, fid))
-        self._insert(record)
+        self._start_landmarks(ids, se2_transform(self.values.poses[-1], lm.positions))
+        record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
+        ends = np.stack([np.zeros(3), submap.exit_pose])
+        self._append(submap, [record], np.array(submap.interval), ends)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self._tie_fixes(self.submaps[-1])
         return fid
 
+    def _add_dense(self, submap: Submap, covariance_scale: float, spacing: float | None) -> int:
+        cut = cut_submap(submap, spacing)
+        d, node, fid = self.values.group.dof, len(self.values.poses) - 1, self._next_factor
+        records = [
+            BetweenRecord(
+                fid + k,
+                node + k,
+                node + k + 1,
+                T,
+                whitener(P, what=f"covariance of submap {submap.key}", dim=d, scale=covariance_scale),
+                group="dense-submap",
+            )
+            for k, (T, P) in enumerate(zip(cut.increments, cut.covariances))
+        ]
+        self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
+        # from here on nothing fails
+        self._append(submap, records, cut.times, cut.T_base_node)
+        self._event(
+            "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
+        )
+        self._tie_fixes(self.submaps[-1])
+        return fid
+
+    def _append(self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array) -> None:
+        """New nodes after the last one, the submap's entry, and its factors."""
+        node, group, base = len(self.values.poses) - 1, self.values.group, self.values.poses[-1]
+        new = group.compose(np.broadcast_to(base, T_base_node[1:].shape), T_base_node[1:])
+        self.values.poses = np.vstack([self.values.poses, new])
+        ids = tuple(r.factor_id for r in records)
+        nodes = tuple(range(node, node + len(T_base_node)))
+        self.submaps.append(
+            SubmapNode(submap.key, node, submap.interval, submap.trajectory, ids[0], nodes, times, T_base_node, ids)
+        )
+        for record in records:
+            self._insert(record)
+
     def start_session(self, T_world_base: ArrayLike) -> int:
         """Begin another chain of submaps whose first base is free: another robot, or another day.
 
-        Nothing but landmarks that both chains see ties it to what is there, so it needs at least two of them.
+        Nothing but landmarks that both chains see ties it to what is there, so it needs at least two of them, or a
+        between-factor.
 
         Parameters
         ----------
-        T_world_base : (3,)
+        T_world_base : (3,) or (7,)
             Where the chain is thought to begin; only a start value.
 
         Returns
@@ -142,9 +187,7 @@ class PoseGraph(GraphRecord):
         int
             Node of the new first base; the next submap begins there.
         """
-        T = np.asarray(T_world_base, dtype=np.float64)
-        if T.shape != (3,) or not np.all(np.isfinite(T)):
-            raise GeometryError("start of a session is not usable", got=T_world_base, wanted="three finite numbers")
+        T = self._pose(T_world_base, "start of a session")
         if not self.submaps:
             raise DataError("the first session needs no start", wanted="submaps before another session begins")
         self.values.poses = np.vstack([self.values.poses, T])
@@ -166,7 +209,7 @@ class PoseGraph(GraphRecord):
         robust: Robust = NO_KERNEL,
         group: str = "between",
     ) -> int:
-        """A relative pose between nodes i and j; ``covariance`` (3, 3) in the right tangent.
+        """A relative pose between nodes i and j; ``covariance`` (d, d) in the right tangent, d = 3 or 6.
 
         Parameters
         ----------
@@ -181,13 +224,11 @@ class PoseGraph(GraphRecord):
         last = len(self.values.poses) - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("between-factor joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
-        T = np.asarray(T_ij, dtype=np.float64)
-        if T.shape != (3,) or not np.all(np.isfinite(T)):
-            raise GeometryError(f"relative pose x{i} → x{j} is not usable", got=T_ij, wanted="three finite numbers")
+        T = self._pose(T_ij, f"relative pose x{i} → x{j}")
         names = list(streams)
         if evidence == EXCLUSIVE and (not names or interval is None):
             raise ConfigError(f"between-factor x{i} → x{j} must name the streams and the interval that it spends")
-        W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=3)
+        W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=self.values.group.dof)
         record = BetweenRecord(self._next_factor, i, j, T, W, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
         self._insert(record)
@@ -195,95 +236,66 @@ class PoseGraph(GraphRecord):
         return record.factor_id
 
     def add_match(self, submap_key: int, match: Match, *, robust: Robust = NO_KERNEL) -> int:
-        """A front end's re-entry into an earlier submap, as declared ``shared-scan`` evidence."""
-        here, target = self.node_of(submap_key), self.node_of(match.target)
-        interval = next(s.interval for s in self.submaps if s.key == submap_key)
-        return self.add_between(
-            target,
+        """A front end's re-entry into an earlier submap, as declared ``shared-scan`` evidence.
+
+        A scan matches what the map shows around it, and that was laid down by the nearest stretch of the target's
+        path. So where the target has inner nodes the match hangs on the one nearest to where the match puts this
+        submap's base: by the fixed pose of that node in the target, and with the covariance that the path has lost
+        between the node and its nearest pose added.
+
+        Parameters
+        ----------
+        submap_key : int
+            Submap whose base was matched.
+        match : Match
+        robust : Robust
+        """
+        here, target = self.node_of(submap_key), self.submap(match.target)
+        node, T, P = self._into(target, self._pose(match.T_target_here, "match"), np.asarray(match.covariance))
+        fid = self.add_between(
+            node,
             here,
-            match.T_target_here,
-            match.covariance,
+            T,
+            P,
             streams=["match"],
-            interval=interval,
+            interval=self.submap(submap_key).interval,
             evidence="shared-scan",
             robust=robust,
             group="match",
         )
+        self.events[-1] |= {
+            "submap": submap_key,
+            "target": match.target,
+            "fitness": match.fitness,
+            "support": match.support,
+        }
+        return fid
 
-    def add_gps(self, gps: Gps, *, stream: str = "gps", config: GpsConfig | None = None) -> list[int]:
-        """Give the graph position fixes, at any time and in any portion; each finds its own submap.
+    def _into(self, s: SubmapNode, T_base_here: Array, P: Array) -> tuple[int, Array, Array]:
+        """A pose seen from a submap's base, seen from the nearest of its nodes: (node, pose, covariance)."""
+        path, group = s.trajectory, self.values.group
+        if not s.inner or path is None:
+            return s.node, T_base_here, P
+        dim = self.dim
+        row = int(np.argmin(np.sum((path.positions - T_base_here[:dim]) ** 2, axis=1)))
+        inside = np.clip(path.times[row : row + 1], *s.interval)
+        inside = np.clip(inside, path.times[0], path.times[-1])
+        at = s.nearest(inside)
+        k = int(at[0])
+        T = group.between(s.T_base_node[k], T_base_here)
+        T_node_body, E = s.local(inside, at)
+        if E is None or k == 0:  # the base itself: what the match states is of it
+            return s.nodes[k], T, P
+        A = group.adjoint(group.between(T, T_node_body[0]))  # an error of the body, seen where the match ends
+        extra = A @ E[0] @ A.T
+        return s.nodes[k], T, P + 0.5 * (extra + extra.T)
 
-        Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts
-        by rigid alignment and all of them become factors. Fixes that no submap covers are dropped and counted
-        (:attr:`events`, kind ``gps-dropped``).
-
-        Returns
-        -------
-        list of int
-            Factor ids, one a fix.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap that holds the fix already used ``stream``, or the fix was given before. No fix is taken then.
-        """
-        if gps.positions.shape[1] != 2:
-            raise GeometryError("GPS fixes have the wrong dimension", got=gps.positions.shape, wanted="(n, 2)")
-        cfg = config or self._gps_config
-        self._gps_config = cfg
-        for t in gps.times:
-            self.ledger.check(f"GPS fix at {t:.3f} s", [stream], (float(t), float(t)))
-        fixes = []
-        for t, p, s in zip(gps.times.tolist(), gps.positions, gps.sigma.tolist()):
-            fixes.append(Fix(self._next_factor, t, p, s, gps.lever, cfg))
-            self.ledger.spend(self._next_factor, f"GPS fix at {t:.3f} s", [stream], (t, t))
-            self._next_factor += 1
-        self.gps.add(fixes)
-        for s in self.submaps:
-            self._tie_fixes(s, more=s is not self.submaps[-1])
-        return [f.factor_id for f in fixes]
-
-    def finish_gps(self) -> None:
-        """No more submaps will come: the last instant belongs to the last submap, later fixes are dropped."""
-        if self.submaps:
-            self._tie_fixes(self.submaps[-1], closed=True)
-        self._drop_fixes([(f.factor_id, "after the last submap") for f in self.gps.waiting])
-        self.gps.waiting = []
-
-    # ---------------------------------------------------------------- GPS
-
-    def _tie_fixes(self, s: SubmapNode, *, closed: bool = False, more: bool = False) -> None:
-        """Give a submap its waiting fixes; with ``more`` to follow, do not start the datum yet."""
-        dropped = self.gps.tie(s.node, s.interval, s.trajectory, closed=closed)
-        late = [f for f in self.gps.waiting if f.time < s.interval[0] and not more and s is self.submaps[-1]]
-        self.gps.waiting = [f for f in self.gps.waiting if f not in late]
-        self._drop_fixes([*dropped, *((f.factor_id, "no submap covers it") for f in late)])
-        if more or not self.gps.tied:
-            return
-        if self.gps_origin is None:
-            self.gps_origin = self.gps.tied[0].fix.position.copy()
-        if self.values.datum is None:
-            start = self.gps.datum_if_ready(self.values.poses, self.gps_origin, self.gps.tied[0].fix.config.baseline)
-            if start is None:
-                return
-            self.values.datum = start
-            self._event("datum", fixes=len(self.gps.tied), T_gps_world=start.tolist())
-        for t in sorted(self.gps.tied, key=lambda t: t.fix.time):
-            bias = self._bias_of(t.fix)
-            W = whitener(t.covariance, what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
-            z = t.fix.position - self.gps_origin
-            self._insert(GpsRecord(t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, t.fix.config.robust, bias))
-        self.gps.tied = []
-
-    def _bias_of(self, fix: Fix) -> int | None:
-        cfg, previous = fix.config, self.gps.last_time
-        self.gps.last_time = fix.time
-        if cfg.bias_sigma is None:
-            return None
-        if len(self.values.biases) == 0 or fix.time - previous > cfg.segment_gap:
-            self.values.biases = np.vstack([self.values.biases, np.zeros(2)])
-            s = len(self.values.biases) - 1
-            record = BiasPriorRecord(self._next_factor, s, cfg.bias_sigma)
-            self.ledger.spend(record.factor_id, record.label(), ["-"], (fix.time, fix.time), "prior")
-            self._insert(record)
-        return len(self.values.biases) - 1
+    def _pose(self, T: ArrayLike, what: str) -> Array:
+        """A pose of the graph's dimension, its quaternion of length one."""
+        pose, group = np.asarray(T, dtype=np.float64), self.values.group
+        if pose.shape != (group.size,) or not np.all(np.isfinite(pose)):
+            wanted = {3: "three", 7: "seven"}[group.size]
+            raise GeometryError(f"{what} is not usable", got=T, wanted=f"{wanted} finite numbers")
+        if group.dim == 3:
+            pose = np.concatenate([pose[:3], quat_normalize(pose[3:])])
+        return pose

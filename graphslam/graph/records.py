@@ -60,7 +60,14 @@ class SubmapRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BetweenRecord:
-    """``T_ij`` between two nodes, right-tangent noise, residual ``Log(T_ij⁻¹ x_i⁻¹ x_j)`` as GTSAM's BetweenFactor."""
+    """``T_ij`` between two nodes, right-tangent noise, residual ``Log(T_ij⁻¹ x_i⁻¹ x_j)`` as GTSAM's BetweenFactor.
+
+    Parameters
+    ----------
+    T_ij : (3,) or (7,)
+    whitener : (3, 3) or (6, 6)
+        Tangents in GTSAM's order: x, y, θ, or rotation before translation.
+    """
 
     factor_id: int
     i: int
@@ -73,7 +80,7 @@ class BetweenRecord:
     @property
     def rows(self) -> int:
         """Dimension of the residual."""
-        return 3
+        return len(self.whitener)
 
     def variables(self) -> list[str]:
         """Names of the variables."""
@@ -91,15 +98,17 @@ class GpsRecord:
     Parameters
     ----------
     node : int
-        Base of the submap that holds the fix.
-    arm : (2,)
-        Antenna in the base frame, ``T_start_body(t) · lever``.
-    z : (2,)
+        Node that the fix hangs on: the base of the submap that holds it, or the nearest inner node.
+    arm : (dim,)
+        Antenna in the node's frame, ``T_node_body(t) · lever``.
+    z : (dim,)
         Fix in the GPS frame, counted from the first fix.
-    whitener : (2, 2)
-        Of fix and arm together, in the base frame.
+    whitener : (dim, dim)
+        Of fix and arm together, in the node's frame.
     bias : int or None
         GPS segment whose bias it carries.
+    tilt : bool
+        The graph knows where up is, and the level datum is turned by it.
     """
 
     factor_id: int
@@ -111,15 +120,17 @@ class GpsRecord:
     robust: Robust = NO_KERNEL
     bias: int | None = None
     group: str = "gps"
+    tilt: bool = False
 
     @property
     def rows(self) -> int:
         """Dimension of the residual."""
-        return 2
+        return len(self.z)
 
     def variables(self) -> list[str]:
         """Names of the variables."""
-        return [f"x{self.node}", "datum", *([] if self.bias is None else [f"bias{self.bias}"])]
+        bias = [] if self.bias is None else [f"bias{self.bias}"]
+        return [f"x{self.node}", "datum", *bias, *(["tilt"] if self.tilt else [])]
 
     def label(self) -> str:
         """Name for messages."""
@@ -134,11 +145,12 @@ class BiasPriorRecord:
     bias: int
     sigma: float
     group: str = "gps-bias"
+    dim: int = 2
 
     @property
     def rows(self) -> int:
         """Dimension of the residual."""
-        return 2
+        return self.dim
 
     def variables(self) -> list[str]:
         """Names of the variables."""
@@ -149,4 +161,38 @@ class BiasPriorRecord:
         return f"prior on bias{self.bias} (factor {self.factor_id})"
 
 
-Record = SubmapRecord | BetweenRecord | GpsRecord | BiasPriorRecord
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeRecord:
+    """Where gravity points, seen from a node; see :mod:`graphslam.graph.attitude` for the residual.
+
+    Parameters
+    ----------
+    node : int
+    direction : (3,)
+        Unit vector of gravity (down) in the node's frame.
+    whitener : (2, 2)
+        Of the two components across ``direction`` [1/rad].
+    """
+
+    factor_id: int
+    node: int
+    direction: Array
+    whitener: Array
+    robust: Robust = NO_KERNEL
+    group: str = "attitude"
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return 2
+
+    def variables(self) -> list[str]:
+        """Names of the variables."""
+        return [f"x{self.node}", "tilt"]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"{self.group} of x{self.node} (factor {self.factor_id})"
+
+
+Record = SubmapRecord | BetweenRecord | GpsRecord | BiasPriorRecord | AttitudeRecord

@@ -21,7 +21,7 @@ class ClassScore:
         Factors, and scalars they measure.
     dof : int
         ``rows`` less the unknowns that this class alone brings in: poses and landmarks for submaps, the datum for GPS,
-        biases for their priors. Summed over the classes it is the dof of the whole.
+        biases for their priors, the tilt for attitudes. Summed over the classes it is the dof of the whole.
     """
 
     chi2: float
@@ -77,7 +77,11 @@ def score(flat: FlatGraph, chi2: Array) -> Score:
         c[0] += value
         c[1] += 1
         c[2] += record.rows
-    unknowns = {"gps": 3 if lay.datum else 0, "gps-bias": 2 * lay.biases}
+    unknowns = {
+        "gps": lay.datum_dof if lay.datum else 0,
+        "gps-bias": lay.dim * lay.biases,
+        "attitude": 2 if lay.tilt else 0,
+    }
     chain = next((g for g in ("submap", "dense-submap") if g in sums), next(iter(sums), ""))
     unknowns[chain] = unknowns.get(chain, 0) + lay.datum_start
     return Score(

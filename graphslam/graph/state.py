@@ -1,8 +1,13 @@
-"""Names, values and columns of the variables of a graph.
+"""Names, values and columns of the variables of a graph, in the plane or in space.
 
-Variables are named by short strings that also stand in messages: ``x3`` (pose of the base of submap 3), ``l17``
-(landmark 17), ``datum`` (``T_gps_world``), ``bias2`` (position bias of GPS segment 2). The first base ``x0`` is fixed
-at the origin and is no variable at all: no prior has to hold it, and nothing is lost to a badly scaled one.
+Variables are named by short strings that also stand in messages: ``x3`` (pose of node 3), ``l17`` (landmark 17),
+``datum`` (``T_gps_world``), ``bias2`` (position bias of GPS segment 2), ``tilt`` (where up is in the frame of the first
+base, in space only). The first base ``x0`` is fixed at the origin and is no variable at all: no prior has to hold it,
+and nothing is lost to a badly scaled one.
+
+Poses are SE(2) ``(3,)`` or SE(3) ``(7,)`` and move by right tangents in GTSAM's order: x, y, θ in the plane, rotation
+before translation in space. The datum is SE(2) in the plane. In space it is ``[x, y, z, heading]``: the GPS frame and
+the frame of the first base are both level, so four numbers lie between them, and they move by plain addition.
 """
 
 from __future__ import annotations
@@ -16,12 +21,15 @@ import numpy.typing as npt
 
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, rotation2, se2_compose, se2_exp
+from graphslam.core.poses import Group, group_of
 
 
 def gtsam_key(name: str) -> int:
     """GTSAM's 64-bit symbol of a variable name (letter in the top byte)."""
     if name == "datum":
         return ord("g") << 56
+    if name == "tilt":
+        return ord("t") << 56
     if name.startswith("bias"):
         return (ord("b") << 56) | int(name[4:])
     return (ord(name[0]) << 56) | int(name[1:])
@@ -30,24 +38,27 @@ def gtsam_key(name: str) -> int:
 def key_name(key: int) -> str:
     """Inverse of :func:`gtsam_key`."""
     letter, index = chr(key >> 56), key & ((1 << 56) - 1)
-    return "datum" if letter == "g" else f"bias{index}" if letter == "b" else f"{letter}{index}"
+    whole = {"g": "datum", "t": "tilt"}
+    return whole.get(letter) or (f"bias{index}" if letter == "b" else f"{letter}{index}")
 
 
 @dataclass(slots=True)
 class Values:
-    """Values of all variables of a 2-D graph.
+    """Values of all variables of a graph.
 
     Parameters
     ----------
-    poses : (m + 1, 3)
-        ``T_world_base`` of every submap's base and of the last exit; row 0 is the fixed first base.
+    poses : (m + 1, 3) or (m + 1, 7)
+        ``T_world_node`` of every submap's base, of its inner nodes and of the last exit; row 0 is the fixed first base.
     landmark_ids : (n,) int64
-    landmarks : (n, 2)
-        World positions [m].
-    datum : (3,) or None
-        ``T_gps_world``, GPS positions counted from the first fix.
-    biases : (s, 2)
+    landmarks : (n, dim)
+        World positions [m]; none in space.
+    datum : (3,) or (4,) or None
+        ``T_gps_world``, GPS positions counted from the first fix: x, y, heading, or x, y, z, heading.
+    biases : (s, dim)
         GPS biases of the segments in the GPS frame [m].
+    tilt : (2,) or None
+        Rotation vector about x and y [rad] that takes the z axis of the first base to where up is.
     """
 
     poses: Array
@@ -55,6 +66,23 @@ class Values:
     landmarks: Array
     datum: Array | None = None
     biases: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    tilt: Array | None = None
+
+    @classmethod
+    def empty(cls, dim: int) -> Values:
+        """The first base at the origin and nothing else."""
+        start = np.zeros((1, 3)) if dim == 2 else np.array([[0.0, 0, 0, 0, 0, 0, 1]])
+        return cls(start, np.zeros(0, dtype=np.int64), np.zeros((0, dim)), None, np.zeros((0, dim)))
+
+    @property
+    def group(self) -> Group:
+        """SE(2) or SE(3)."""
+        return group_of(self.poses)
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return 2 if self.poses.shape[1] == 3 else 3
 
     def copy(self) -> Values:
         """Independent copy."""
@@ -64,40 +92,47 @@ class Values:
             self.landmarks.copy(),
             None if self.datum is None else self.datum.copy(),
             self.biases.copy(),
+            None if self.tilt is None else self.tilt.copy(),
         )
 
     def layout(self) -> Layout:
         """Columns of these variables."""
-        return Layout(len(self.poses), tuple(self.landmark_ids.tolist()), self.datum is not None, len(self.biases))
+        return Layout(
+            len(self.poses),
+            tuple(self.landmark_ids.tolist()),
+            self.datum is not None,
+            len(self.biases),
+            self.dim,
+            self.tilt is not None,
+        )
 
     def retract(self, step: Array) -> Values:
-        """Values after a step ``(layout.size,)``: poses and datum ``T ∘ Exp(ξ)``, points plus."""
+        """Values after a step ``(layout.size,)``: poses (and the datum of the plane) ``T ∘ Exp(ξ)``, all else plus."""
+        g, dim = self.group, self.dim
         m, n = len(self.poses) - 1, len(self.landmarks)
         poses = self.poses.copy()
-        poses[1:] = se2_compose(poses[1:], se2_exp(step[: 3 * m].reshape(-1, 3)))
-        c = 3 * m + 2 * n
-        landmarks = self.landmarks + step[3 * m : c].reshape(-1, 2)
-        datum = self.datum
+        poses[1:] = g.compose(poses[1:], g.exp(step[: g.dof * m].reshape(-1, g.dof)))
+        c = g.dof * m + dim * n
+        landmarks = self.landmarks + step[g.dof * m : c].reshape(-1, dim)
+        datum, tilt = self.datum, self.tilt
         if datum is not None:
-            datum = se2_compose(datum, se2_exp(step[c : c + 3]))
-            c += 3
-        return replace(
-            self, poses=poses, landmarks=landmarks, datum=datum, biases=self.biases + step[c:].reshape(-1, 2)
-        )
+            k = len(datum)
+            datum = se2_compose(datum, se2_exp(step[c : c + k])) if dim == 2 else datum + step[c : c + k]
+            c += k
+        if tilt is not None:
+            tilt, step = tilt + step[-2:], step[:-2]
+        biases = self.biases + step[c:].reshape(-1, dim)
+        return replace(self, poses=poses, landmarks=landmarks, datum=datum, biases=biases, tilt=tilt)
 
     def is_finite(self) -> bool:
         """Every number finite."""
-        return bool(
-            np.all(np.isfinite(self.poses))
-            and np.all(np.isfinite(self.landmarks))
-            and (self.datum is None or np.all(np.isfinite(self.datum)))
-            and np.all(np.isfinite(self.biases))
-        )
+        arrays = (self.poses, self.landmarks, self.datum, self.biases, self.tilt)
+        return all(a is None or bool(np.all(np.isfinite(a))) for a in arrays)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns: ``[x_1 … x_m (3 each), landmarks (2 each), datum (3), biases (2 each)]``; x_0 has none.
+    """Columns: ``[x_1 … x_m (3 | 6 each), landmarks, datum (3 | 4), biases, tilt (2)]``; x_0 has none.
 
     Parameters
     ----------
@@ -107,32 +142,52 @@ class Layout:
         In row order.
     datum : bool
     biases : int
+    dim : int
+        2 or 3: of points and biases.
+    tilt : bool
     """
 
     nodes: int
     landmark_ids: tuple[int, ...]
     datum: bool
     biases: int
+    dim: int = 2
+    tilt: bool = False
+
+    @property
+    def pose_dof(self) -> int:
+        """Columns of a pose."""
+        return 3 if self.dim == 2 else 6
+
+    @property
+    def datum_dof(self) -> int:
+        """Columns of the datum, if there is one."""
+        return 3 if self.dim == 2 else 4
 
     @property
     def landmark_start(self) -> int:
         """First column of the landmarks."""
-        return 3 * (self.nodes - 1)
+        return self.pose_dof * (self.nodes - 1)
 
     @property
     def datum_start(self) -> int:
         """First column of the datum (or of what follows the landmarks)."""
-        return self.landmark_start + 2 * len(self.landmark_ids)
+        return self.landmark_start + self.dim * len(self.landmark_ids)
 
     @property
     def bias_start(self) -> int:
         """First column of the biases."""
-        return self.datum_start + (3 if self.datum else 0)
+        return self.datum_start + (self.datum_dof if self.datum else 0)
+
+    @property
+    def tilt_start(self) -> int:
+        """First column of the tilt (or the end)."""
+        return self.bias_start + self.dim * self.biases
 
     @property
     def size(self) -> int:
         """Number of free scalars (``states``)."""
-        return self.bias_start + 2 * self.biases
+        return self.tilt_start + (2 if self.tilt else 0)
 
     @cached_property
     def row_of(self) -> dict[int, int]:
@@ -142,11 +197,13 @@ class Layout:
     def names(self) -> list[str]:
         """Names of the variables in column order."""
         out = [f"x{k}" for k in range(1, self.nodes)] + [f"l{i}" for i in self.landmark_ids]
-        return out + (["datum"] if self.datum else []) + [f"bias{s}" for s in range(self.biases)]
+        out += (["datum"] if self.datum else []) + [f"bias{s}" for s in range(self.biases)]
+        return out + (["tilt"] if self.tilt else [])
 
     def owner_of_columns(self) -> list[str]:
         """Name of the variable that each column belongs to."""
-        return [name for name in self.names() for _ in range(3 if name[0] in "xd" else 2)]
+        width = {"x": self.pose_dof, "d": self.datum_dof, "t": 2}
+        return [name for name in self.names() for _ in range(width.get(name[0], self.dim))]
 
     def columns(self, name: str) -> npt.NDArray[np.intp]:
         """Columns of one variable; none for the fixed ``x0``.
@@ -156,24 +213,33 @@ class Layout:
         SolverError
             Unknown variable.
         """
+        start, d = -1, self.dim
         try:
             if name == "datum":
-                start, d = (self.datum_start, 3) if self.datum else (-1, 3)
+                start, d = (self.datum_start if self.datum else -1), self.datum_dof
+            elif name == "tilt":
+                start, d = (self.tilt_start if self.tilt else -1), 2
             elif name.startswith("bias"):
                 s = int(name[4:])
-                start, d = (self.bias_start + 2 * s, 2) if 0 <= s < self.biases else (-1, 2)
+                start = self.bias_start + d * s if 0 <= s < self.biases else -1
             elif name[0] == "x":
-                k = int(name[1:])
+                k, d = int(name[1:]), self.pose_dof
                 if k == 0:
                     return np.zeros(0, dtype=np.intp)
-                start, d = (3 * (k - 1), 3) if 0 < k < self.nodes else (-1, 3)
-            else:
-                start, d = (self.landmark_start + 2 * self.row_of[int(name[1:])], 2) if name[0] == "l" else (-1, 2)
+                start = d * (k - 1) if 0 < k < self.nodes else -1
+            elif name[0] == "l":
+                start = self.landmark_start + d * self.row_of[int(name[1:])]
         except (ValueError, KeyError, IndexError):
-            start, d = -1, 0
+            start = -1
         if start < 0:
             raise SolverError(f"no variable {name!r}; names are x1 … x{self.nodes - 1}, l<id>, datum, bias<segment>")
         return np.arange(start, start + d)
+
+    def pose_columns(self, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Columns ``(k, dof)`` of nodes ``(k,)``; -1 for the fixed first base."""
+        d = self.pose_dof
+        c = d * (np.asarray(nodes)[..., None] - 1) + np.arange(d)
+        return np.where(c < 0, -1, c)
 
     def columns_of(self, names: Iterable[str]) -> npt.NDArray[np.intp]:
         """Columns of several variables in that order."""

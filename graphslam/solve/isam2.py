@@ -19,7 +19,8 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.gtsam_factors import from_gtsam, gtsam_factor, insert_value
+from graphslam.graph.gtsam_factors import gtsam_factor
+from graphslam.graph.gtsam_values import from_gtsam, insert_value
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.records import Record
 from graphslam.graph.state import Values
@@ -165,10 +166,13 @@ class Isam2Solver:
         parameters = gtsam.ISAM2Params()
         metres, radians = self.relinearize_threshold, self.relinearize_angle
         thresholds = gtsam.ISAM2ThresholdMap()
-        for letter in "xg":
-            thresholds.insert((letter, np.array([metres, metres, radians])))
-        for letter in "lb":
-            thresholds.insert((letter, np.array([metres, metres])))
+        if self.graph.dim == 2:
+            widths = {"x": (2, 1), "g": (2, 1), "l": (2, 0), "b": (2, 0)}
+        else:  # GTSAM's Pose3 has its rotation first; the datum here has its heading last
+            widths = {"x": (3, -3), "g": (3, 1), "b": (3, 0), "t": (0, 2)}
+        for letter, (m, r) in widths.items():
+            parts = [np.full(m, metres), np.full(abs(r), radians)]
+            thresholds.insert((letter, np.concatenate(parts if r >= 0 else parts[::-1])))
         parameters.setRelinearizeThreshold(thresholds)
         parameters.relinearizeSkip = self.relinearize_skip
         parameters.findUnusedFactorSlots = True
@@ -293,6 +297,7 @@ def _first_line(error: Exception) -> str:
 def _distance(a: Values, b: Values) -> float:
     """Greatest change of any component."""
     parts = [np.abs(a.poses - b.poses).max(initial=0.0), np.abs(a.landmarks - b.landmarks).max(initial=0.0)]
-    if a.datum is not None and b.datum is not None:
-        parts.append(np.abs(a.datum - b.datum).max())
+    for one, other in ((a.datum, b.datum), (a.tilt, b.tilt)):
+        if one is not None and other is not None:
+            parts.append(np.abs(one - other).max())
     return float(max(parts))

@@ -9,11 +9,13 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import MissingDataError
-from graphslam.core.geometry import Array, se2_adjoint, se2_compose, se2_inverse
+from graphslam.core.errors import GeometryError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.flat import FlatGraph
+from graphslam.graph.gps_family import level_datum_pose
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
 from graphslam.graph.score import Score, score
 from graphslam.graph.state import Values, vector_form
@@ -61,7 +63,7 @@ class Solution:
 
     @property
     def poses(self) -> Array:
-        """Nodes ``(m + 1, 3)`` in the frame of the first base."""
+        """Nodes ``(m + 1, 3|7)`` in the frame of the first base: bases, inner nodes, exits."""
         return self.values.poses
 
     @property
@@ -72,7 +74,25 @@ class Solution:
     @property
     def exit_nodes(self) -> npt.NDArray[np.intp]:
         """Row of :attr:`poses` at the end of every submap ``(m,)``."""
-        return np.array([s.node + 1 for s in self._submaps], dtype=np.intp)
+        return np.array([s.exit_node for s in self._submaps], dtype=np.intp)
+
+    @property
+    def base_nodes(self) -> npt.NDArray[np.intp]:
+        """Row of :attr:`poses` at the base of every submap ``(m,)``."""
+        return np.array([s.node for s in self._submaps], dtype=np.intp)
+
+    @property
+    def submaps(self) -> tuple[SubmapNode, ...]:
+        """Nodes of every submap, inner ones included."""
+        return tuple(self._submaps)
+
+    @property
+    def node_times(self) -> Array:
+        """When the body was at every node ``(m + 1,)`` [s]; where two submaps meet, the start of the later one."""
+        out = np.full(len(self.poses), np.nan)
+        for s in self._submaps:
+            out[list(s.nodes)] = s.times
+        return out
 
     @property
     def landmark_ids(self) -> npt.NDArray[np.int64]:
@@ -91,9 +111,12 @@ class Solution:
 
     @property
     def T_gps_world(self) -> Array | None:
-        """Map → the GPS stream's own frame ``(3,)``, or None without GPS."""
+        """Map → the GPS stream's own frame ``(3,)`` or ``(7,)``, or None without GPS."""
         if self.values.datum is None or self.gps_origin is None:
             return None
+        if self.values.dim == 3:
+            T = level_datum_pose(self.values.datum, self.values.tilt)
+            return np.concatenate([T[:3] + self.gps_origin, T[3:]])
         return self.values.datum + np.append(self.gps_origin, 0.0)
 
     @cached_property
@@ -110,7 +133,7 @@ class Solution:
         return self.covariance.joint(names)
 
     def node_covariances(self) -> Array:
-        """``(m + 1, 3, 3)``, right tangent; zeros for the fixed first base."""
+        """``(m + 1, d, d)``, right tangent; zeros for the fixed first base."""
         return self.covariance.poses()
 
     def landmark_covariances(self) -> Array:
@@ -118,16 +141,27 @@ class Solution:
         return self.covariance.landmarks()
 
     def joint_covariance(self) -> Array:
-        """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base."""
+        """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base.
+
+        Raises
+        ------
+        GeometryError
+            In space, where poses are no vectors; ask :meth:`joint_marginal` for tangents.
+        """
         lay = self._flat.layout
+        if lay.dim != 2:
+            raise GeometryError("poses in space have no covariance as vectors", wanted="joint_marginal")
         P = self.covariance.columns(np.arange(lay.datum_start))
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
 
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
-        """Path at full rate: ``x_k ∘ T_start_body(t)`` for every submap with a trajectory of its own.
+        """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory of its own.
 
-        Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the node and the local path taken as
-        independent. Where two submaps share an instant the later one has it: a fresh base is surer than a long arm.
+        ``x_k`` is the submap's base, or the last of its inner nodes before t: the path bends with them. Covariances
+        are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the node and the local path taken as independent,
+        ``P_local`` being what the path has lost since the node. What the next node knows better is left aside, so
+        between nodes they are an upper bound. Where two submaps share an instant the later one has it: a fresh base
+        is surer than a long arm.
 
         Parameters
         ----------
@@ -146,21 +180,23 @@ class Solution:
         with_path = [s for s in chosen if s.trajectory is not None and len(s.trajectory)]
         if not with_path:
             raise MissingDataError("no submap has a trajectory", wanted="submaps with T_start_body(t)")
-        last = np.inf
+        last, group = np.inf, group_of(self.values.poses)
         for s in reversed(with_path):
-            local = s.trajectory
-            assert local is not None
-            keep = local.times < last
+            path = s.trajectory
+            assert path is not None
+            keep = path.times < last
             if not np.any(keep):
                 continue
-            T = local.poses[keep]
-            last = float(local.times[keep][0])
-            times.append(local.times[keep])
-            poses.append(se2_compose(self.values.poses[s.node], T))
+            at = s.before(path.times[keep])
+            node = np.array(s.nodes)[at]
+            T, P_local = s.local_rows(keep, at)
+            last = float(path.times[keep][0])
+            times.append(path.times[keep])
+            poses.append(group.compose(self.values.poses[node], T))
             if P_nodes is not None:
-                ad = se2_adjoint(se2_inverse(T))
-                P = ad @ P_nodes[s.node] @ np.swapaxes(ad, 1, 2)
-                covs.append(P if local.covariances is None else P + local.covariances[keep])
+                ad = group.adjoint(group.inverse(T))
+                P = ad @ P_nodes[node] @ np.swapaxes(ad, 1, 2)
+                covs.append(P if P_local is None else P + P_local)
         return Trajectory(
             np.concatenate(times[::-1]),
             np.concatenate(poses[::-1]),

@@ -8,7 +8,8 @@ import pytest
 
 from graphslam.core.geometry import se2_between
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gtsam_factors import gtsam_factor, to_gtsam
+from graphslam.graph.gtsam_factors import gtsam_factor
+from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.state import gtsam_key

@@ -52,9 +52,9 @@ def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(a, b))
 
 
-def test_dimension_three_is_refused():
-    with pytest.raises(ConfigError, match="two dimensions"):
-        PoseGraph(dim=3)
+def test_dimension_four_is_refused():
+    with pytest.raises(ConfigError, match="two or in three"):
+        PoseGraph(dim=4)
 
 
 def test_new_landmarks_get_fresh_ids_and_start_where_they_were_seen(chain):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_compose, se2_exp
-from graphslam.graph.gtsam_factors import gtsam_factor, to_gtsam
+from graphslam.graph.gtsam_factors import gtsam_factor
+from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import whitener
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.state import gtsam_key, key_name, vector_form

@@ -1,0 +1,150 @@
+"""What a graph keeps of a submap besides its factors: its nodes, and how to get from them to any instant inside.
+
+A dense submap may have *inner nodes*: frames ``T_base_node`` at poses of its own path, so that a loop can bend it. What
+hangs on the submap at time t (a fix, a match, the full-rate path) then hangs on the nearest of them, by a fixed local
+pose whose covariance is what the path says to have lost between the two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import Group, group_of
+from graphslam.core.trajectory import Trajectory
+
+# What two marginals of a path leave of the error between them is made positive semi-definite; directions below this
+# share of the path's own variance are rounding.
+_FLOOR = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapNode:
+    """A submap in a graph.
+
+    Parameters
+    ----------
+    key : int
+    node : int
+        Node at its base.
+    interval : (t_start, t_end)
+    trajectory : Trajectory or None
+        ``T_base_body(t)``.
+    factor_id : int
+        Its factor, or the first of the factors of its chain.
+    nodes : (k + 2,) int
+        Base, inner nodes in order of time, exit.
+    times : (k + 2,)
+        When the body was there [s].
+    T_base_node : (k + 2, 3|7)
+        Identity, poses of the path, exit.
+    factor_ids : (k + 1,) int
+        The chain from node to node.
+    """
+
+    key: int
+    node: int
+    interval: tuple[float, float]
+    trajectory: Trajectory | None
+    factor_id: int
+    nodes: tuple[int, ...] = ()
+    times: Array = field(default_factory=lambda: np.zeros(0))
+    T_base_node: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    factor_ids: tuple[int, ...] = ()
+
+    @property
+    def exit_node(self) -> int:
+        """Node at its end, where the next submap begins."""
+        return self.nodes[-1]
+
+    @property
+    def inner(self) -> tuple[int, ...]:
+        """Nodes between base and exit."""
+        return self.nodes[1:-1]
+
+    def before(self, times: Array) -> npt.NDArray[np.intp]:
+        """Index ``(q,)`` into :attr:`nodes` of the last node at or before each of ``times``; never the exit."""
+        return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.nodes) - 2)
+
+    def nearest(self, times: Array) -> npt.NDArray[np.intp]:
+        """Index ``(q,)`` into :attr:`nodes` of the node nearest in time; never the exit."""
+        t = np.asarray(times, dtype=np.float64)
+        i = self.before(t)
+        j = np.minimum(i + 1, len(self.nodes) - 2)
+        return np.asarray(np.where(np.abs(self.times[j] - t) < np.abs(t - self.times[i]), j, i))
+
+    def local(self, times: Array, at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
+        """Poses of the body seen from nodes, and their covariances.
+
+        Parameters
+        ----------
+        times : (q,)
+        at : (q,) int
+            Index into :attr:`nodes`, not the exit.
+
+        Returns
+        -------
+        T_node_body : (q, 3|7)
+        covariance : (q, d, d) or None
+            Right tangent at the body; None where the path has none.
+
+        Raises
+        ------
+        DataError
+            Outside the path.
+        """
+        assert self.trajectory is not None
+        path = self.trajectory
+        P = None if path.covariances is None else path.interpolate_covariance(times)
+        return self._seen(np.asarray(times, dtype=np.float64), path.interpolate(times), P, at)
+
+    def local_rows(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
+        """The same at the path's own instants ``rows`` (mask or integers)."""
+        assert self.trajectory is not None
+        path = self.trajectory
+        P = None if path.covariances is None else path.covariances[rows]
+        return self._seen(path.times[rows], path.poses[rows], P, at)
+
+    def _seen(self, t: Array, T: Array, P: Array | None, at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
+        assert self.trajectory is not None
+        path, group = self.trajectory, group_of(T)
+        out = T.copy()
+        inner = np.flatnonzero(at > 0)
+        origin = self.T_base_node[at[inner]]
+        out[inner] = group.between(origin, T[inner])
+        if P is not None and len(inner):
+            P = P.copy()
+            P_node = path.interpolate_covariance(self.times[at[inner]])
+            after = t[inner] >= self.times[at[inner]]
+            ahead = grown(group, P_node, P[inner], out[inner])
+            # a body before the node: the error from it to the node, seen from the other side
+            back = group.inverse(out[inner])
+            ad = group.adjoint(out[inner])
+            behind = ad @ grown(group, P[inner], P_node, back) @ np.swapaxes(ad, 1, 2)
+            P[inner] = np.where(after[:, None, None], ahead, behind)
+        return out, P
+
+
+def grown(group: Group, P_a: Array, P_b: Array, T_ab: Array) -> Array:
+    """Covariance ``(q, d, d)`` that a path adds from a to b: ``P_b - Ad(T_ab⁻¹) P_a Ad(T_ab⁻¹)ᵀ``.
+
+    Made positive semi-definite (in units of the spread at b): a path told by its marginals may seem to know more later
+    than before, as a levelled one does of its roll and pitch.
+
+    Parameters
+    ----------
+    P_a, P_b : (q, d, d)
+        Right tangents at a and b.
+    T_ab : (q, 3|7)
+    """
+    ad = group.adjoint(group.inverse(T_ab))
+    Q = P_b - ad @ P_a @ np.swapaxes(ad, 1, 2)
+    s = np.sqrt(np.maximum(np.diagonal(P_b, axis1=1, axis2=2), 1e-300))
+    scaled = Q / (s[:, :, None] * s[:, None, :])
+    w, V = np.linalg.eigh(0.5 * (scaled + np.swapaxes(scaled, 1, 2)))
+    scaled = (V * np.maximum(w, _FLOOR)[:, None, :]) @ np.swapaxes(V, 1, 2)
+    return np.asarray(scaled * (s[:, :, None] * s[:, None, :]))
