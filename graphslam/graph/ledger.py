@@ -24,6 +24,7 @@ EXCLUSIVE = "measurement"
 DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
+    "levelled": "each base was levelled by the same gravity that the submap's exit holds",
 }
 
 

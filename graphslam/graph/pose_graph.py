@@ -27,6 +27,7 @@ The path of a pipeline, once per finished submap, and the end of a run::
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,17 +36,17 @@ from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.gps_verbs import GpsVerbs
+from graphslam.graph.attitude_verbs import AttitudeVerbs, without_tilt
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, whitener
-from graphslam.graph.records import BetweenRecord, Record, SubmapRecord
+from graphslam.graph.records import AttitudeRecord, BetweenRecord, Record, SubmapRecord
 from graphslam.graph.submap_node import SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
 
 
-class PoseGraph(GpsVerbs):
+class PoseGraph(AttitudeVerbs):
     """A graph of submaps, landmarks and GPS, in the plane or in space: the verbs that add factors.
 
     The first base is fixed at the origin. What the graph holds and what can be asked of it is in
@@ -64,6 +65,7 @@ class PoseGraph(GpsVerbs):
         *,
         covariance_scale: float = 1.0,
         spacing: float | None = None,
+        level_sigma: float | None = None,
     ) -> int:
         """Append a submap: a new node, new landmarks, and one factor with the full joint covariance.
 
@@ -79,6 +81,12 @@ class PoseGraph(GpsVerbs):
         spacing : float, optional
             A submap without landmarks gets an inner node about every so many metres of its path
             (:mod:`graphslam.graph.inner_nodes`), so that loops can bend it; the chain composes to its exit.
+        level_sigma : float, optional
+            In space: base and exit of this submap were levelled, each by itself, with this standard deviation [rad].
+            An exit that says so as a *relative* roll and pitch says it wrongly: errors of relative poses add up along
+            a chain, those of levelling do not. So the exit gives up its relative roll and pitch, and the exit's node
+            is said to be level instead (and the first base, once). That gravity was in the exit's covariance already;
+            it is no double count because the exit has given up what it knew of it (ledger kind ``levelled``).
 
         Returns
         -------
@@ -97,8 +105,10 @@ class PoseGraph(GpsVerbs):
             raise DataError(f"submap {submap.key} is already in the graph", wanted="each submap once")
         if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
             raise ConfigError(f"inner nodes need a positive spacing, got {spacing}")
+        if level_sigma is not None and not (self.dim == 3 and np.isfinite(level_sigma) and level_sigma > 0):
+            raise ConfigError(f"levelled bases are in space and need a positive sigma, got {level_sigma}")
         if submap.landmarks is None:
-            return self._add_dense(submap, covariance_scale, spacing)
+            return self._add_dense(submap, covariance_scale, spacing, level_sigma)
         if self.dim != 2:
             raise GeometryError(f"submap {submap.key} has landmarks in space", wanted="landmark submaps in the plane")
         return self._add_landmarks(submap, landmark_ids, covariance_scale)
@@ -135,8 +145,12 @@ class PoseGraph(GpsVerbs):
         self._tie_fixes(self.submaps[-1])
         return fid
 
-    def _add_dense(self, submap: Submap, covariance_scale: float, spacing: float | None) -> int:
+    def _add_dense(
+        self, submap: Submap, covariance_scale: float, spacing: float | None, level_sigma: float | None
+    ) -> int:
         cut = cut_submap(submap, spacing)
+        if level_sigma is not None:
+            cut.covariances[-1] = without_tilt(cut.covariances[-1])  # the path inside stands by its own attitude
         d, node, fid = self.values.group.dof, len(self.values.poses) - 1, self._next_factor
         records = [
             BetweenRecord(
@@ -152,11 +166,22 @@ class PoseGraph(GpsVerbs):
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         # from here on nothing fails
         self._append(submap, records, cut.times, cut.T_base_node)
+        if level_sigma is not None:
+            self._level_ends(level_sigma)
         self._event(
             "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
         )
         self._tie_fixes(self.submaps[-1])
         return fid
+
+    def _level_ends(self, sigma: float) -> None:
+        """The last submap's exit is level, and so is its base if nothing has said so yet."""
+        s = self.submaps[-1]
+        known = {r.node for r in self.records.values() if isinstance(r, AttitudeRecord)}
+        if s.node not in known:
+            self._level(s.node, sigma, s.interval[0])
+        fid = self._level(s.exit_node, sigma, s.interval[1])
+        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
 
     def _append(self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array) -> None:
         """New nodes after the last one, the submap's entry, and its factors."""

@@ -42,8 +42,8 @@ class SubmapNode:
         When the body was there [s].
     T_base_node : (k + 2, 3|7)
         Identity, poses of the path, exit.
-    factor_ids : (k + 1,) int
-        The chain from node to node.
+    factor_ids : tuple of int
+        The chain from node to node, and what came with it (the attitude of a levelled exit).
     """
 
     key: int
