@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,17 +38,30 @@ class BackEnd:
     config: BackEndConfig
     solver_name: str
     graph: PoseGraph = field(default_factory=PoseGraph)
+    """Of two dimensions until a submap of three comes first."""
     seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
     per_submap_s: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
+        self._waiting: list[tuple[Gps, GpsConfig]] = []
+        kind = self.config.match_robust
+        self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
 
     def add_gps(self, gps: Gps, config: GpsConfig) -> None:
-        """Give the graph the fixes that count; they wait for the submaps that hold them."""
+        """Give the graph the fixes that count; they wait for the submaps that hold them.
+
+        Before the first submap it is not known whether the graph is in the plane: there fixes lose their height.
+        """
+        if not self.graph.submaps:
+            self._waiting.append((gps, config))
+            return
+        have, want = gps.positions.shape[1], self.graph.dim
+        if have > want:
+            gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
         kernel = NO_KERNEL if config.robust == "none" else Robust(config.robust, config.robust_width)
         self.graph.add_gps(
             gps,
@@ -60,9 +73,24 @@ class BackEnd:
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""
         start = time.perf_counter()
-        ids = associate(self.graph, submap, self._association) if self.config.associate else None
+        if submap.dim != self.graph.dim and not self.graph.submaps:
+            self.graph = PoseGraph(submap.dim)
+            self.solver = make_solver(self.solver_name, self.graph)
+        c = self.config
+        ids = associate(self.graph, submap, self._association) if c.associate and submap.landmarks is not None else None
         associated = time.perf_counter()
-        self.graph.add_submap(submap, landmark_ids=ids, covariance_scale=self.config.covariance_scale)
+        dense = submap.landmarks is None
+        self.graph.add_submap(
+            submap,
+            landmark_ids=ids,
+            covariance_scale=c.covariance_scale,
+            spacing=c.node_spacing if dense and c.node_spacing > 0 else None,
+            level_sigma=c.level_sigma if dense and submap.dim == 3 and c.level_sigma > 0 else None,
+        )
+        self._add_matches(submap)
+        waiting, self._waiting = self._waiting, []
+        for gps, config in waiting:
+            self.add_gps(gps, config)
         self.solver.update()
         solved = time.perf_counter()
         self.seconds["associate"] += associated - start
@@ -70,6 +98,16 @@ class BackEnd:
         if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
             self.merge()
         self.per_submap_s.append(time.perf_counter() - start)
+
+    def _add_matches(self, submap: Submap) -> None:
+        """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""
+        for m in submap.matches:
+            if m.support >= self.config.match_support:
+                self.graph.add_match(submap.key, m, robust=self._match_kernel)
+            else:
+                self.graph.note(
+                    "match-not-used", submap=submap.key, target=m.target, fitness=m.fitness, support=m.support
+                )
 
     def merge(self) -> int:
         """Merge landmarks by joint covariance, then by distance, and solve again; returns the number merged."""

@@ -60,6 +60,21 @@ class BackEndConfig:
     """Look for landmarks to merge after this many submaps, and at the end."""
     confirmed_hits: int = 1
     """Landmarks of the final map were sighted at least this often over all submaps."""
+    node_spacing: float = 3.0
+    """Dense submaps get an inner node about every so many metres of their path [m]; 0 = none."""
+    level_sigma: float = 0.0
+    """In space: bases are levelled, each by itself, with this σ of roll and pitch [rad]; 0 = exits say it."""
+    match_support: float = 0.5
+    """A front end's match becomes a factor if at least this share of the particles took it; above 1 = none does."""
+    match_robust: Literal["none", "huber", "cauchy"] = "cauchy"
+    """Robust kernel on every match."""
+    match_width: float = 2.385
+    """Width of that kernel in standard deviations."""
+
+    def __post_init__(self) -> None:
+        for name in ("node_spacing", "level_sigma", "match_support"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"backend.{name} must not be negative, got {getattr(self, name)}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

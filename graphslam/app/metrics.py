@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from graphslam.app.plan_view import plan_path, plan_pose
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, se2_between, se2_inverse, se2_transform
+from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -94,6 +96,9 @@ def gps_metrics(
     results: dict[str, GpsResiduals] = {}
     if len(gps.times) < 2:
         return results
+    if trajectory.dim == 3:  # scored in the plane, seen from above
+        trajectory = plan_path(trajectory)
+        T_gps_world = None if T_gps_world is None else plan_pose(T_gps_world)
     try:
         if T_gps_world is None:
             results["all"] = gps_residuals(trajectory, gps)
@@ -136,16 +141,39 @@ def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
     start = np.array([submaps[0].interval[0]])
     if not _covered(path, start)[0]:
         return None
-    base = path.interpolate(start)[0]
+    g = group_of(path.poses)
+    base = true_base(path, submaps[0])
     times = np.array([s.interval[1] for s in submaps])
     known = _covered(path, times)
     ends = path.interpolate(times[known])
+    if g.dim == 3:  # the frame at an exit need not be the body's: bases in space stand level
+        ends = g.compose(ends, np.array([_exit_of_body(s) for s in submaps])[known])
     return MapTruth(
         keys=np.array([s.key for s in submaps], dtype=np.int64)[known],
-        exit_poses=se2_between(np.broadcast_to(base, ends.shape), ends),
+        exit_poses=g.between(np.broadcast_to(base, ends.shape), ends),
         landmark_ids=log.truth.landmark_ids,
-        landmarks=se2_transform(se2_inverse(base), log.truth.landmarks),
+        landmarks=g.transform(g.inverse(base), log.truth.landmarks)
+        if len(log.truth.landmarks)
+        else np.zeros((0, g.dim)),
     )
+
+
+def true_base(path: Trajectory, first: Submap) -> Array:
+    """Where the base of the first submap really stands, in the frame of the true ``path``.
+
+    In space a base may stand level beside the body (SegSLAM's do); the submap's own path says where the body is in it.
+    """
+    at = path.interpolate(np.array([first.interval[0]]))[0]
+    own = first.trajectory
+    if path.dim == 2 or own is None or not len(own):
+        return at
+    return group_of(at).compose(at, group_of(at).inverse(own.poses[0]))
+
+
+def _exit_of_body(submap: Submap) -> Array:
+    """``T_body_exit`` at the end of a submap's own path."""
+    g, own = group_of(submap.exit_pose), submap.trajectory
+    return g.identity if own is None or not len(own) else g.between(own.poses[-1], submap.exit_pose)
 
 
 def _covered(path: Trajectory, times: Array) -> np.ndarray:
@@ -155,8 +183,14 @@ def _covered(path: Trajectory, times: Array) -> np.ndarray:
     return np.asarray(inside & (path.times[j] - path.times[j - 1] <= TRUTH_GAP))
 
 
-def truth_path(log: SensorLog, times: Array) -> Trajectory | None:
-    """True path at ``times`` where it is known, in the frame of the base at the first of them."""
+def truth_path(log: SensorLog, times: Array, first: Submap | None = None) -> Trajectory | None:
+    """True path at ``times`` where it is known, in the frame of the base at the first of them.
+
+    Parameters
+    ----------
+    first : Submap, optional
+        The first submap, whose base in space need not be the body (:func:`true_base`).
+    """
     if log.truth is None:
         return None
     path = log.truth.trajectory
@@ -164,7 +198,10 @@ def truth_path(log: SensorLog, times: Array) -> Trajectory | None:
     if len(inside) == 0:
         return None
     poses = path.interpolate(inside)
-    return Trajectory(inside, se2_between(np.broadcast_to(poses[0], poses.shape), poses))
+    base = poses[0]
+    if path.dim == 3 and first is not None and _covered(path, np.array([first.interval[0]]))[0]:
+        base = true_base(path, first)
+    return Trajectory(inside, group_of(poses).between(np.broadcast_to(base, poses.shape), poses))
 
 
 def truth_metrics(

@@ -82,8 +82,9 @@ def _map_arrays(m: GlobalMap) -> dict[str, Any]:
     for name in ("node_times", "node_poses", "node_covariances", "landmark_ids", "landmarks", "landmark_covariances"):
         arrays[name] = getattr(m, name)
     arrays["landmark_hits"] = m.landmark_hits
-    if m.T_gps_world is not None:
-        arrays["T_gps_world"] = m.T_gps_world
+    for name in ("T_gps_world", "base_nodes"):
+        if getattr(m, name) is not None:
+            arrays[name] = getattr(m, name)
     return arrays
 
 
@@ -145,6 +146,7 @@ def open_run(path: str | Path) -> Run:
             landmark_covariances=a["landmark_covariances"],
             landmark_hits=a["landmark_hits"],
             T_gps_world=a.get("T_gps_world"),
+            base_nodes=a.get("base_nodes"),
         )
     except KeyError as error:
         raise FormatError(f"map lacks array {error}", where=str(root / "map.npz")) from None
@@ -159,8 +161,8 @@ def open_run(path: str | Path) -> Run:
         folder=root,
         gps={p.stem.removeprefix("gps_"): _gps(p) for p in sorted(root.glob("gps_*.npz"))},
         truth=read_truth(root),
-        truth_path=_path(root / "truth.tum"),
-        dead_reckoning=_path(root / "dead_reckoning.tum"),
+        truth_path=_path(root / "truth.tum", m.dim),
+        dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
     )
 
 
@@ -178,8 +180,8 @@ def _gps(file: Path) -> GpsResiduals:
     )
 
 
-def _path(file: Path) -> Trajectory | None:
-    return read_tum(file, dim=2) if file.is_file() else None
+def _path(file: Path, dim: int) -> Trajectory | None:
+    return read_tum(file, dim=dim) if file.is_file() else None
 
 
 def _events(file: Path) -> list[dict[str, Any]]:

@@ -32,14 +32,16 @@ from graphslam.app.metrics import (
     truth_metrics,
     truth_path,
 )
+from graphslam.app.metrics_space import truth_metrics_in_space
 from graphslam.app.outputs import write_outputs
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import MissingDataError
-from graphslam.core.geometry import Array, se2_compose
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Submap
@@ -247,14 +249,18 @@ def _judge(
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
-        dead_reckoning_metrics(out, reckoned, gps)
+        if back.graph.dim == 2:
+            dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"
-    true_path = truth_path(log, global_map.trajectory.times)
+    true_path = truth_path(log, global_map.trajectory.times, submaps[0])
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
-    checks = check_without_truth(out, back.graph, identified, solution.poses, gps, settings)
+    checks = check_without_truth(out, back.graph, identified, global_map.base_poses, gps, settings)
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
-        truth_metrics(out, solution, truth, identities=known, path=true_path)
+        if back.graph.dim == 2:
+            truth_metrics(out, solution, truth, identities=known, path=true_path)
+        else:
+            truth_metrics_in_space(out, solution, truth, path=true_path)
         identities = "truth" if known else "run"
     audit_association(out, log, front, *back.observation_labels(submaps))
     report = {
@@ -297,7 +303,7 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
     keep = n >= confirmed
     return GlobalMap(
         trajectory=solution.trajectory(),
-        node_times=np.array([s.interval[0] for s in submaps] + [submaps[-1].interval[1]]),
+        node_times=solution.node_times,
         node_poses=solution.poses,
         node_covariances=solution.node_covariances(),
         landmark_ids=solution.landmark_ids[keep],
@@ -305,6 +311,7 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
         landmark_covariances=solution.landmark_covariances()[keep],
         landmark_hits=n[keep],
         T_gps_world=solution.T_gps_world,
+        base_nodes=np.append(solution.base_nodes, solution.exit_nodes[-1]).astype(np.int64),
     )
 
 
@@ -319,9 +326,10 @@ def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
     if len(times) < 2:
         return None
     steps = motion.dead_reckoning(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[0].increments
-    poses = np.zeros_like(steps)
+    group = group_of(steps)
+    poses = np.tile(group.identity, (len(steps), 1))
     for k in range(1, len(steps)):
-        poses[k] = se2_compose(poses[k - 1], steps[k])
+        poses[k] = group.compose(poses[k - 1], steps[k])
     return Trajectory(times, poses)
 
 

@@ -34,14 +34,16 @@ class GlobalMap:
     ----------
     trajectory : Trajectory
         Full rate, ``T_world_base(t)`` with covariances.
-    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3), (m + 1, 3, 3)
-        Bases of the submaps and the end of the last.
+    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3|7), (m + 1, d, d)
+        Bases of the submaps, their inner nodes, and the end of the last.
     landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
         Confirmed landmarks.
     landmark_hits : (n,)
         Sightings over all submaps.
-    T_gps_world : (3,) or None
+    T_gps_world : (3,) or (7,) or None
         Map → GPS frame, where GPS was in the graph.
+    base_nodes : (k + 1,) int or None
+        Which nodes are bases of submaps or the end of the last; None: all.
     """
 
     trajectory: Trajectory
@@ -53,6 +55,22 @@ class GlobalMap:
     landmark_covariances: Array
     landmark_hits: Ints
     T_gps_world: Array | None = None
+    base_nodes: Ints | None = None
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.trajectory.dim
+
+    @property
+    def base_poses(self) -> Array:
+        """Bases of the submaps and the end of the last ``(k + 1, 3|7)``."""
+        return self.node_poses if self.base_nodes is None else self.node_poses[self.base_nodes]
+
+    @property
+    def base_times(self) -> Array:
+        """When the body was there ``(k + 1,)`` [s]."""
+        return self.node_times if self.base_nodes is None else self.node_times[self.base_nodes]
 
 
 @dataclass(frozen=True)

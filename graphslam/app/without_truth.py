@@ -74,8 +74,8 @@ def check_without_truth(
         At its optimum.
     submaps : sequence of Submap
         Identified.
-    poses : (m + 1, 3)
-        Solved nodes.
+    poses : (m + 1, 3|7)
+        Solved bases of the submaps and end of the last.
     gps : Gps or None
         The log's fixes, used and withheld.
     """
@@ -90,13 +90,15 @@ def check_without_truth(
         out.add(f"honesty_{name}_high", row["high"])
         if c.least_weight < 1.0:
             out.add(f"honesty_{name}_mean_weight", c.mean_weight)
-    innovations = _innovations(graph, gps, settings)
+    innovations = _innovations(graph, gps, settings) if graph.dim == 2 else None
     if innovations is not None:
         for row in innovations.tests().to_dict("records"):
             for key in ("value", "low", "high", "autocorrelation", "inside"):
                 direction = "one" if key == "value" else "none"
                 out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)
     loops = None
+    if graph.dim == 3:  # neither landmarks to compare loops by, nor a prediction of fixes
+        return WithoutTruth(classes, None, None)
     try:
         found = find_loops(submaps, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)

@@ -164,6 +164,10 @@ class GraphRecord:
             raise DataError("values are of other variables than the graph's", wanted="the same layout")
         self.values = values
 
+    def note(self, kind: str, **facts: Any) -> None:
+        """Enter something that was decided about this graph in :attr:`events`; facts must be JSON-serialisable."""
+        self._event(kind, **facts)
+
     # ---------------------------------------------------------------- asking
 
     def node_of(self, submap_key: int) -> int:
