@@ -17,10 +17,9 @@ from scipy import stats
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_transform
 from graphslam.core.records import Gps
-from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.evaluate.without_truth import correlated_dof, two_sided
-from graphslam.graph.gps import arm_of, gps_jacobians
+from graphslam.graph.gps import gps_jacobians, lever_arm
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.records import GpsRecord
 
@@ -134,8 +133,10 @@ def gps_innovations(
     Raises
     ------
     DataError
-        The graph has no datum, or no fix lies inside a submap's path.
+        The graph has no datum, is in space, or no fix lies inside a submap's path.
     """
+    if graph.dim != 2:
+        raise DataError("withheld fixes are predicted in the plane only", got=f"a graph of {graph.dim} dimensions")
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:
         raise DataError("withheld fixes cannot be predicted: the graph has no GPS datum", wanted="a graph with GPS")
@@ -192,7 +193,10 @@ def gps_innovations(
 
 
 def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
-    """Node of every fix (-1: none), antenna in its base frame, joint covariance of these points ``(2n, 2n)``."""
+    """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(2n, 2n)``.
+
+    Fixes of one stretch of path, from a node to the next, share what the path has lost since the node.
+    """
     n = len(gps.times)
     node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, 2)), np.zeros((2 * n, 2 * n))
     for k, s in enumerate(graph.submaps):
@@ -201,25 +205,28 @@ def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
             continue
         t0, t1 = max(s.interval[0], path.times[0]), min(s.interval[1], path.times[-1])
         last = k == len(graph.submaps) - 1
-        rows = np.flatnonzero((gps.times >= t0) & ((gps.times <= t1) if last else (gps.times < t1)))
-        if len(rows):
-            node[rows] = s.node
-            arm[rows], _ = arm_of(path, gps.times[rows], gps.lever[:2])
-            ix = (2 * rows[:, None] + np.arange(2)).ravel()
-            cov[np.ix_(ix, ix)] = _arm_covariance(path, gps.times[rows], gps.lever[:2])
+        inside = (gps.times >= t0) & ((gps.times <= t1) if last else (gps.times < t1))
+        at = s.before(gps.times)
+        for i in range(len(s.nodes) - 1):
+            rows = np.flatnonzero(inside & (at == i))
+            if len(rows):
+                T, P = s.local(gps.times[rows], at[rows])
+                node[rows] = s.nodes[i]
+                arm[rows], _ = lever_arm(T, None, gps.lever[:2])
+                ix = (2 * rows[:, None] + np.arange(2)).ravel()
+                cov[np.ix_(ix, ix)] = _arm_covariance(T, P, gps.lever[:2])
     return node, arm, cov
 
 
-def _arm_covariance(path: Trajectory, times: Array, lever: Array) -> Array:
-    """Joint covariance ``(2q, 2q)`` of the antenna at several instants of one submap's path.
+def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
+    """Joint covariance ``(2q, 2q)`` of the antenna at several poses ``(q, 3)`` of one stretch of path.
 
     The path is told by its marginals; between them it is taken as a process whose error is carried along and grows,
     ``ξ_j = Ad(T_ij⁻¹) ξ_i + w``, as that of dead reckoning does.
     """
-    q = len(times)
-    if path.covariances is None:
+    q = len(T)
+    if P is None:
         return np.zeros((2 * q, 2 * q))
-    T, P = path.interpolate(times), path.interpolate_covariance(times)
     G = np.zeros((q, 2, 3))
     G[:, :, :2] = rotation2(T[:, 2])
     G[:, :, 2] = rotation2(T[:, 2]) @ np.array([-lever[1], lever[0]])
