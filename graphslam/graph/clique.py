@@ -96,7 +96,7 @@ def _degeneracy_order(A: Mask) -> npt.NDArray[np.intp]:
 
 
 def _greedy(rows: list[int], n: int) -> int:
-    """From every one of the best-connected vertices: add the candidate with the most neighbours among the candidates."""
+    """From each of the best-connected vertices: add the candidate with most neighbours among the candidates."""
     best = 0
     for start in sorted(range(n), key=lambda v: -rows[v].bit_count())[: min(n, 20)]:
         clique, candidates = 1 << start, rows[start]

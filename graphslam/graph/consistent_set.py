@@ -11,8 +11,8 @@ which is the identity if all four are right. ``r = Log E`` is a right tangent at
 where ``C_k = Σ_{i<k} Ad(X_{i+1}) Q_i Ad(X_{i+1})ᵀ`` is the covariance of the chain summed in the frame of its start (so
 that any piece of it is a difference of two), ``M = Ad(B_ac T_cd X_d⁻¹)`` and ``N = Ad(X_a⁻¹)`` carry it to a, and the
 last term, of the stretch that both pieces run over, keeps what they share from being counted as independent.
-``D² = rᵀ S⁻¹ r`` is χ² of 3 (SE(2)) or 6 (SE(3)) degrees of freedom if both loops are right. Nothing is linearised about
-a solution: there need not be one.
+``D² = rᵀ S⁻¹ r`` is χ² of 3 (SE(2)) or 6 (SE(3)) degrees of freedom if both loops are right. Nothing is linearised
+about a solution: there need not be one.
 
 The largest set of loops that agree two by two is the maximum clique of the graph of agreements. That graph is wrong
 about a right pair with probability ``1 - level``; a clique of many loops forgives none of its pairs, so loops that
@@ -316,7 +316,7 @@ def largest_consistent_set(
     ``nan`` counts as agreement: what cannot be compared contradicts nothing.
     """
     D = np.asarray(chi2, dtype=np.float64)
-    conflict = D > limit
+    conflict = limit < D
     alone = np.diag(conflict) & against_chain
     agree = ~conflict & ~alone[:, None] & ~alone[None, :]
     found = maximum_clique(agree & agree.T, budget=budget)

@@ -21,6 +21,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 
+Index = npt.NDArray[np.intp]
 Kind = Literal["random", "aliased"]
 # A drawn loop that the reference poses do not contradict with this confidence is not wrong, and is drawn again.
 CONTRADICTED = 0.999
@@ -108,10 +109,10 @@ def add_wrong_loops(
     wanted = round(share / (1.0 - share) * len(loops))
     size = 1 if kind == "random" else min(group_size, max(len(network) // 4, 1))
     limit = float(stats.chi2.ppf(CONTRADICTED, network.tangent_dim))
-    edges: list[Array] = []
-    like: list[Array] = []
+    edges: list[Index] = []
+    like: list[Index] = []
     measured: list[Array] = []
-    group: list[Array] = []
+    group: list[Index] = []
     have, groups, failed = 0, 0, 0
     while have < wanted:
         n = min(size, wanted - have)
@@ -155,12 +156,12 @@ def add_wrong_loops(
 def _draw(
     network: PoseNetwork,
     poses: Array,
-    loops: Array,
+    loops: Index,
     count: int,
     size: int,
     rng: np.random.Generator,
     solved: bool,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Index, Index, Array]:
     """Ends ``(count · size, 2)``, the loop that each imitates, and the measurement of each.
 
     A group takes the stretches ``a … a+size`` and ``b … b+size`` for one place: one motion W of the second, which puts
@@ -199,7 +200,7 @@ def _draw(
     return ends, model, compose(z, exp(noise))
 
 
-def _costs(network: PoseNetwork, poses: Array, ends: Array, model: Array, z: Array) -> Array:
+def _costs(network: PoseNetwork, poses: Array, ends: Index, model: Index, z: Array) -> Array:
     if network.dim == 2:
         r = se2.se2_log(se2.se2_between(z, se2.se2_between(poses[ends[:, 0]], poses[ends[:, 1]])))
     else:

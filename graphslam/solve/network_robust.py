@@ -10,13 +10,13 @@ allow. Plain trimming from every start is the competitor, and the lowest truncat
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 from scipy import stats
 from tqdm import tqdm
 
@@ -24,19 +24,29 @@ from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, Polished, polish
-from graphslam.solve.network_consensus import Consensus, loop_consensus, odometry_edges
+from graphslam.solve.network_consensus import loop_consensus, odometry_edges
 from graphslam.solve.network_diagnose import check_determined
-from graphslam.solve.network_model import edge_costs, observation_costs
+from graphslam.solve.network_model import Layout, edge_costs, linearise, observation_costs
+from graphslam.solve.network_sparse import factor
 from graphslam.solve.network_start import chordal_start, landmarks_from, odometry_start
 
 log = logging.getLogger(__name__)
 
 Mask = npt.NDArray[np.bool_]
-ROUNDS = 20
+ROUNDS = 12
+# Limits are widened so far to look for what was left out together.
+WIDER = (10.0, 100.0)
+# Loops left out that are tested against the covariance of the answer, at a time, and how often.
+TESTED, TESTS = 300, 4
 # Growth of μ, descent steps at each, and when to stop (Yang et al. 2020 use 1.4).
-GROWTH, STEPS, STAGES = 1.4, 4, 100
+GROWTH, STEPS, STAGES = 1.4, 2, 60
 # Residuals of the loops believed at the start are taken to be at most so many times the limit: μ starts there.
 WORST = 1e3
+# The guess is confirmed if fewer of all edges than this were believed at first and are outliers in the end.
+CONFIRMED = 0.001
+# Steps of a solve between two choices of inliers; the last solve goes to the end.
+TRIM_STEPS = 6
+FINAL_STEPS, SETTLE = 200, 40
 # Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
 START_STEPS = 40
 
@@ -122,52 +132,65 @@ def truncated_least_squares(
     trusted = np.zeros(m + len(network.observations), dtype=np.bool_)
     if trust_odometry:
         trusted[:m] = odometry_edges(network)
-    guess = trusted.copy()
-    guess[:m] |= consensus.odometry | consensus.likely
-    guess[m:] = True
     starts: dict[str, tuple[gtsam.Values, Mask]] = {}
     scale = 1.0 if noise_scale is None else noise_scale
-    for name, used in (("consensus", guess), ("odometry", trusted)):
-        begun = _from(problem, used, consensus) if used[:m].any() else None
-        if begun is not None:
+    for name, believed in (("consensus", consensus.likely), ("core", consensus.core)):
+        if believed.any() and not (name == "core" and (believed == consensus.likely).all()):
+            used = trusted | True
+            used[:m] = consensus.odometry | believed
+            begun = _least_squares(problem, used, chordal=True)
+            if begun is None:
+                continue
             starts[name] = (begun, used)
-            if name == "consensus" and noise_scale is None and consensus.likely.any():
-                scale = _scale(network, problem.arrays(begun), consensus)
-            if name == "consensus" and consensus.likely.any():
-                break  # dead reckoning is worth trying only where loops bear nothing out
+            if noise_scale is None:
+                scale = min(
+                    _scale(network, problem.arrays(begun), used, believed), scale if len(starts) > 1 else np.inf
+                )
+    if not starts and trusted.any():
+        used = trusted.copy()
+        used[m:] = True
+        begun = _least_squares(problem, used, chordal=False)
+        if begun is not None:
+            starts["odometry"] = (begun, used)
     limit = _limits(network, probability, scale, trusted)
-    starts |= {name: (values, np.ones_like(guess)) for name, values in (given or {}).items()}
+    starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
     found: list[tuple[str, _Trimmed]] = []
-    for name, (values, believed) in tqdm(
-        starts.items(), desc="robust starts", unit="start", disable=not progress, leave=False
-    ):
-        costs = _costs(network, *problem.arrays(values))
-        found.append((name, _trim(network, values, (costs <= limit) | trusted, limit)))
+    for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
+        if name not in starts:
+            continue
+        values, believed = starts[name]
         weights, annealed = _anneal(network, values, limit, believed)
-        found.append((name, _trim(network, annealed, (weights > 0.5) | trusted, limit)))
+        trials = [
+            _trim(network, values, _costs(network, *problem.arrays(values)) <= limit, limit),
+            _trim(network, annealed, weights > 0.5, limit),
+        ]
+        best = _readmit(network, _widen(network, min(trials, key=lambda t: t.cost), limit), limit)
+        found.append((name, best))
+        if name == "consensus" and (best.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED:
+            starts.pop("core", None)  # the loops believed first are believed last
     if not found:
         raise IndeterminateError(f"{network.source}: no robust start could be made")
     reached: dict[str, float] = {}
     for name, trimmed in found:
         reached[name] = min(trimmed.cost, reached.get(name, np.inf))
     name, best = min(found, key=lambda f: f[1].cost)
+    best = _trim(network, best.end.values, best.inliers, limit, steps=FINAL_STEPS)
     return Robust(best.inliers, best.problem, best.end, best.cost, limit, scale, name, reached)
 
 
-def _from(problem: BatchProblem, used: Mask, consensus: Consensus) -> gtsam.Values | None:
-    """Least squares of the measurements in ``used`` alone: rotations first; dead reckoning where that is all."""
-    network, m = problem.network, len(problem.network.edges)
-    part = _part(network, used)
+def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
+    """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
+    part = _part(problem.network, used)
     try:
         check_determined(part)
-        if not consensus.likely.any() or len(network.observations):
+        if chordal and not len(part.observations):
+            arrays = chordal_start(part)
+        else:
             poses = odometry_start(part)
             arrays = poses, landmarks_from(part, poses)
-        else:
-            arrays = chordal_start(part)
         return polish(BatchProblem(part), problem.values(*arrays), max_iterations=START_STEPS).values
     except (IndeterminateError, RuntimeError) as error:
-        log.info("%s: %d of %d edges make no start: %s", network.source, int(used[:m].sum()), m, error)
+        log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
 
 
@@ -185,16 +208,16 @@ def _part(network: PoseNetwork, used: Mask) -> PoseNetwork:
     )
 
 
-def _scale(network: PoseNetwork, arrays: tuple[Array, Array], consensus: Consensus) -> float:
-    """True over stated variance of the loops, from the median cost of the likely ones after least squares.
+def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
+    """True over stated variance of the loops, from the median cost of those believed, after least squares.
 
     A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
     left of ``rows``.
     """
-    used = consensus.likely | consensus.odometry
-    rows = int(used.sum()) * network.tangent_dim + 2 * len(network.observations)
+    m = len(network.edges)
+    rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
     left = max(rows - network.states, 1) / rows
-    median = float(np.median(edge_costs(network, arrays[0])[consensus.likely]))
+    median = float(np.median(edge_costs(network, arrays[0])[believed]))
     return max(median / (left * float(stats.chi2.median(network.tangent_dim))), np.finfo(float).tiny)
 
 
@@ -242,14 +265,24 @@ class _Trimmed:
     cost: float
 
 
-def _trim(network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array) -> _Trimmed:
+def _trim(
+    network: PoseNetwork,
+    values: gtsam.Values,
+    inliers: Mask,
+    limit: Array,
+    *,
+    steps: int = TRIM_STEPS,
+    settle: bool = False,
+) -> _Trimmed:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
-    Neither step raises the truncated cost, so it ends.
+    Neither step raises the truncated cost, so it ends. ``settle``: the first solve is a longer one, because the
+    choice at the start is not one by cost.
     """
     for _ in range(ROUNDS):
         inner = BatchProblem(network, inliers)
-        end = polish(inner, values)
+        end = polish(inner, values, max_iterations=SETTLE if settle else steps)
+        settle = False
         costs = _costs(network, *inner.arrays(end.values))
         fresh = costs <= limit
         if (fresh == inliers).all():
@@ -258,10 +291,66 @@ def _trim(network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Arra
     return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
 
 
+def _widen(network: PoseNetwork, best: _Trimmed, limit: Array) -> _Trimmed:
+    """Look again at what was left out by a little: with wider limits for a while, kept if the cost falls.
+
+    Loops that alone tie a stretch of the path are left out together, because without them the stretch lies elsewhere;
+    each is then too far off to be taken back in alone.
+    """
+    for widest in WIDER:
+        wide = best
+        for step in np.geomspace(widest, 1.0, 4):
+            costs = _costs(network, *wide.problem.arrays(wide.end.values))
+            inliers = costs <= step * limit
+            if step == widest and (inliers == wide.inliers).all():
+                break
+            wide = _trim(network, wide.end.values, inliers, step * limit)
+        if wide.cost < best.cost * (1.0 - 1e-9):
+            best = wide
+    return best
+
+
+def _readmit(network: PoseNetwork, best: _Trimmed, limit: Array) -> _Trimmed:
+    """Take back what the answer is too uncertain to contradict: ``rᵀ (Ω⁻¹ + J Σ Jᵀ)⁻¹ r`` within the limit.
+
+    That is what a measurement left out would add to the objective, to first order; its cost at the answer says
+    nothing where the answer is free to move. Kept if the truncated cost falls.
+    """
+    m = len(network.edges)
+    for _ in range(TESTS):
+        poses, landmarks = best.problem.arrays(best.end.values)
+        costs = edge_costs(network, poses)
+        w = np.linalg.eigvalsh(network.information)
+        outside = np.flatnonzero(~best.inliers[:m] & (w[:, 0] > 1e-12 * w[:, -1]))
+        outside = outside[np.argsort(costs[outside], kind="stable")][:TESTED]
+        if not len(outside):
+            break
+        D = _predicted(network, best.inliers, outside, poses, landmarks)
+        fresh = best.inliers.copy()
+        fresh[outside[limit[outside] >= D]] = True
+        if (fresh == best.inliers).all():
+            break
+        tried = _trim(network, best.end.values, fresh, limit, settle=True)
+        if not tried.cost < best.cost * (1.0 - 1e-9):
+            break
+        best = tried
+    return best
+
+
+def _predicted(network: PoseNetwork, inliers: Mask, rows: npt.NDArray[np.intp], poses: Array, marks: Array) -> Array:
+    """``D²`` of edges against the posterior of the inliers."""
+    layout, d = Layout.of(network), network.tangent_dim
+    J, _ = linearise(_part(network, inliers), poses, marks, layout)
+    part = _part(network, np.isin(np.arange(len(inliers)), rows))
+    back = np.argsort(np.argsort(rows))
+    # whitened: S = I + A H⁻¹ Aᵀ, in the order of the file
+    A, r = linearise(part, poses, marks, layout)
+    solved = factor(sp.csc_matrix(J.T @ J)).solve(A.T.toarray())
+    blocks = np.asarray(A @ solved).reshape(len(rows), d, len(rows), d)
+    S = np.eye(d) + blocks[np.arange(len(rows)), :, np.arange(len(rows))]
+    r = r.reshape(-1, d)
+    return np.einsum("ki,ki->k", r, np.linalg.solve(S, r[..., None])[..., 0])[back]
+
+
 def _costs(network: PoseNetwork, poses: Array, landmarks: Array) -> Array:
     return np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])
-
-
-def start_names(given: Sequence[str] | None) -> tuple[str, ...]:
-    """Starts that a user asked for."""
-    return tuple(given or ())
