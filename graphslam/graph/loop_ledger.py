@@ -1,0 +1,183 @@
+"""The ledger of loops: every decision with its reasons and figures, as events that outlive the run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from graphslam.core.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Verdict = Literal["accepted", "rejected", "switched-off", "undone"]
+EVENT = "loop"
+COLUMNS = (
+    "loop",
+    "verdict",
+    "why",
+    "source",
+    "submap_i",
+    "submap_j",
+    "i",
+    "j",
+    "score",
+    "gain",
+    "fitness",
+    "margin",
+    "chi2",
+    "weight",
+    "effect_predicted",
+    "effect",
+    "effect_earlier",
+    "factor_id",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """What was decided of a loop, and on what grounds; the latest of a loop is the one in force.
+
+    Parameters
+    ----------
+    loop : int
+        Number of the loop in the ledger.
+    verdict : {"accepted", "rejected", "switched-off", "undone"}
+    why : str
+        In words.
+    i, j : int
+        Nodes.
+    submap_i, submap_j : int
+        Keys of their submaps.
+    source : str
+        Who proposed it: ``front-end``, ``proximity``, ``appearance``.
+    score, gain : float
+        Of the candidate.
+    gates : dict
+        Figures of its registration.
+    chi2 : float
+        Against the graph's joint marginal when it was decided on; once it is in, against the graph without it.
+    weight : float
+        Of the robust kernel at the solution; 0 of a loop that is not in the graph.
+    effect_predicted : float
+        By how much it was expected to raise the objective: ``eᵀ (P + R)⁻¹ e``.
+    effect : float
+        By how much it did.
+    effect_earlier : float
+        Of that, what the factors bear that were there before.
+    factor_id : int
+        In the graph; −1 if it is not there.
+    """
+
+    loop: int
+    verdict: Verdict
+    why: str
+    i: int
+    j: int
+    submap_i: int = -1
+    submap_j: int = -1
+    source: str = ""
+    score: float = math.nan
+    gain: float = math.nan
+    gates: dict[str, Any] = field(default_factory=dict)
+    chi2: float = math.nan
+    weight: float = 0.0
+    effect_predicted: float = math.nan
+    effect: float = math.nan
+    effect_earlier: float = math.nan
+    factor_id: int = -1
+
+    def event(self) -> dict[str, Any]:
+        """One line of ``events.jsonl``."""
+        return {"event": EVENT, **{name: getattr(self, name) for name in self.__slots__}}
+
+
+class LoopLedger:
+    """Decisions in the order in which they were made.
+
+    Examples
+    --------
+    >>> ledger = LoopLedger()
+    >>> ledger.write(Decision(loop=0, verdict="accepted", why="", i=3, j=40, factor_id=77))
+    >>> ledger.write(Decision(loop=0, verdict="undone", why="asked for", i=3, j=40))
+    >>> ledger.current()[0].verdict
+    'undone'
+    """
+
+    def __init__(self, decisions: Iterable[Decision] = ()) -> None:
+        self.decisions: list[Decision] = list(decisions)
+
+    @classmethod
+    def from_events(cls, events: Iterable[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
+        """The ledger of a run from its events; those of other kinds are passed over.
+
+        Raises
+        ------
+        DataError
+            A loop event that is none.
+        """
+        out = []
+        names = set(Decision.__slots__)
+        for k, e in enumerate(events):
+            if e.get("event") != EVENT:
+                continue
+            # not-a-number is null in JSON
+            facts: dict[str, Any] = {n: math.nan if v is None else v for n, v in e.items() if n in names}
+            try:
+                out.append(Decision(**facts))
+            except TypeError as error:
+                raise DataError(f"loop event {k} is not whole ({error})", where=where) from None
+        return cls(out)
+
+    def write(self, decision: Decision) -> None:
+        """Add a decision."""
+        self.decisions.append(decision)
+
+    def __len__(self) -> int:
+        return len(self.decisions)
+
+    def current(self) -> list[Decision]:
+        """The decision in force of every loop, by its number."""
+        last: dict[int, Decision] = {}
+        for d in self.decisions:
+            last[d.loop] = d
+        return [last[k] for k in sorted(last)]
+
+    def of(self, loop: int) -> Decision:
+        """The decision in force of one loop.
+
+        Raises
+        ------
+        DataError
+            There is no such loop.
+        """
+        for d in reversed(self.decisions):
+            if d.loop == loop:
+                return d
+        raise DataError(f"loop {loop} is not in the ledger", wanted=f"one of {len(self.current())} loops")
+
+    def events(self) -> list[dict[str, Any]]:
+        """All decisions, ready for ``events.jsonl``."""
+        return [d.event() for d in self.decisions]
+
+    def counts(self) -> dict[str, int]:
+        """Loops by verdict in force."""
+        out: dict[str, int] = {}
+        for d in self.current():
+            out[d.verdict] = out.get(d.verdict, 0) + 1
+        return out
+
+    def table(self, *, history: bool = False) -> pd.DataFrame:
+        """A row a loop with the decision in force, or with ``history`` a row a decision."""
+        import pandas as pd
+
+        rows = []
+        for d in self.decisions if history else self.current():
+            row = d.event()
+            gates = row.pop("gates") or {}
+            row["fitness"] = gates.get("fitness_known") or gates.get("fitness", math.nan)
+            row["margin"] = gates.get("margin", math.nan)
+            rows.append(row)
+        return pd.DataFrame(rows, columns=list(COLUMNS))

@@ -1,0 +1,299 @@
+"""Which loops are believed: each is tried against the graph, against the others, and by what it does once it is in.
+
+One wrong loop ruins a map, so a loop passes, in this order,
+
+1. the gates of its registration (:mod:`graphslam.registration.gates`);
+2. the chain of submaps alone, and all other loops two by two: the largest set that agrees (pairwise consistency);
+3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
+4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
+   are in, every one is asked what the graph *without* it says of it.
+
+With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
+without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
+solution is needed for it. Every step writes a :class:`~graphslam.graph.loop_ledger.Decision`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
+
+import numpy as np
+from scipy import stats
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.gaussian import check_covariance
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.graph.consistent_set import ConsistentSet, consistent_loops
+from graphslam.graph.loop_ledger import Decision, LoopLedger, Verdict
+from graphslam.graph.loop_measure import Loop
+from graphslam.graph.loop_places import Ints
+from graphslam.graph.noise import Robust
+from graphslam.registration.submap_pairs import prediction_chi2
+
+
+class LoopGraph(Protocol):
+    """What is asked of a graph that loops are added to."""
+
+    def relative(self, i: Ints, j: Ints) -> tuple[Array, Array]:
+        """``T_ij (k, 7|3)`` and covariances ``(k, d, d)``, right tangents, from the joint marginals."""
+        ...
+
+    def add_loop(self, loop: Loop, robust: Robust) -> int:
+        """Add a between-factor; its id."""
+        ...
+
+    def remove_loop(self, factor_id: int) -> None:
+        """Take it out again."""
+        ...
+
+    def solve(self) -> None:
+        """Bring the values to the optimum."""
+        ...
+
+    def chi2(self) -> dict[int, float]:
+        """``rᵀ P⁻¹ r`` of every factor at the values, without its kernel."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopConfig:
+    """When a loop is believed."""
+
+    level: float = 0.999
+    """A right loop passes the χ² of the graph with this probability."""
+    pairwise: float = 0.99
+    """Two right loops agree with this probability."""
+    kernel: float = 0.95
+    """Loops in the graph have a Huber kernel that begins where a right loop lies with this probability."""
+    off: float = 0.9999
+    """A loop is switched off that the graph without it would refuse with this confidence."""
+    earlier: float = 0.9999
+    """… or that raises the χ² of earlier factors by more than this quantile of its own."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not 0.0 < getattr(self, f.name) < 1.0:
+                raise ConfigError(f"loops: {f.name} = {getattr(self, f.name)}; wanted a probability in (0, 1)")
+
+
+class LoopCloser:
+    """Decides on loops, and keeps the ledger.
+
+    Parameters
+    ----------
+    graph : LoopGraph
+    increments, covariances : (n, 7|3), (n, d, d)
+        The chain alone, from node to node, right tangents: what pairwise consistency goes by.
+    config : LoopConfig, optional
+    ledger : LoopLedger, optional
+        To go on with.
+    """
+
+    def __init__(
+        self,
+        graph: LoopGraph,
+        increments: Array,
+        covariances: Array,
+        config: LoopConfig | None = None,
+        ledger: LoopLedger | None = None,
+    ) -> None:
+        self.graph = graph
+        self.increments, self.covariances = increments, covariances
+        self.config = LoopConfig() if config is None else config
+        self.ledger = LoopLedger() if ledger is None else ledger
+        self.loops: dict[int, Loop] = {}
+        self._dof = group_of(increments).dof
+
+    # ---------------------------------------------------------------- deciding
+
+    @property
+    def accepted(self) -> list[int]:
+        """Numbers of the loops that are in the graph."""
+        return [d.loop for d in self.ledger.current() if d.verdict == "accepted"]
+
+    def propose(self, loops: Sequence[Loop]) -> list[Decision]:
+        """Decide on new loops, and again on those that are in or were refused by the company they were in.
+
+        Returns
+        -------
+        list of Decision
+            In force for the new ones, in their order.
+
+        Raises
+        ------
+        CovarianceError
+            A loop that passed its gates without a covariance.
+        """
+        first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
+        numbers = list(range(first, first + len(loops)))
+        usable = []
+        for n, loop in zip(numbers, loops):
+            self.loops[n] = loop
+            if loop.why:
+                self._write(n, "rejected", f"registration: {loop.why}")
+            else:
+                check_covariance(loop.covariance, what=f"covariance of loop {n}", dim=self._dof)
+                usable.append(n)
+        if usable:
+            self._decide(usable)
+        return [self.ledger.of(n) for n in numbers]
+
+    def undo(self, loop: int, why: str = "asked for") -> Decision:
+        """Take a loop out of the graph, and solve without it.
+
+        Raises
+        ------
+        DataError
+            It is not in the graph.
+        """
+        d = self.ledger.of(loop)
+        if d.verdict != "accepted":
+            raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
+        before = sum(self.graph.chi2().values())
+        self.graph.remove_loop(d.factor_id)
+        self.graph.solve()
+        effect = sum(self.graph.chi2().values()) - before
+        self.ledger.write(replace(d, verdict="undone", why=why, weight=0.0, factor_id=-1, effect=effect))
+        return self.ledger.of(loop)
+
+    def _decide(self, new: list[int]) -> None:
+        # loops that disagreed with others may turn out right when more are there
+        again = [n for n in self._refused_by_company() if n not in new]
+        numbers = sorted({*new, *self.accepted, *again})
+        found = self._consistent(numbers)
+        inside = set(self.accepted)
+        left = []
+        for k, n in enumerate(numbers):
+            if found.accepted[k]:
+                if n not in inside:
+                    left.append((float(found.chi2[k, k]), n))
+            elif n in inside:
+                self._switch_off(n, f"pairwise: {found.reasons[k]}")
+            else:
+                self._write(n, "rejected", f"pairwise: {found.reasons[k]}", chi2=float(found.chi2[k, k]))
+        self._one_by_one([n for _, n in sorted(left)])
+        self._reconsider()
+
+    def _one_by_one(self, numbers: list[int]) -> None:
+        """Add loops in this order, each against the graph as it is by then."""
+        c, d = self.config, self._dof
+        limit = float(stats.chi2.ppf(c.level, d))
+        earlier_limit = float(stats.chi2.ppf(c.earlier, d))
+        for n in numbers:
+            loop = self.loops[n]
+            T, P = self.graph.relative(np.array([loop.i]), np.array([loop.j]))
+            expected = prediction_chi2(loop.T_ij, loop.covariance, T[0], P[0])
+            if not expected <= limit:  # NaN is not
+                self._write(n, "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", chi2=expected)
+                continue
+            before = self.graph.chi2()
+            fid = self.graph.add_loop(loop, self._kernel())
+            self.graph.solve()
+            after = self.graph.chi2()
+            effect = sum(after.values()) - sum(before.values())
+            earlier = sum(after[f] - before[f] for f in before)
+            facts = {"chi2": expected, "effect_predicted": expected, "effect": effect, "effect_earlier": earlier}
+            if not earlier <= earlier_limit:
+                self.graph.remove_loop(fid)
+                self.graph.solve()
+                worst = max(before, key=lambda f: after[f] - before[f])
+                why = (
+                    f"effect: χ² of earlier factors rises by {earlier:.1f} > {earlier_limit:.1f} (most: factor {worst})"
+                )
+                self._write(n, "switched-off", why, **facts)
+                continue
+            weight = float(self._kernel().weight(np.array([after[fid]]))[0])
+            self._write(n, "accepted", found_why(expected, d), factor_id=fid, weight=weight, **facts)
+
+    def _reconsider(self) -> None:
+        """Switch off, worst first, what the rest of the graph contradicts; then say the weights of the others."""
+        limit = float(stats.chi2.ppf(self.config.off, self._dof))
+        while inside := self.accepted:
+            alone = self.without(inside)
+            worst = int(np.argmax(alone))
+            if not alone[worst] > limit:
+                break
+            n = inside[worst]
+            self._switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
+        chi2 = self.graph.chi2()
+        for n in self.accepted:
+            d = self.ledger.of(n)
+            weight = float(self._kernel().weight(np.array([chi2[d.factor_id]]))[0])
+            if abs(weight - d.weight) > 0.01:
+                self.ledger.write(replace(d, weight=weight))
+
+    def without(self, numbers: Sequence[int]) -> Array:
+        """χ² of loops that are in the graph against the graph without them ``(k,)``, each by itself.
+
+        ``rᵀ (R - P)⁻¹ r`` with the residual r and the posterior P of the relative pose. Infinite where nothing but the
+        loop holds the two together and yet it does not fit.
+        """
+        loops = [self.loops[n] for n in numbers]
+        T, P = self.graph.relative(np.array([x.i for x in loops]), np.array([x.j for x in loops]))
+        out = np.empty(len(loops))
+        for k, x in enumerate(loops):
+            g = group_of(x.T_ij)
+            D = g.between(T[k], x.T_ij)
+            A = g.adjoint(D)
+            R = A @ x.covariance @ A.T
+            e = g.log(D)
+            # in units of R: what of it the graph had to learn from the loop is no test of it
+            L = np.linalg.cholesky(R)
+            y, S = np.linalg.solve(L, e), np.linalg.solve(L, np.linalg.solve(L, P[k]).T)
+            w, V = np.linalg.eigh(0.5 * (S + S.T))
+            left = np.maximum(1.0 - w, 1e-9)
+            out[k] = float(np.sum((V.T @ y) ** 2 / left))
+        return out
+
+    # ---------------------------------------------------------------- writing
+
+    def _switch_off(self, n: int, why: str, chi2: float = math.nan) -> None:
+        d = self.ledger.of(n)
+        before = sum(self.graph.chi2().values())
+        self.graph.remove_loop(d.factor_id)
+        self.graph.solve()
+        effect = sum(self.graph.chi2().values()) - before
+        value = d.chi2 if math.isnan(chi2) else chi2
+        self.ledger.write(
+            replace(d, verdict="switched-off", why=why, weight=0.0, factor_id=-1, effect=effect, chi2=value)
+        )
+
+    def _write(self, n: int, verdict: Verdict, why: str, **facts: float) -> None:
+        x = self.loops[n]
+        known: dict[str, float] = dict(facts)
+        fid = int(known.pop("factor_id", -1))
+        self.ledger.write(
+            Decision(
+                loop=n, verdict=verdict, why=why, i=int(x.i), j=int(x.j), submap_i=int(x.submaps[0]),
+                submap_j=int(x.submaps[1]), source=x.source, score=x.score, gain=x.gain, gates=x.gates, factor_id=fid,
+                **known,
+            )  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def _refused_by_company(self) -> list[int]:
+        verdicts = ("rejected", "switched-off")
+        return [
+            d.loop
+            for d in self.ledger.current()
+            if d.verdict in verdicts and d.loop in self.loops and not self.loops[d.loop].why
+        ]
+
+    def _consistent(self, numbers: list[int]) -> ConsistentSet:
+        x = [self.loops[n] for n in numbers]
+        ends = np.array([[a.i, a.j] for a in x], dtype=np.int64)
+        measured, covariance = np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
+        return consistent_loops(
+            self.increments, self.covariances, (ends, measured, covariance), self.config.pairwise, against_chain=True
+        )
+
+    def _kernel(self) -> Robust:
+        return Robust("huber", math.sqrt(float(stats.chi2.ppf(self.config.kernel, self._dof))))
+
+
+def found_why(chi2: float, dof: int) -> str:
+    """Why a loop was accepted, in words."""
+    return f"agrees with the graph: χ² {chi2:.1f} of {dof}"
