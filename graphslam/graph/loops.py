@@ -3,7 +3,8 @@
 One wrong loop ruins a map, so a loop passes, in this order,
 
 1. the gates of its registration (:mod:`graphslam.registration.gates`);
-2. the chain of submaps alone, and all other loops two by two: the largest set that agrees (pairwise consistency);
+2. the χ² of the chain of submaps alone, and all other loops two by two: the largest set that agrees (pairwise
+   consistency);
 3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
 4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
    are in, every one is asked what the graph *without* it says of it.
@@ -27,7 +28,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.consistent_set import ConsistentSet, consistent_loops
+from graphslam.graph.consistent_set import Chain, ConsistentSet, LoopArrays, chain_chi2, consistent_loops
 from graphslam.graph.loop_ledger import Decision, LoopLedger, Verdict
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
@@ -65,6 +66,8 @@ class LoopConfig:
 
     level: float = 0.999
     """A right loop passes the χ² of the graph with this probability."""
+    chain: float = 0.9999
+    """… and that of the chain alone with this: what is wrong with the chain is wrong for all loops at once."""
     pairwise: float = 0.99
     """Two right loops agree with this probability."""
     kernel: float = 0.95
@@ -164,17 +167,25 @@ class LoopCloser:
         # loops that disagreed with others may turn out right when more are there
         again = [n for n in self._refused_by_company() if n not in new]
         numbers = sorted({*new, *self.accepted, *again})
-        found = self._consistent(numbers)
+        chain = dict(zip(numbers, self._against_chain(numbers)))
+        limit = float(stats.chi2.ppf(self.config.chain, self._dof))
         inside = set(self.accepted)
+        for n in numbers:
+            if n not in inside and not chain[n] <= limit and n in new:
+                self._write(n, "rejected", f"chain: χ² {chain[n]:.1f} > {limit:.1f}", chi2=chain[n])
+        numbers = [n for n in numbers if n in inside or chain[n] <= limit]
+        if not numbers:
+            return
+        found = self._consistent(numbers)
         left = []
         for k, n in enumerate(numbers):
             if found.accepted[k]:
                 if n not in inside:
-                    left.append((float(found.chi2[k, k]), n))
+                    left.append((chain[n], n))
             elif n in inside:
                 self._switch_off(n, f"pairwise: {found.reasons[k]}")
-            else:
-                self._write(n, "rejected", f"pairwise: {found.reasons[k]}", chi2=float(found.chi2[k, k]))
+            elif n in new:
+                self._write(n, "rejected", f"pairwise: {found.reasons[k]}", chi2=chain[n])
         self._one_by_one([n for _, n in sorted(left)])
         self._reconsider()
 
@@ -282,12 +293,18 @@ class LoopCloser:
             if d.verdict in verdicts and d.loop in self.loops and not self.loops[d.loop].why
         ]
 
-    def _consistent(self, numbers: list[int]) -> ConsistentSet:
+    def _arrays(self, numbers: list[int]) -> tuple[Ints, Array, Array]:
         x = [self.loops[n] for n in numbers]
         ends = np.array([[a.i, a.j] for a in x], dtype=np.int64)
-        measured, covariance = np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
+        return ends, np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
+
+    def _against_chain(self, numbers: list[int]) -> list[float]:
+        chain = Chain.of(self.increments, self.covariances)
+        return [float(v) for v in chain_chi2(chain, LoopArrays.of(chain, *self._arrays(numbers)))]
+
+    def _consistent(self, numbers: list[int]) -> ConsistentSet:
         return consistent_loops(
-            self.increments, self.covariances, (ends, measured, covariance), self.config.pairwise, against_chain=True
+            self.increments, self.covariances, self._arrays(numbers), self.config.pairwise, against_chain=False
         )
 
     def _kernel(self) -> Robust:
