@@ -17,8 +17,8 @@ from graphslam.core.errors import DataError, GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import LIMIT, UNKNOWN
-from graphslam.maps.fuse_kernels import find_bricks
+from graphslam.evidence.layout import UNKNOWN
+from graphslam.maps.added_kernels import subtract_bricks
 
 COPIED = 0.9
 """A segment began with a copy of a map if it knows this share of what that map knows: 0.994 of a copy whose pose is
@@ -47,7 +47,7 @@ class Added:
     shared: int
 
 
-def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None) -> Added:
+def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None, *, slack: int = 0) -> Added:
     """The log-odds of ``grid`` less those of ``earlier``; voxels that did not change are unknown.
 
     What came in while a voxel was saturated cannot be seen in the difference, and is lost: the earlier map has it.
@@ -58,6 +58,9 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None)
         Of one voxel size and dimension.
     T_grid_earlier : (7,) or (3,), optional
         As it was when the copy was put on the grid's lattice; default the identity.
+    slack : {0, 1}
+        1: a voxel did not change if one beside it has its value in the earlier map. For maps that were put on lattices
+        of their own, each, from a third one: rounding twice is not rounding once.
 
     Raises
     ------
@@ -69,23 +72,23 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None)
             got=f"{earlier.voxel_size} m, {earlier.dim}-D",
             wanted=f"{grid.voxel_size} m, {grid.dim}-D",
         )
+    if slack not in (0, 1):
+        raise GridError("impossible slack of a difference of maps", got=slack, wanted="0 or 1 voxels")
     before = EvidenceGrid(grid.voxel_size, model=earlier.model, dim=grid.dim, pool=grid.pool)
     before.merge(earlier, T_grid_earlier)
     pool = grid.pool
+    counts = np.zeros(3, np.int64)
     with pool.lock:
         rows = grid.packed_bricks()
         keys, new = np.ascontiguousarray(rows[:, 0]), pool.bricks[rows[:, 1]]
-        ids = np.empty(len(keys), np.int64)
-        find_bricks(before.root, keys, pool.levels, pool.children, ids)
-        old = pool.bricks[ids]
-    both = (new != UNKNOWN) & (old != UNKNOWN)
-    same = both & (new == old)
-    difference = np.clip(new.astype(np.int32) - np.where(both, old, 0), -LIMIT, LIMIT)
-    difference[(new == UNKNOWN) | same] = UNKNOWN
+        difference = np.empty_like(new)
+        subtract_bricks(
+            keys, new, before.root, pool.levels, pool.children, pool.bricks, slack, grid.dim == 2, difference, counts
+        )
     some = (difference != UNKNOWN).any(axis=1)
     out = grid.empty()
-    out.write_packed(keys[some], difference[some].astype(np.int16))
-    return Added(out, int(np.sum(difference != UNKNOWN)), int(same.sum()), int(both.sum()))
+    out.write_packed(keys[some], difference[some])
+    return Added(out, *counts.tolist())
 
 
 def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Mapping[int, int]]:

@@ -65,9 +65,9 @@ class Scene(NamedTuple):
     config: SegSlamFrontEndConfig
 
 
-def scene(name: str) -> Scene:
-    """A scene by name; every beam is kept."""
-    if name.startswith("lidar3d"):
+def scene(name: str, points: int = ALL_POINTS) -> Scene:
+    """A scene by name, with so many beams of a step at most."""
+    if name not in ("court", "garage", "garage-full"):
         log = load(name)
         config: Any = cfg.build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
         config = dataclasses.replace(config, filter=dataclasses.replace(config.filter, map_beams=0))
@@ -78,7 +78,7 @@ def scene(name: str) -> Scene:
         config = SegSlamFrontEndConfig(
             steps=StepConfig(max_range=reach, level_floors=True), filter=GridFilterConfig(walk_scale=0.5)
         )
-    steps = dataclasses.replace(config.steps, most_points=ALL_POINTS)
+    steps = dataclasses.replace(config.steps, most_points=points)
     return Scene(name, log, dataclasses.replace(config, steps=steps))
 
 

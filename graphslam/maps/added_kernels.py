@@ -1,0 +1,55 @@
+"""Compiled comparison of a map with one that it may have begun as a copy of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.evidence.kernels import kernel
+from graphslam.evidence.tree_kernels import find_node
+
+
+@kernel()
+def subtract_bricks(keys, new, root, levels, children, bricks, slack, flat, out, counts):
+    """``out (n, 512)``: ``new (n, 512)`` less what the tree ``root`` says of the same voxels; unknown where nothing
+    changed.
+
+    Nothing changed where a voxel of the tree within ``slack`` (0 or 1) voxels along each axis, which ``new`` may have
+    its value from, has the very value. Adds to ``counts (3,)``: voxels with a difference, unchanged ones, and those
+    that both know.
+    """
+    near = np.zeros((3, 3, 3), np.int64)
+    edge = 1 << (2 * levels)
+    up = 0 if flat else slack
+    for k in range(keys.shape[0]):
+        key = keys[k]
+        bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
+        for c in range(-up, up + 1):
+            for d in range(-slack, slack + 1):
+                for e in range(-slack, slack + 1):
+                    x, y, z = bx + e, by + d, bz + c
+                    near[c + 1, d + 1, e + 1] = 0
+                    if root == 0 or not (0 <= x < edge and 0 <= y < edge and 0 <= z < edge):
+                        continue
+                    parent = find_node(root, x, y, z, levels, children)
+                    if parent != 0:
+                        near[c + 1, d + 1, e + 1] = children[parent, ((z & 3) << 4) | ((y & 3) << 2) | (x & 3)]
+        for v in range(512):
+            value = new[k, v]
+            out[k, v] = -32768
+            if value == -32768:
+                continue
+            old = bricks[near[1, 1, 1], v]
+            counts[2] += old != -32768
+            x, y, z = v & 7, (v >> 3) & 7, v >> 6
+            same = False
+            for c in range(z - up, z + up + 1):
+                for d in range(y - slack, y + slack + 1):
+                    for e in range(x - slack, x + slack + 1):
+                        b = near[(c >> 3) + 1, (d >> 3) + 1, (e >> 3) + 1]
+                        same = same or bricks[b, ((c & 7) << 6) | ((d & 7) << 3) | (e & 7)] == value
+            if same:
+                counts[1] += 1
+                continue
+            counts[0] += 1
+            difference = np.int64(value) - (np.int64(old) if old != -32768 else np.int64(0))
+            out[k, v] = min(max(difference, -32767), 32767)
