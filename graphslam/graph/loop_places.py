@@ -18,6 +18,7 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
+from graphslam.graph.inner_nodes import inner_rows
 
 Ints = npt.NDArray[np.int64]
 
@@ -104,9 +105,7 @@ def places_of(submaps: Sequence[Submap], spacing: float = 3.0) -> Places:
             raise DataError(f"submap {s.key} has no path to put places on", wanted="a trajectory")
         path = s.trajectory
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
-        count = max(round(along[-1] / spacing), 1)
-        goals = along[-1] * np.arange(count) / count
-        rows = np.unique(np.clip(np.searchsorted(along, goals), 0, len(path) - 1))
+        rows = np.concatenate([[0], inner_rows(path, spacing)])
         T = path.poses[rows].copy()
         T[0] = group_of(T).identity  # the base itself
         submap += [k] * len(rows)
