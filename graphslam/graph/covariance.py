@@ -118,6 +118,20 @@ class JointCovariance:
         blocks = self._diagonal_blocks(0, self.layout.landmark_start, d)
         return np.concatenate([np.zeros((1, d, d)), blocks])
 
+    def cross(self, first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
+        """Cross-covariances ``(k, d, d)`` of pairs of nodes ``(k,)``; zeros where one is the fixed first base."""
+        i, j = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
+        d = self.layout.pose_dof
+        out = np.zeros((len(i), d, d))
+        free = np.flatnonzero((i > 0) & (j > 0))
+        step = 60 // d  # pairs whose columns are solved together
+        for c in range(0, len(free), step):
+            k = free[c : c + step]
+            nodes, at = np.unique(np.concatenate([i[k], j[k]]), return_inverse=True)
+            B = self.columns(self.layout.pose_columns(nodes).ravel()).reshape(len(nodes), d, len(nodes), d)
+            out[k] = B[at[: len(k)], :, at[len(k) :], :]
+        return out
+
     def landmarks(self) -> Array:
         """Marginal of every landmark ``(n, dim, dim)``."""
         return self._diagonal_blocks(self.layout.landmark_start, self.layout.datum_start, self.layout.dim)

@@ -140,7 +140,7 @@ class PoseGraph(AttitudeVerbs):
         self._start_landmarks(ids, se2_transform(self.values.poses[-1], lm.positions))
         record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
         ends = np.stack([np.zeros(3), submap.exit_pose])
-        self._append(submap, [record], np.array(submap.interval), ends)
+        self._append(submap, [record], np.array(submap.interval), ends, np.zeros((0, 3, 3)))
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self._tie_fixes(self.submaps[-1])
         return fid
@@ -165,7 +165,7 @@ class PoseGraph(AttitudeVerbs):
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         # from here on nothing fails
-        self._append(submap, records, cut.times, cut.T_base_node)
+        self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances)
         if level_sigma is not None:
             self._level_ends(level_sigma)
         self._event(
@@ -183,7 +183,9 @@ class PoseGraph(AttitudeVerbs):
         fid = self._level(s.exit_node, sigma, s.interval[1])
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
 
-    def _append(self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array) -> None:
+    def _append(
+        self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, covariances: Array
+    ) -> None:
         """New nodes after the last one, the submap's entry, and its factors."""
         node, group, base = len(self.values.poses) - 1, self.values.group, self.values.poses[-1]
         new = group.compose(np.broadcast_to(base, T_base_node[1:].shape), T_base_node[1:])
@@ -191,7 +193,18 @@ class PoseGraph(AttitudeVerbs):
         ids = tuple(r.factor_id for r in records)
         nodes = tuple(range(node, node + len(T_base_node)))
         self.submaps.append(
-            SubmapNode(submap.key, node, submap.interval, submap.trajectory, ids[0], nodes, times, T_base_node, ids)
+            SubmapNode(
+                submap.key,
+                node,
+                submap.interval,
+                submap.trajectory,
+                ids[0],
+                nodes,
+                times,
+                T_base_node,
+                ids,
+                covariances,
+            )
         )
         for record in records:
             self._insert(record)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
 from graphslam.core.trajectory import Trajectory
@@ -20,6 +21,29 @@ from graphslam.core.trajectory import Trajectory
 # What two marginals of a path leave of the error between them is made positive semi-definite; directions below this
 # share of the path's own variance are rounding.
 _FLOOR = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bridge:
+    """Instants of a path between two nodes a and b, given both.
+
+    Inside a stretch the error walks from a to b. If the increment a → b has the covariance S, of which Q had been
+    collected at the instant, the walk that ends with the residual e at b is on the average at ``K e``,
+    ``K = Q Aᵀ S⁻¹`` (A carries an error of the instant on to b), and about that it keeps ``Q - K A Q``.
+
+    Parameters
+    ----------
+    T_node_body : (q, 3|7)
+        From node a.
+    gain : (q, d, d)
+        K.
+    left : (q, d, d)
+        ``Q - K A Q``.
+    """
+
+    T_node_body: Array
+    gain: Array
+    left: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +66,8 @@ class SubmapNode:
         When the body was there [s].
     T_base_node : (k + 2, 3|7)
         Identity, poses of the path, exit.
+    covariances : (k + 1, d, d)
+        Of the increments from node to node as they stand in the graph, right tangent at the later one.
     factor_ids : tuple of int
         The chain from node to node, and what came with it (the attitude of a levelled exit).
     """
@@ -55,6 +81,7 @@ class SubmapNode:
     times: Array = field(default_factory=lambda: np.zeros(0))
     T_base_node: Array = field(default_factory=lambda: np.zeros((0, 3)))
     factor_ids: tuple[int, ...] = ()
+    covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
     @property
     def exit_node(self) -> int:
@@ -108,6 +135,31 @@ class SubmapNode:
         path = self.trajectory
         P = None if path.covariances is None else path.covariances[rows]
         return self._seen(path.times[rows], path.poses[rows], P, at)
+
+    def between(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> Bridge:
+        """The path's own instants ``rows`` between the nodes ``at`` and the next ones: what each of the two says.
+
+        Raises
+        ------
+        DataError
+            The path has no covariances.
+        """
+        T, Q = self.local_rows(rows, at)
+        if self.trajectory is None or Q is None:
+            raise DataError(f"path of submap {self.key} has no covariances", wanted="covariances")
+        group = group_of(T)
+        ahead = group.between(self.trajectory.poses[rows], self.T_base_node[at + 1])
+        A = group.adjoint(group.inverse(ahead))  # an error of the body, carried on to the next node
+        L = np.linalg.cholesky(self.covariances)[at]
+        B = np.linalg.solve(L, A)
+        M = B @ Q @ np.swapaxes(B, 1, 2)
+        w, V = np.linalg.eigh(0.5 * (M + np.swapaxes(M, 1, 2)))
+        w = np.clip(w, 0.0, 1.0)[:, None, :]  # marginals may claim more than the whole increment has
+        Vt = np.swapaxes(V, 1, 2)
+        back = np.linalg.solve(B, np.broadcast_to(np.eye(group.dof), B.shape))
+        gain = back @ ((V * w) @ Vt) @ np.linalg.inv(L)
+        left = back @ ((V * (w * (1.0 - w))) @ Vt) @ np.swapaxes(back, 1, 2)
+        return Bridge(T, gain, left)
 
     def _seen(self, t: Array, T: Array, P: Array | None, at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
         assert self.trajectory is not None

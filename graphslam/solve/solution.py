@@ -157,11 +157,13 @@ class Solution:
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
         """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory of its own.
 
-        ``x_k`` is the submap's base, or the last of its inner nodes before t: the path bends with them. Covariances
-        are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the node and the local path taken as independent,
-        ``P_local`` being what the path has lost since the node. What the next node knows better is left aside, so
-        between nodes they are an upper bound. Where two submaps share an instant the later one has it: a fresh base
+        ``x_k`` is the submap's base. Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the base
+        and the local path taken as independent. Where two submaps share an instant the later one has it: a fresh base
         is surer than a long arm.
+
+        A submap with inner nodes is bent by them: between two nodes the path is what both say of it together
+        (:class:`~graphslam.graph.submap_node.Bridge`), so it runs through them without a jump, and its covariance is
+        that of the two nodes jointly and of the way between them.
 
         Parameters
         ----------
@@ -187,11 +189,16 @@ class Solution:
             keep = path.times < last
             if not np.any(keep):
                 continue
+            last = float(path.times[keep][0])
+            times.append(path.times[keep])
+            if s.inner and path.covariances is not None:
+                T, P = self._bent(s, keep, P_nodes)
+                poses.append(T)
+                covs.append(P)
+                continue
             at = s.before(path.times[keep])
             node = np.array(s.nodes)[at]
             T, P_local = s.local_rows(keep, at)
-            last = float(path.times[keep][0])
-            times.append(path.times[keep])
             poses.append(group.compose(self.values.poses[node], T))
             if P_nodes is not None:
                 ad = group.adjoint(group.inverse(T))
@@ -200,8 +207,29 @@ class Solution:
         return Trajectory(
             np.concatenate(times[::-1]),
             np.concatenate(poses[::-1]),
-            np.concatenate(covs[::-1]) if covs else None,
+            np.concatenate(covs[::-1]) if covariances else None,
         )
+
+    def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
+        """Poses and covariances of a path between the nodes of its submap, given both neighbours of each instant."""
+        assert s.trajectory is not None
+        x, group = self.values.poses, group_of(self.values.poses)
+        at, nodes = s.before(s.trajectory.times[rows]), np.array(s.nodes)
+        b = s.between(rows, at)
+        T_ab = group.between(s.T_base_node[:-1], s.T_base_node[1:])
+        e = group.log(group.between(T_ab, group.between(x[nodes[:-1]], x[nodes[1:]])))[at]
+        own = group.compose(b.T_node_body, group.exp((b.gain @ e[..., None])[..., 0]))
+        poses = group.compose(x[nodes[at]], own)
+        if P_nodes is None:
+            return poses, np.zeros((0, group.dof, group.dof))
+        P = P_nodes[nodes]
+        P_ab = self.covariance.cross(nodes[:-1], nodes[1:])[at]
+        # δ_t = F δ_a + K δ_b + w, F = Ad(T_at⁻¹) - K Ad(T_ab⁻¹)
+        F = group.adjoint(group.inverse(b.T_node_body)) - b.gain @ group.adjoint(group.inverse(T_ab))[at]
+        Ft, Kt = np.swapaxes(F, 1, 2), np.swapaxes(b.gain, 1, 2)
+        mixed = F @ P_ab @ Kt
+        C = F @ P[at] @ Ft + b.gain @ P[at + 1] @ Kt + mixed + np.swapaxes(mixed, 1, 2) + b.left
+        return poses, 0.5 * (C + np.swapaxes(C, 1, 2))
 
     def _repr_html_(self) -> str:
         verdict = "at the optimum" if self.converged else f"not at its optimum (may still fall by {self.decrement:.3g})"

@@ -11,6 +11,7 @@ from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import LandmarkMap, Match, Submap
+from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_factors import gtsam_factor
@@ -212,6 +213,19 @@ def test_marginals_are_gtsams_and_those_of_a_monte_carlo(rng):
         d2.append(float(e.ravel() @ np.linalg.solve(P, e.ravel())))
     low, high = chi2_mean_bounds(24, runs, 0.99)
     assert low < np.mean(d2) < high
+
+
+def test_cross_covariances_dense_and_sparse(rng):
+    chain = dense_chain(rng, m=14, steps=6)
+    g = loop_graph(chain, rng)
+    full = g.covariance().full()
+    i, j = np.array([0, 1, 5, 13, 2]), np.array([1, 2, 6, 14, 9])
+    for dense in (True, False):
+        P = JointCovariance(g.flat().layout, g.flat().evaluate(g.values, dense=dense).A).cross(i, j)
+        np.testing.assert_array_equal(P[0], 0.0)
+        for k in range(1, 5):
+            block = full[np.ix_(g.flat().layout.columns(f"x{i[k]}"), g.flat().layout.columns(f"x{j[k]}"))]
+            np.testing.assert_allclose(P[k], block, rtol=1e-6, atol=1e-12)
 
 
 def test_match_joins_the_bases(rng):
