@@ -59,8 +59,8 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
     T_grid_earlier : (7,) or (3,), optional
         As it was when the copy was put on the grid's lattice; default the identity.
     slack : {0, 1}
-        1: a voxel did not change if one beside it has its value in the earlier map. For maps that were put on lattices
-        of their own, each, from a third one: rounding twice is not rounding once.
+        1: a voxel that both know did not change if one beside it has its value in the earlier map. For maps that were
+        put on lattices of their own, each, from a third one: rounding twice is not rounding once.
 
     Raises
     ------
@@ -94,12 +94,14 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
 def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Mapping[int, int]]:
     """The grid of each submap without what it took over from an older one that it entered.
 
-    Of the matches of a submap that was entered by one, that is taken whose map it holds a copy of (`COPIED`).
+    Of the matches of a submap that was entered by one, that is taken whose map it holds a copy of (`COPIED`); a submap
+    that goes on in the map of the one before holds a copy of that. Where the run that made them is at hand,
+    :func:`graphslam.maps.segslam_evidence.own_evidence_of` is exact.
 
     Parameters
     ----------
     submaps : sequence of Submap
-        With evidence grids.
+        A chain, with evidence grids.
 
     Returns
     -------
@@ -112,21 +114,37 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     DataError
         A submap without an evidence grid.
     """
-    whole: dict[int, EvidenceGrid] = {}
-    for s in submaps:
-        if not isinstance(s.grid, EvidenceGrid):
-            raise DataError(f"submap {s.key} has no evidence grid", got=type(s.grid).__name__, wanted="EvidenceGrid")
-        whole[s.key] = s.grid
+    whole = {s.key: grid_of(s) for s in submaps}
     grids, entered = dict(whole), {}
+    before: Submap | None = None
     for s in submaps:
         group = SE3 if s.dim == 3 else SE2
+        kind = s.report.get("entered", "match")
+        older = [(m.target, m.T_target_here) for m in s.matches] if kind == "match" else []
+        if kind == "same" and before is not None:
+            older = [(before.key, before.exit_pose)]
         best = COPIED
-        for match in s.matches if s.report.get("entered", "match") == "match" else ():
-            earlier = whole.get(match.target)
-            if earlier is None:
+        for target, T_target_here in older:
+            if target not in whole or target == s.key:
                 continue
-            found = added(whole[s.key], earlier, group.inverse(match.T_target_here))
-            share = found.shared / max(earlier.voxel_counts().known, 1)
+            # each was put on the lattice of its own base
+            found = added(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
+            share = found.shared / max(whole[target].voxel_counts().known, 1)
             if share >= best:
-                best, grids[s.key], entered[s.key] = share, found.grid, match.target
+                best, grids[s.key], entered[s.key] = share, found.grid, target
+        before = s
     return grids, entered
+
+
+def grid_of(submap: Submap) -> EvidenceGrid:
+    """The evidence grid of a submap.
+
+    Raises
+    ------
+    DataError
+        It has none.
+    """
+    grid = submap.grid
+    if not isinstance(grid, EvidenceGrid):
+        raise DataError(f"submap {submap.key} has no evidence grid", got=type(grid).__name__, wanted="EvidenceGrid")
+    return grid

@@ -13,9 +13,9 @@ def subtract_bricks(keys, new, root, levels, children, bricks, slack, flat, out,
     """``out (n, 512)``: ``new (n, 512)`` less what the tree ``root`` says of the same voxels; unknown where nothing
     changed.
 
-    Nothing changed where a voxel of the tree within ``slack`` (0 or 1) voxels along each axis, which ``new`` may have
-    its value from, has the very value. Adds to ``counts (3,)``: voxels with a difference, unchanged ones, and those
-    that both know.
+    Nothing changed where the tree has the very value, or knows the voxel and has the value within ``slack`` (0 or 1)
+    voxels of it along each axis: ``new`` may have it from there. Adds to ``counts (3,)``: voxels with a difference,
+    unchanged ones, and those that both know.
     """
     near = np.zeros((3, 3, 3), np.int64)
     edge = 1 << (2 * levels)
@@ -41,8 +41,9 @@ def subtract_bricks(keys, new, root, levels, children, bricks, slack, flat, out,
             old = bricks[near[1, 1, 1], v]
             counts[2] += old != -32768
             x, y, z = v & 7, (v >> 3) & 7, v >> 6
-            same = False
-            for c in range(z - up, z + up + 1):
+            same = old == value
+            beside = slack > 0 and old != -32768 and not same
+            for c in range(z - up, z + up + 1 if beside else z - up):
                 for d in range(y - slack, y + slack + 1):
                     for e in range(x - slack, x + slack + 1):
                         b = near[(c >> 3) + 1, (d >> 3) + 1, (e >> 3) + 1]
@@ -50,6 +51,6 @@ def subtract_bricks(keys, new, root, levels, children, bricks, slack, flat, out,
             if same:
                 counts[1] += 1
                 continue
-            counts[0] += 1
             difference = np.int64(value) - (np.int64(old) if old != -32768 else np.int64(0))
+            counts[0] += 1
             out[k, v] = min(max(difference, -32767), 32767)

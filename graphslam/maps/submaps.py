@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, level
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.added import own_evidence
 from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
 
@@ -72,6 +73,7 @@ def divide_submaps(
     every: float | None = 3.0,
     config: DivisionConfig | None = None,
     own: bool = True,
+    grids: Mapping[int, EvidenceGrid] | None = None,
     level_nodes: bool = True,
 ) -> DividedSubmaps:
     """Pieces of a chain of submaps with evidence grids, and where the chain has them.
@@ -86,6 +88,8 @@ def divide_submaps(
         Give its ``reach``: the sensor's.
     own : bool
         Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.added`).
+    grids : mapping of key to EvidenceGrid, optional
+        What each submap saw itself, where that is known exactly (:mod:`graphslam.maps.segslam_evidence`).
     level_nodes : bool
         Nodes have the body's position and heading and stand level (3-D): otherwise what one instant says wrong of roll
         and pitch tilts a piece whose far end may be 25 m off.
@@ -97,9 +101,10 @@ def divide_submaps(
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
-    if own:
+    if grids is None and own:
         grids, _ = own_evidence(submaps)
-        submaps = [replace(s, grid=grids[s.key]) for s in submaps]
+    if grids is not None:
+        submaps = [replace(s, grid=grids.get(s.key)) for s in submaps]
     group = SE3 if submaps[0].dim == 3 else SE2
     out = DividedSubmaps({}, {}, {}, {}, level_nodes)
     base = group.identity

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -48,6 +50,24 @@ def test_what_came_in_since_is_what_was_scanned(dim: int, rng: np.random.Generat
     assert added(old, old.copy()).known == 0
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_value_from_beside_is_no_change_where_maps_were_rounded_twice(dim: int, rng: np.random.Generator) -> None:
+    old, new = scanned(rng, dim), scanned(rng, dim)
+    got = added(new, old, slack=1)
+    before, up = voxels_of_grid(old), 1 if dim == 3 else 0
+    wanted = {}
+    for (x, y, z), value in voxels_of_grid(new).items():
+        beside = itertools.product(range(x - 1, x + 2), range(y - 1, y + 2), range(z - up, z + up + 1))
+        if (x, y, z) in before and value in {before.get(v) for v in beside}:
+            continue
+        wanted[x, y, z] = value - before.get((x, y, z), 0)
+    assert voxels_of_grid(got.grid) == wanted
+    assert got.known < added(new, old).known
+    assert added(old, old.copy(), slack=1).known == 0
+    with pytest.raises(GridError):
+        added(new, old, slack=2)
+
+
 def resampled(grid: EvidenceGrid, T: np.ndarray) -> EvidenceGrid:
     """A map in the frame of another base, as front ends hand it over."""
     moved = grid.empty()
@@ -79,7 +99,13 @@ def test_submaps_lose_what_they_took_over(dim: int, rng: np.random.Generator) ->
     assert entered == {2: 0}
     assert grids[0] is first
     assert grids[2].voxel_counts().known < here.voxel_counts().known
-    assert voxels_of_grid(grids[2]) == voxels_of_grid(added(here, first, group.inverse(T)).grid)
+    assert voxels_of_grid(grids[2]) == voxels_of_grid(added(here, first, group.inverse(T), slack=1).grid)
+    # one that goes on in the map of the one before
+    further = [submap(0, first), submap(1, resampled(copy, group.inverse(group.identity)), (), "same")]
+    grids, entered = own_evidence(further)
+    assert entered == {1: 0}
+    assert grids[1].voxel_counts().known < copy.voxel_counts().known
+    assert own_evidence([further[1]])[1] == {}
     # no match, or a map that is no copy of it: all is its own
     assert own_evidence([chain[0], submap(2, here, matches, "new")])[1] == {}
     assert own_evidence([chain[0], submap(2, second, (match(0, T),), "match")])[1] == {}

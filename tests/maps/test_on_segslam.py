@@ -7,12 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from frontends.segslam.front_end import settled
+from frontends.segslam.result import SegSlamResult
+from frontends.segslam.segslam import run_segslam
+from frontends.segslam.submaps import settled_chain
 from frontends.steps import Steps, make_steps
 from graphslam.core.errors import DataError
+from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.added import own_evidence
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
+from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
 from tests.benchmarks.bench_maps import insert, scene, submaps_of
 from tests.reference.small_maps import same_map
@@ -75,3 +82,41 @@ def test_submaps_that_cannot_be_divided_are_refused(run: tuple[Steps, list[Subma
         divide_submaps([replace(submaps[0], trajectory=None)])
     with pytest.raises(DataError, match="no evidence grid"):
         divide_submaps([replace(submaps[0], grid=None)])
+
+
+@pytest.fixture(scope="module")
+def reentered() -> tuple[SegSlamResult, list[Submap]]:
+    """A run that enters an older map, by more than one particle."""
+    s = scene("court")
+    steps = make_steps(s.log, s.config.steps)
+    result = run_segslam(steps, replace(s.config.filter, particles=5), s.config.segslam, SeedTree(0))
+    return result, settled(result, s.config.drift, s.config.segslam)
+
+
+def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegSlamResult, list[Submap]]) -> None:
+    result, submaps = reentered
+    chain = settled_chain(result.segmap, int(result.closed[result.best]))
+    exact = own_evidence_of(result.segmap, chain, submaps)
+    entered = [m for m in submaps if m.report["entered"] != "new"]
+    assert entered
+    told, _ = own_evidence(submaps)
+    for m in submaps:
+        whole, own = m.grid.voxel_counts().known, exact[m.key].voxel_counts().known  # type: ignore[union-attr]
+        if m in entered:
+            assert own < 0.8 * whole
+            # what can be told without the run is about as much
+            assert told[m.key].voxel_counts().known == pytest.approx(own, rel=0.25)
+        else:
+            assert exact[m.key] is m.grid
+    # along the path of the map sample, the map is nearer to that of the scans than with everything twice
+    path = result.trajectory()
+    poses = path.interpolate(np.clip(result.steps.times, path.times[0], path.times[-1]))
+    scans = insert(result.steps, poses, 0.2, submaps[0].grid.model)  # type: ignore[union-attr]
+    off = []
+    for grids in (None, told, exact):
+        divided = divide_submaps(submaps, own=False, grids=grids, config=DivisionConfig(reach=9.0))
+        off.append(abs(fuse(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
+    assert off[2] < off[0]
+    assert max(off) < 0.05 * scans.entropy()
+    with pytest.raises(DataError):
+        own_evidence_of(result.segmap, chain[:1], submaps)
