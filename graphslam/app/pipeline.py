@@ -34,6 +34,7 @@ from graphslam.app.metrics import (
 )
 from graphslam.app.metrics_space import truth_metrics_in_space
 from graphslam.app.outputs import write_outputs
+from graphslam.app.plan_view import plan_path
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.threads import one_blas_thread
@@ -41,7 +42,7 @@ from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of
+from graphslam.core.poses import SE3, group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Submap
@@ -245,7 +246,7 @@ def _judge(
     scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
     time_metrics(out, seconds, log.duration, scans, work.per_scan)
     residuals = {}
-    reckoned = dead_reckoning(log, global_map.trajectory.times)
+    reckoned = dead_reckoning(log, global_map.trajectory)
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
@@ -315,22 +316,41 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
     )
 
 
-def dead_reckoning(log: SensorLog, times: np.ndarray) -> Trajectory | None:
-    """Path from the log's motion stream alone, in the frame of the first base; None without one."""
+def dead_reckoning(log: SensorLog, path: Trajectory) -> Trajectory | None:
+    """Path from the log's motion stream alone, in the frame of the first base; None without one.
+
+    Parameters
+    ----------
+    path : Trajectory
+        The solved path: its times, its dimension, and in space its first pose, since a base need not be the body.
+    """
     try:
         stream = motion.motion_stream(log)[1]
     except MissingDataError:
         return None
     last = stream.times[-1] if isinstance(stream, Odometry) else np.inf  # the last control is held
-    times = times[(times >= stream.times[0]) & (times <= last)]
+    times = path.times[(path.times >= stream.times[0]) & (path.times <= last)]
     if len(times) < 2:
         return None
+    if isinstance(stream, Odometry) and stream.increments.shape[1] == 7:
+        return _reckoned_in_space(stream, times, path)
     steps = motion.dead_reckoning(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[0].increments
     group = group_of(steps)
     poses = np.tile(group.identity, (len(steps), 1))
     for k in range(1, len(steps)):
         poses[k] = group.compose(poses[k - 1], steps[k])
     return Trajectory(times, poses)
+
+
+def _reckoned_in_space(odometry: Odometry, times: Array, path: Trajectory) -> Trajectory:
+    poses = np.tile(SE3.identity, (len(odometry.times), 1))
+    for k in range(1, len(poses)):
+        poses[k] = SE3.compose(poses[k - 1], odometry.increments[k])
+    at = Trajectory(odometry.times, poses).interpolate(times)
+    if path.dim == 2:
+        return plan_path(Trajectory(times, SE3.between(np.broadcast_to(at[0], at.shape), at)))
+    start = SE3.compose(path.interpolate(times[:1])[0], SE3.inverse(at[0]))
+    return Trajectory(times, SE3.compose(np.broadcast_to(start, at.shape), at))
 
 
 def versions() -> dict[str, str]:

@@ -140,7 +140,7 @@ class PoseGraph(AttitudeVerbs):
         self._start_landmarks(ids, se2_transform(self.values.poses[-1], lm.positions))
         record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
         ends = np.stack([np.zeros(3), submap.exit_pose])
-        self._append(submap, [record], np.array(submap.interval), ends, np.zeros((0, 3, 3)))
+        self._append(submap, [record], np.array(submap.interval), ends)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self._tie_fixes(self.submaps[-1])
         return fid
@@ -149,6 +149,7 @@ class PoseGraph(AttitudeVerbs):
         self, submap: Submap, covariance_scale: float, spacing: float | None, level_sigma: float | None
     ) -> int:
         cut = cut_submap(submap, spacing)
+        stated = covariance_scale * cut.covariances
         if level_sigma is not None:
             cut.covariances[-1] = without_tilt(cut.covariances[-1])  # the path inside stands by its own attitude
         d, node, fid = self.values.group.dof, len(self.values.poses) - 1, self._next_factor
@@ -165,7 +166,7 @@ class PoseGraph(AttitudeVerbs):
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         # from here on nothing fails
-        self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances)
+        self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances, stated)
         if level_sigma is not None:
             self._level_ends(level_sigma)
         self._event(
@@ -184,7 +185,7 @@ class PoseGraph(AttitudeVerbs):
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
 
     def _append(
-        self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, covariances: Array
+        self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, *covariances: Array
     ) -> None:
         """New nodes after the last one, the submap's entry, and its factors."""
         node, group, base = len(self.values.poses) - 1, self.values.group, self.values.poses[-1]
@@ -203,7 +204,7 @@ class PoseGraph(AttitudeVerbs):
                 times,
                 T_base_node,
                 ids,
-                covariances,
+                *covariances,
             )
         )
         for record in records:

@@ -68,6 +68,9 @@ class SubmapNode:
         Identity, poses of the path, exit.
     covariances : (k + 1, d, d)
         Of the increments from node to node as they stand in the graph, right tangent at the later one.
+    stated : (k + 1, d, d)
+        The same as the submap stated them, before a levelled exit gave up its relative roll and pitch: what a chain of
+        relative poses by itself is worth, for instance in cycles of loops and chain.
     factor_ids : tuple of int
         The chain from node to node, and what came with it (the attitude of a levelled exit).
     """
@@ -82,6 +85,7 @@ class SubmapNode:
     T_base_node: Array = field(default_factory=lambda: np.zeros((0, 3)))
     factor_ids: tuple[int, ...] = ()
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
     @property
     def exit_node(self) -> int:

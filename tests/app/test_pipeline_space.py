@@ -16,7 +16,7 @@ from graphslam.app.plan_view import plan_covariance, plan_pose
 from graphslam.core.geometry import se2_between, se2_log
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.poses import SE2, SE3
-from graphslam.core.records import Gps
+from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.gps_family import level_datum_pose
@@ -65,7 +65,11 @@ def ring(dim: int, seed: int = 4) -> tuple[SensorLog, Ring]:
     gps = Gps(times=times[::3], positions=z, sigma=np.full(len(z), 0.3), lever=np.zeros(dim))
     path = Trajectory(times, poses)
     landmarks = {"landmark_ids": np.zeros(0, dtype=np.int64), "landmarks": np.zeros((0, dim))}
-    log = SensorLog(name="ring", streams={"gps": gps}, truth=Truth(path, **landmarks))
+    steps = np.concatenate([group.identity[None], group.between(poses[:-1], poses[1:])])
+    odometry = Odometry(
+        times=times, increments=steps, covariances=np.tile(1e-4 * np.eye(group.dof), (len(steps), 1, 1))
+    )
+    log = SensorLog(name="ring", streams={"gps": gps, "odometry": odometry}, truth=Truth(path, **landmarks))
     return log, Ring(tuple(made))
 
 
@@ -103,6 +107,9 @@ def test_folder_is_complete_and_comes_back(dim, tmp_path, monkeypatch):
     np.testing.assert_array_equal(back.map.base_poses, r.map.base_poses)
     np.testing.assert_array_equal(back.map.trajectory.covariances, r.map.trajectory.covariances)
     assert back.truth_path.dim == dim
+    # the odometry of this log is exact, so the reckoned path is the true one
+    np.testing.assert_allclose(r.dead_reckoning.positions, r.truth_path.positions, atol=1e-6)
+    assert back.dead_reckoning.dim == dim
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -152,6 +159,7 @@ def test_a_flat_front_end_takes_the_level_part_of_fixes_in_space(monkeypatch):
     monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
     r = pipeline.run(flat, frontend="ring", config={"gps": {"use": "all"}}, progress=False)
     assert r.graph.dim == 2
+    assert r.dead_reckoning.dim == 2
     assert r.graph.objective()["gps"].factors > 50
 
 

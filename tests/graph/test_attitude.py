@@ -129,6 +129,8 @@ def test_what_the_exit_says_of_all_else_is_kept(rng, spacing):
         level.covariance().marginal(name)[2:, 2:], g.covariance().marginal(name)[2:, 2:], rtol=1e-4, atol=1e-9
     )
     s = level.submaps[0]
+    np.testing.assert_allclose(s.stated, g.submaps[0].covariances, rtol=1e-12)
+    assert s.covariances[-1][0, 0] > 1.0 > s.stated[-1][0, 0]
     assert level.ledger.table().query("kind == 'levelled'")["stream"].tolist() == ["gravity", "gravity"]
     assert level.objective()["levelled"].dof == 2 * 2
     level.remove(s.factor_ids[0])
