@@ -73,6 +73,17 @@ class BackEnd:
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""
         start = time.perf_counter()
+        associated = self.append(submap)
+        self.solver.update()
+        solved = time.perf_counter()
+        self.seconds["associate"] += associated - start
+        self.seconds["solve"] += solved - associated
+        if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
+            self.merge()
+        self.per_submap_s.append(time.perf_counter() - start)
+
+    def append(self, submap: Submap) -> float:
+        """Associate and add without solving; returns the time at which it was associated [s]."""
         if submap.dim != self.graph.dim and not self.graph.submaps:
             self.graph = PoseGraph(submap.dim)
             self.solver = make_solver(self.solver_name, self.graph)
@@ -91,13 +102,7 @@ class BackEnd:
         waiting, self._waiting = self._waiting, []
         for gps, config in waiting:
             self.add_gps(gps, config)
-        self.solver.update()
-        solved = time.perf_counter()
-        self.seconds["associate"] += associated - start
-        self.seconds["solve"] += solved - associated
-        if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
-            self.merge()
-        self.per_submap_s.append(time.perf_counter() - start)
+        return associated
 
     def _add_matches(self, submap: Submap) -> None:
         """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""

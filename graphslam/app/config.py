@@ -78,6 +78,26 @@ class BackEndConfig:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MapConfig:
+    """The fused map at the end of a run whose submaps have evidence grids."""
+
+    fuse: bool = True
+    """Make it."""
+    low: float = 0.3
+    """Floor plans begin this far above the path [m] …"""
+    high: float = 1.8
+    """… and end this far above it."""
+    threads: int = 1
+    """That put pieces where they are; the map is the same with any number."""
+
+    def __post_init__(self) -> None:
+        if not self.high > self.low:
+            raise ConfigError(f"map: floor plans from {self.low} to {self.high} m; wanted low < high")
+        if self.threads < 1:
+            raise ConfigError(f"map.threads = {self.threads}; wanted ≥ 1")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class RunConfig:
     """Everything that steers ``graphslam run`` beside the source and the seed."""
 
@@ -87,6 +107,8 @@ class RunConfig:
     """Association, scale, merging."""
     gps: GpsConfig = dataclasses.field(default_factory=GpsConfig)
     """GPS factors and what is withheld."""
+    map: MapConfig = dataclasses.field(default_factory=MapConfig)
+    """The fused map."""
 
 
 def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:

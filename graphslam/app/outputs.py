@@ -13,6 +13,7 @@ import pandas as pd
 from graphslam.app.figures import save_figures
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
+from graphslam.app.run_maps import draw_run_map, write_run_map
 from graphslam.core.atomic import read_json, read_npz, write_npz
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.geometry import Array
@@ -52,6 +53,9 @@ def write_outputs(folder: RunFolder, run: Run) -> None:
         folder.write_text("ledger.csv", run.ledger.to_csv(index=False))
     folder.write_json("metrics.json", run.metrics.to_dict("records"))
     save_figures(run, folder.figures)
+    if run.fused is not None:
+        write_run_map(folder.path, run.fused)
+        draw_run_map(run.fused, m.trajectory, folder.figures, name=run.name)
     folder.write_json("run.json", run.report)  # last: its presence says that the run is finished
 
 

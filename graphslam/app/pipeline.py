@@ -37,9 +37,10 @@ from graphslam.app.outputs import write_outputs
 from graphslam.app.plan_view import plan_path
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
+from graphslam.app.run_maps import RunMap, has_grids, make_run_map, sensor_reach
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.without_truth import check_without_truth
-from graphslam.core.errors import MissingDataError
+from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import SE3, group_of
@@ -161,6 +162,7 @@ def effective_config(
         "frontend": cfg.as_dict(front_config),
         "backend": cfg.as_dict(settings.backend),
         "gps": cfg.as_dict(settings.gps),
+        "map": cfg.as_dict(settings.map),
     }
 
 
@@ -243,6 +245,11 @@ def _judge(
     out = Metrics()
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))
+    fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
+    if fused is not None:
+        fused.metrics(out)
+        seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
+        seconds["total"] += seconds["map"]
     scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
     time_metrics(out, seconds, log.duration, scans, work.per_scan)
     residuals = {}
@@ -279,6 +286,8 @@ def _judge(
         "objective": solution.objective,
         "converged": solution.converged,
     }
+    if why_not:
+        report["map_left_out"] = why_not
     return Run(
         name=log.name,
         submaps=identified,
@@ -295,7 +304,21 @@ def _judge(
         solution=solution,
         graph=back.graph,
         checks=checks,
+        fused=fused,
     )
+
+
+def _fused_map(
+    submaps: list[Submap], m: GlobalMap, config: cfg.MapConfig, effective: Mapping[str, Any]
+) -> tuple[RunMap | None, str]:
+    """The fused map of submaps with grids; or None, and why where there could have been one."""
+    if not (config.fuse and has_grids(submaps)):
+        return None, ""
+    try:
+        return make_run_map(submaps, m, reach=sensor_reach(effective), config=config), ""
+    except GraphSlamError as error:  # a run that is solved is not thrown away for its map
+        logger.warning("no fused map: %s", error)
+        return None, str(error)
 
 
 def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:

@@ -19,6 +19,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 
 if TYPE_CHECKING:
+    from graphslam.app.run_maps import RunMap
     from graphslam.app.without_truth import WithoutTruth
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.solution import Solution
@@ -102,6 +103,8 @@ class Run:
         The solver's own view; None for a run read back from disk.
     checks : WithoutTruth or None
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
+    fused : RunMap or None
+        Fused evidence grid of submaps that have grids. For a run read back from disk: ``run_maps.map_of_folder``.
     """
 
     name: str
@@ -120,6 +123,7 @@ class Run:
     solution: Solution | None = None
     graph: PoseGraph | None = None
     checks: WithoutTruth | None = None
+    fused: RunMap | None = None
 
     def metric(self, key: str) -> float:
         """Value of one metric.

@@ -1,7 +1,8 @@
 """The folder of a run: complete after a crash up to the last finished submap, resumable from there.
 
 ``config.toml`` (effective), ``run.json``, ``submaps/``, ``graph.g2o``, ``trajectory.tum``, ``nodes.tum``,
-``landmarks.csv``, ``metrics.json``, ``events.jsonl``, ``association.npz``, ``solution.npz``, ``figures/``.
+``landmarks.csv``, ``metrics.json``, ``events.jsonl``, ``association.npz``, ``figures/``; of submaps with evidence grids
+``map.ply``, ``map.bt``, ``map-level0.pgm`` …, ``fused_map.json``.
 """
 
 from __future__ import annotations

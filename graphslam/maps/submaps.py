@@ -75,6 +75,7 @@ def divide_submaps(
     own: bool = True,
     grids: Mapping[int, EvidenceGrid] | None = None,
     level_nodes: bool = True,
+    nodes: Mapping[int, Array] | None = None,
 ) -> DividedSubmaps:
     """Pieces of a chain of submaps with evidence grids, and where the chain has them.
 
@@ -93,6 +94,9 @@ def divide_submaps(
     level_nodes : bool
         Nodes have the body's position and heading and stand level (3-D): otherwise what one instant says wrong of roll
         and pitch tilts a piece whose far end may be 25 m off.
+    nodes : mapping of key to (m,), optional
+        Times of a graph's nodes in each submap [s], in place of ``every``. The first is the base itself, not the body.
+        A submap of one node is one piece.
 
     Raises
     ------
@@ -109,15 +113,22 @@ def divide_submaps(
     out = DividedSubmaps({}, {}, {}, {}, level_nodes)
     base = group.identity
     for s in submaps:
-        if every is None:
+        given = None if nodes is None else np.asarray(nodes[s.key], dtype=np.float64)
+        if (every is None) if given is None else len(given) < 2:
             times, local = np.array([s.interval[0]]), group.identity[None]
             pieces = pieces_of_submap(s)
         else:
             if s.trajectory is None:
                 raise DataError(f"submap {s.key} has no path to divide it along", wanted="a trajectory")
-            times = node_times_every(s.trajectory, every)
+            if given is None:
+                assert every is not None
+                given = node_times_every(s.trajectory, every)
+            # a path may begin a rounding error after its submap
+            times = np.clip(given, s.trajectory.times[0], s.trajectory.times[-1])
             local = s.trajectory.interpolate(times)
             local = level(local) if level_nodes else local
+            if nodes is not None:
+                local[0] = group.identity
             pieces = pieces_of_submap(s, times, T_base_nodes=local, config=config)
         for name, piece in pieces.items():
             k = name[1]  # type: ignore[index]

@@ -1,0 +1,53 @@
+"""``graphslam map``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from graphslam.app.cli_run import JSON
+from graphslam.app.terminal import emit, table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to the command line."""
+    app.command("map")(make_map)
+
+
+def make_map(
+    run: Path = typer.Argument(..., help="Folder of a finished run of a front end with evidence grids."),
+    grid: bool = typer.Option(False, "--grid", help="Write the evidence grid itself too: map.grid.npz."),
+    minimum_entropy: bool = typer.Option(
+        False,
+        "--minimum-entropy",
+        help="Solve the run with other choices of its matches too, and write the clearest map: clearest.*",
+    ),
+    low: float | None = typer.Option(None, help="Floor plans begin this far above the path [m]; default the run's."),
+    high: float | None = typer.Option(None, help="Floor plans end this far above the path [m]; default the run's."),
+    as_json: bool = JSON,
+) -> None:
+    """The fused map of a run, made again from its folder: no scan is read."""
+    from graphslam.app.run_folder import RunFolder
+    from graphslam.app.run_maps import draw_run_map, map_of_folder, with_heights, write_run_map
+
+    result, made = map_of_folder(run, heights=lambda c: with_heights(c, low, high))
+    files = write_run_map(run, made)
+    if grid:
+        made.fused.grid.save(run / "map.grid.npz")
+        files.append(run / "map.grid.npz")
+    figures = draw_run_map(made, result.map.trajectory, RunFolder(run).figures, name=result.name)
+    value: dict[str, Any] = made.facts()
+    rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
+    text = table(rows)
+    if minimum_entropy:
+        from graphslam.app.run_hypotheses import clearest_of_run, write_clearest
+
+        found = clearest_of_run(result, made, progress=not as_json)
+        files += write_clearest(run, found, bands=made.bands)
+        value["candidates"] = found.rows
+        text += "\n\n" + table(found.rows)
+    value |= {"out": str(run), "files": [str(p) for p in files], "figures": [str(p) for p in figures]}
+    text += f"\n\nwritten: {', '.join(p.name for p in files)}; figures: {', '.join(p.name for p in figures)}"
+    emit(value, text, as_json=as_json)

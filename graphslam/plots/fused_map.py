@@ -1,0 +1,163 @@
+"""Fused maps: each storey as a plan with the path on it, and a cut from the side."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import BRICK_EDGE, UNKNOWN
+from graphslam.maps.export import floor_plan
+from graphslam.plots import style
+from graphslam.plots.evidence import plot_section, probability, voxel_bounds
+
+BELOW = 1.5
+"""A path is drawn on a storey's plan from this far below its band [m]."""
+
+
+def plot_storey(
+    grid: EvidenceGrid,
+    low: float,
+    high: float,
+    ax: Axes | None = None,
+    *,
+    path: Trajectory | None = None,
+    title: str | None = None,
+) -> Axes:
+    """What stands in a band of heights: of columns the most occupied voxel; white free, black occupied, grey unknown.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        3-D.
+    low, high : float
+        The band [m].
+    ax : Axes or None
+    path : Trajectory, optional
+        ``T_world_body``; drawn where it is in the band, or less than 1.5 m below.
+    title : str, optional
+
+    Raises
+    ------
+    GridError
+        A 2-D grid, or an empty band.
+    """
+    ax = plot_section(floor_plan(grid, low, high), ax, title=title or f"{low:.1f} to {high:.1f} m")
+    if path is not None:
+        p = path.positions
+        here = (p[:, 2] > low - BELOW) & (p[:, 2] < high)
+        line = np.where(here[:, None], p, np.nan)
+        ax.plot(line[:, 0], line[:, 1], color=style.VERMILION, lw=0.9, label="path")
+        style.legend(ax)
+    return ax
+
+
+def cut_plane(path: Trajectory) -> tuple[int, float]:
+    """Where to cut a map so that most is seen: the horizontal axis across the cut (0 or 1), and where on it [m].
+
+    Along the longer side of the path, through the middle of where it climbs; where it does not, of all of it.
+    """
+    p = path.positions
+    across = 1 if np.ptp(p[:, 0]) >= np.ptp(p[:, 1]) else 0
+    step = np.diff(p, axis=0)
+    climbs = np.abs(step[:, 2]) > 0.05 * np.maximum(np.linalg.norm(step[:, :2], axis=1), 1e-9)
+    rising = np.ptp(p[:, 2]) > 1.5 and climbs.any()
+    return across, float(np.median(p[:-1][climbs, across] if rising else p[:, across]))
+
+
+def slab(grid: EvidenceGrid, axis: int, low: float, high: float) -> tuple[Array, tuple[float, float, float, float]]:
+    """Probabilities ``(heights, columns)`` of the most occupied voxel across a slab, NaN where nothing is known.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        3-D.
+    axis : {0, 1}
+        Across the slab.
+    low, high : float
+        Voxels whose centres lie in between [m].
+
+    Returns
+    -------
+    probabilities, extent : of the other horizontal axis and of heights [m]
+
+    Raises
+    ------
+    ConfigError
+        A 2-D grid, another axis, or an empty slab.
+    """
+    size = grid.voxel_size
+    first, last = (int(np.ceil(v / size - 0.5)) for v in (low, high))
+    if grid.dim != 3 or axis not in (0, 1) or last <= first:
+        raise ConfigError(f"no slab of a {grid.dim}-D grid across axis {axis} from {low} to {high} m")
+    start, end = voxel_bounds(grid)
+    along = 1 - axis
+    out = np.full((int(end[2] - start[2]), int(end[along] - start[along])), UNKNOWN, np.int16)
+    coordinates, values = grid.brick_coordinates(), grid.brick_values().reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE)
+    for c, v in zip(BRICK_EDGE * coordinates, values):  # v: z, y, x
+        k = np.arange(c[axis], c[axis] + BRICK_EDGE)
+        keep = (k >= first) & (k < last)
+        if keep.any():
+            # unknown is the least value there is
+            top = (v[:, keep, :].max(axis=1)) if axis == 1 else (v[:, :, keep].max(axis=2))
+            i, j = int(c[2] - start[2]), int(c[along] - start[along])
+            block = out[i : i + BRICK_EDGE, j : j + BRICK_EDGE]
+            np.maximum(block, top, out=block)
+    extent = (start[along] * size, end[along] * size, start[2] * size, end[2] * size)
+    return probability(out), extent
+
+
+def plot_cut(
+    grid: EvidenceGrid,
+    path: Trajectory,
+    ax: Axes | None = None,
+    *,
+    thickness: float = 2.0,
+    stretch: float = 2.0,
+    title: str | None = None,
+) -> Axes:
+    """A slab of the map from the side, along the longer way of the path and through where it climbs.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        3-D.
+    path : Trajectory
+        ``T_world_body``.
+    ax : Axes or None
+    thickness : float
+        Of the slab [m].
+    stretch : float
+        Of heights in the picture.
+    title : str, optional
+
+    Raises
+    ------
+    DataError
+        A path in the plane.
+    ConfigError
+    """
+    if path.dim != 3:
+        raise DataError("a path in the plane has no side", got=f"{path.dim}-D", wanted="3-D")
+    axis, at = cut_plane(path)
+    p, extent = slab(grid, axis, at - 0.5 * thickness, at + 0.5 * thickness)
+    ax = style.new_axes(ax, (9.0, 3.2))
+    ax.set_facecolor("0.72")
+    if p.size:
+        ax.imshow(p, cmap="gray_r", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest")
+    q = path.positions
+    ax.plot(q[:, 1 - axis], q[:, 2], color=style.VERMILION, lw=0.9, label="path, all of it")
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero((p >= 0.5).any(axis=1))  # the sky is known, too, and says nothing
+    if len(rows):
+        size = grid.voxel_size
+        ax.set_ylim(extent[2] + size * rows[0] - 0.5, extent[2] + size * (rows[-1] + 1) + 0.5)
+    ax.set_aspect(stretch)
+    names = "xy"
+    ax.set(xlabel=f"{names[1 - axis]} [m]", ylabel="z [m]")
+    ax.set_title(title or f"{names[axis]} = {at:.1f} m", fontsize="medium")
+    style.legend(ax, outside=False, loc="upper right")
+    return ax
