@@ -122,8 +122,8 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
     """``T_world_node`` of every piece, from the graph's nodes; standing level where the pieces do."""
     out: dict[PieceId, Array] = {}
     for name in divided.pieces:
-        key, k = name  # type: ignore[misc]
-        T = nodes[key][1][k]
+        assert isinstance(name, tuple)
+        T = nodes[name[0]][1][name[1]]
         out[name] = level(T) if divided.level_nodes else T
     return out
 
