@@ -26,6 +26,7 @@ def solve(
         False, "--repair", help="Project indefinite information matrices instead of refusing them."
     ),
     out: Path | None = typer.Option(None, help="g2o file for the solution."),
+    certify: bool = typer.Option(False, "--certify", help="Say whether the answer is the global optimum."),
     as_json: bool = JSON,
 ) -> None:
     """Solve a pose-graph file from its best start, and say honestly whether it is at its optimum."""
@@ -40,7 +41,7 @@ def solve(
                 f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"
             )
         path = found
-    value = solve_file(path, solver, repair=repair, out=out)
+    value = solve_file(path, solver, repair=repair, out=out, certificate=certify)
     emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
 
 

@@ -22,6 +22,7 @@ def solve_file(
     out: str | os.PathLike[str] | None = None,
     *,
     noise: Noise = "auto",
+    certificate: bool = False,
     progress: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
@@ -39,6 +40,9 @@ def solve_file(
         Write the solution as g2o; ``.xz``, ``.gz`` and ``.bz2`` compress.
     noise : str
         Meaning of TORO/iSAM noise columns.
+    certificate : bool
+        Also say whether the answer is certified to be the global optimum (``"certificate"`` in words, its numbers in
+        ``"certificate_numbers"``).
     **options
         Of :func:`graphslam.solve.network_solve.solve_network`.
 
@@ -53,7 +57,7 @@ def solve_file(
     MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
     """
     network = read_network(path, noise=noise, repair=repair)
-    solution = solve_network(network, solver, progress=progress, **options)
+    solution = solve_network(network, solver, certificate=certificate, progress=progress, **options)
     if out is not None:
         write_g2o(out, solution.to_network())
     report = report_of(solution)
@@ -99,6 +103,23 @@ def report_of(solution: NetworkSolution) -> dict[str, Any]:
             for s in solution.starts
         ],
         **solution.details,
+        **_certificate(solution),
+    }
+
+
+def _certificate(solution: NetworkSolution) -> dict[str, Any]:
+    found = solution.certificate
+    if found is None:
+        return {}
+    return {
+        "certificate": str(found),
+        "certificate_numbers": {
+            "verdict": found.verdict,
+            "reason": found.reason,
+            "smallest_eigenvalue": _finite(found.smallest_eigenvalue),
+            "relaxed_objective": _finite(found.relaxed_objective),
+            "objective_from_relaxation": _finite(found.objective_from_relaxation),
+        },
     }
 
 

@@ -64,6 +64,7 @@ READERS: dict[str, Reader] = {
         "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
     ),
     "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
+    "tuc": Reader("graphslam.io.tuc:read_tuc", ("Lecture_Hall_Input.txt.gz", "Lecture_Hall_Input.txt")),
     "carmen": Reader(
         "graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2"), named=True
     ),
@@ -177,7 +178,7 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
 
     Returns
     -------
-    SensorLog, list of Submap, LandmarkObservations or Path
+    SensorLog, list of Submap, LandmarkObservations, TucLog or Path
         By the card's reader, or by what the folder holds. A pose network gives the path of its file, for
         :func:`graphslam.io.network_file.read_network`.
 

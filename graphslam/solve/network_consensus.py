@@ -20,6 +20,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from graphslam.core import se3
+from graphslam.core.geometry import Array, se2_adjoint, se2_inverse
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.consistent_set import Chain, LoopArrays, chain_chi2, pair_chi2
 from graphslam.solve.network_start import identity
@@ -34,6 +36,10 @@ REACH = 5.0
 SUPPORT = 0.25
 # Two loops agree if the D² of their cycle, in the scale of the network, is below this quantile.
 AGREEMENT = 0.999
+# A cycle that closes to within this D² is a repetition, not a measurement.
+REPEATED = 1e-10
+# A loop takes part if the chain's variance between its ends is at least this share of its own, on average.
+INFORMATIVE = 0.05
 # A chain of odometry that joins fewer of the vertices than this is none: the ids are not in the order of a drive.
 CHAINED = 0.9
 # Clusters of loops are compared with each other by about so many representatives, together …
@@ -127,6 +133,11 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
     loops = LoopArrays.of(
         chain, network.edges[rows], network.measurements[rows], np.linalg.inv(network.information[rows])
     )
+    told = _informative(chain, loops)
+    rows = rows[told]
+    if len(rows) < 2:
+        return nothing
+    loops = LoopArrays(loops.ends[told], loops.measured[told], loops.covariance[told])
     near = min(NEIGHBOURS, len(rows) - 1)
     distance, other = cKDTree(loops.ends.astype(np.float64)).query(loops.ends, k=near + 1, p=1)
     # the loop itself is among the nearest, but not always the first: two loops may join the same nodes
@@ -136,6 +147,8 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
     # far neighbours agree by chance: the cycle through them is long and its covariance large
     close = distance <= REACH * max(float(np.quantile(distance[:, 0], 0.25)), 2.0)
     nearest = d2[:, 0][np.isfinite(d2[:, 0])]
+    # said twice word for word (a robot that stands still): nothing about noise
+    nearest = nearest[nearest > REPEATED]
     if len(nearest) < 8:
         return nothing
     scale = min(1.0, float(np.quantile(nearest, 0.25) / stats.chi2.ppf(0.25, d)))
@@ -153,6 +166,19 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
     likely, core, all_votes = np.zeros(m, np.bool_), np.zeros(m, np.bool_), np.zeros(m, np.int64)
     likely[rows[keep]], core[rows[_largest(label, keep)]], all_votes[rows] = True, True, votes
     return Consensus(odometry, True, likely, core, all_votes, max(scale, np.finfo(float).tiny))
+
+
+def _informative(chain: Chain, loops: LoopArrays) -> Mask:
+    """Loops whose ends the chain does not tie far better than they do: those agree with anything near them."""
+    a, b = loops.ends.T
+    home = se2_adjoint(se2_inverse(chain.poses[b])) if chain.tangent_dim == 3 else _home3(chain.poses[b])
+    spread = home @ (chain.spread[b] - chain.spread[a]) @ np.swapaxes(home, 1, 2)
+    ratio = np.trace(np.linalg.solve(loops.covariance, spread), axis1=1, axis2=2) / chain.tangent_dim
+    return np.asarray((ratio > INFORMATIVE) | (chain.part[a] != chain.part[b]))
+
+
+def _home3(poses: Array) -> Array:
+    return se3.se3_adjoint(se3.se3_inverse(poses))
 
 
 def _largest(label: Ints, keep: Mask) -> Mask:

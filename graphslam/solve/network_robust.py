@@ -24,7 +24,7 @@ from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, Polished, polish
-from graphslam.solve.network_consensus import loop_consensus, odometry_edges
+from graphslam.solve.network_consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network_diagnose import check_determined
 from graphslam.solve.network_model import Layout, edge_costs, linearise, observation_costs
 from graphslam.solve.network_sparse import factor
@@ -180,7 +180,7 @@ def truncated_least_squares(
 
 def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
     """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
-    part = _part(problem.network, used)
+    part = subnetwork(problem.network, used)
     try:
         check_determined(part)
         if chordal and not len(part.observations):
@@ -194,7 +194,8 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
         return None
 
 
-def _part(network: PoseNetwork, used: Mask) -> PoseNetwork:
+def subnetwork(network: PoseNetwork, used: Mask) -> PoseNetwork:
+    """The network with only the edges and observations of ``used`` (m + k,)."""
     m = len(network.edges)
     e, o = np.flatnonzero(used[:m]), np.flatnonzero(used[m:])
     return replace(
@@ -209,7 +210,9 @@ def _part(network: PoseNetwork, used: Mask) -> PoseNetwork:
 
 
 def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
-    """True over stated variance of the loops, from the median cost of those believed, after least squares.
+    """True over stated variance of the loops, at most 1, from the median cost of those believed, after least squares.
+
+    More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then.
 
     A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
     left of ``rows``.
@@ -217,8 +220,11 @@ def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believ
     m = len(network.edges)
     rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
     left = max(rows - network.states, 1) / rows
-    median = float(np.median(edge_costs(network, arrays[0])[believed]))
-    return max(median / (left * float(stats.chi2.median(network.tangent_dim))), np.finfo(float).tiny)
+    costs = edge_costs(network, arrays[0])[believed]
+    costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
+    if not len(costs):
+        return 1.0
+    return min(1.0, float(np.median(costs)) / (left * float(stats.chi2.median(network.tangent_dim))))
 
 
 def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mask) -> Array:
@@ -340,8 +346,8 @@ def _readmit(network: PoseNetwork, best: _Trimmed, limit: Array) -> _Trimmed:
 def _predicted(network: PoseNetwork, inliers: Mask, rows: npt.NDArray[np.intp], poses: Array, marks: Array) -> Array:
     """``D²`` of edges against the posterior of the inliers."""
     layout, d = Layout.of(network), network.tangent_dim
-    J, _ = linearise(_part(network, inliers), poses, marks, layout)
-    part = _part(network, np.isin(np.arange(len(inliers)), rows))
+    J, _ = linearise(subnetwork(network, inliers), poses, marks, layout)
+    part = subnetwork(network, np.isin(np.arange(len(inliers)), rows))
     back = np.argsort(np.argsort(rows))
     # whitened: S = I + A H⁻¹ Aᵀ, in the order of the file
     A, r = linearise(part, poses, marks, layout)

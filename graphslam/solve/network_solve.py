@@ -14,6 +14,7 @@ from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, is_converged, polish
+from graphslam.solve.network_certificate import Certificate, certify
 from graphslam.solve.network_consensus import odometry_edges
 from graphslam.solve.network_diagnose import check_determined, check_full_rank
 from graphslam.solve.network_incremental import Isam2Options, relinearise_all, run_isam2
@@ -26,7 +27,7 @@ from graphslam.solve.network_multistart import (
     canonical_start,
     default_starts,
 )
-from graphslam.solve.network_robust import Robust, truncated_cost, truncated_least_squares
+from graphslam.solve.network_robust import Robust, subnetwork, truncated_cost, truncated_least_squares
 from graphslam.solve.network_sparse import PcgProblem
 
 # A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
@@ -70,6 +71,8 @@ class NetworkSolution:
         What only this solver has to say.
     inliers : (m + k,) bool or None
         Edges, then observations, that gnc kept; None from solvers that keep everything.
+    certificate : Certificate or None
+        If it was asked for.
     """
 
     network: PoseNetwork
@@ -87,6 +90,7 @@ class NetworkSolution:
     starts: tuple[StartReport, ...]
     details: dict[str, Any] = field(default_factory=dict)
     inliers: npt.NDArray[np.bool_] | None = None
+    certificate: Certificate | None = None
 
     @property
     def objective_g2o(self) -> float:
@@ -132,6 +136,7 @@ def solve_network(
     solver: str = "lm",
     *,
     starts: Sequence[str] | None = None,
+    certificate: bool = False,
     progress: bool = False,
     **options: Any,
 ) -> NetworkSolution:
@@ -144,6 +149,9 @@ def solve_network(
         Key of :data:`SOLVERS`.
     starts : sequence of str, optional
         Starts to try (:data:`graphslam.solve.network_multistart.STARTS`).
+    certificate : bool
+        Also say whether the answer is the global optimum of what was minimised (for gnc: of the inliers), in
+        ``NetworkSolution.certificate``.
     progress : bool
         Progress bars on stderr.
     **options
@@ -175,6 +183,10 @@ def solve_network(
     decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
     stationary = is_converged(network, value if answer.minimum is None else answer.minimum, decrement)
     at_optimum = gap <= SAME * abs(answer.optimum.best.objective) + 1e-12 * network.residuals
+    shown = None
+    if certificate:
+        judged = network if answer.inliers is None else subnetwork(network, answer.inliers)
+        shown = certify(judged, poses, objective(judged, poses, landmarks))
     return NetworkSolution(
         network=network,
         solver=solver,
@@ -191,6 +203,7 @@ def solve_network(
         starts=answer.optimum.reports,
         details=answer.details,
         inliers=answer.inliers,
+        certificate=shown,
     )
 
 

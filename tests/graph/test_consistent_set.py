@@ -112,7 +112,8 @@ def test_wrong_loops_are_refused_with_reasons_and_right_ones_kept(rng: np.random
     places = np.array([[5, 60], [50, 101], [22, 90], [33, 71], [8, 99], [60, 110], [1, 57], [13, 66], [40, 83]])
     wrong, Pw = loops_of(rng, poses, np.roll(places, 3, axis=0), 0.02)
     alias = np.stack([np.arange(4) + 10, np.arange(4) + 47], axis=1)
-    same, Ps = loops_of(rng, poses, alias - [0, 12], 0.02)
+    away = exp(np.full(3 if dim == 2 else 6, 0.7))  # one wrong motion of the second stretch for all of them
+    same, Ps = loops_of(rng, np.concatenate([poses[:40], compose(away, poses[40:])]), alias, 0.02)
     all_ends = np.concatenate([ends, places, alias])
     found = consistent_loops(
         z, Q, (all_ends, np.concatenate([T, wrong, same]), np.concatenate([P, Pw, Ps])), against_chain=False
