@@ -11,9 +11,8 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.attitude import attitude_terms
-from graphslam.graph.gps_family import gps_terms_in_space
-from graphslam.graph.gtsam_values import gtsam_pose, pose_array
+from graphslam.graph.gtsam_space import attitude_in_space, gps_in_space
+from graphslam.graph.gtsam_values import gtsam_pose
 from graphslam.graph.noise import Robust
 from graphslam.graph.records import AttitudeRecord, BetweenRecord, BiasPriorRecord, GpsRecord, Record, SubmapRecord
 from graphslam.graph.state import gtsam_key
@@ -42,9 +41,11 @@ def gtsam_factor(record: Record, origin: Array) -> Any:
     if isinstance(record, BetweenRecord):
         return _between(record, origin)
     if isinstance(record, GpsRecord):
-        return _gps(record, origin) if len(record.z) == 2 else _gps_in_space(record, origin)
+        if len(record.z) == 3:
+            return gps_in_space(record, with_kernel(gtsam.noiseModel.Unit.Create(3), record.robust), origin)
+        return _gps(record, origin)
     if isinstance(record, AttitudeRecord):
-        return _attitude(record, origin)
+        return attitude_in_space(record, with_kernel(gtsam.noiseModel.Unit.Create(2), record.robust), origin)
     assert isinstance(record, BiasPriorRecord)
     noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
     prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
@@ -140,61 +141,3 @@ def _gps_error(keys: list[int], record: GpsRecord, origin: Array) -> Callable[..
             return np.full(2, np.nan)
 
     return error
-
-
-def _gps_in_space(record: GpsRecord, origin: Array) -> Any:
-    """A fix in space (:mod:`graphslam.graph.gps_family`): pose, datum, and bias and tilt where it has them."""
-    names = record.variables()
-    W, none = record.whitener, np.zeros(3)
-    at = {"datum": slice(6, 10), "tilt": slice(13, 15)}
-    columns = [slice(0, 6) if n[0] == "x" else at.get(n, slice(10, 13)) for n in names]
-
-    def terms(found: dict[str, Array]) -> tuple[Array, list[Array]]:
-        bias = none if record.bias is None else found[f"bias{record.bias}"]
-        r, J = gps_terms_in_space(
-            found[names[0]][None], found["datum"], bias[None], found.get("tilt"), record.arm[None], record.z[None]
-        )
-        return W @ r[0], [W @ J[0, :, c] for c in columns]
-
-    return _custom(names, terms, origin, 3, record.robust)
-
-
-def _attitude(record: AttitudeRecord, origin: Array) -> Any:
-    names = record.variables()
-
-    def terms(found: dict[str, Array]) -> tuple[Array, list[Array]]:
-        r, J = attitude_terms(found[names[0]][None], found["tilt"], record.direction[None])
-        return record.whitener @ r[0], [record.whitener @ J[0, :, :6], record.whitener @ J[0, :, 6:]]
-
-    return _custom(names, terms, origin, 2, record.robust)
-
-
-def _custom(
-    names: list[str],
-    terms: Callable[[dict[str, Array]], tuple[Array, list[Array]]],
-    origin: Array,
-    rows: int,
-    robust: Robust,
-) -> Any:
-    """A factor in space from whitened residual and Jacobians by variable; never raises, fills every Jacobian."""
-    free = [(i, n, gtsam_key(n)) for i, n in enumerate(names) if n != "x0"]
-    width = {"x": 6, "d": 4, "t": 2, "b": 3}
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        try:
-            found = {"x0": origin}
-            for _i, n, key in free:
-                found[n] = pose_array(values.atPose3(key)) if n[0] == "x" else values.atVector(key)
-            r, J = terms(found)
-            if H is not None:
-                for k, (i, _n, _key) in enumerate(free):
-                    H[k] = np.asfortranarray(J[i])
-            return r
-        except Exception:  # whatever it is, GTSAM must not see it: nan is refused by the solver instead
-            if H is not None:
-                for k, (_i, n, _key) in enumerate(free):
-                    H[k] = np.zeros((rows, width[n[0]]))
-            return np.full(rows, np.nan)
-
-    noise = with_kernel(gtsam.noiseModel.Unit.Create(rows), robust)
-    return gtsam.CustomFactor(noise, [key for _, _, key in free], error)

@@ -14,6 +14,7 @@ from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.attitude import DOWN, across, attitude_terms, up_turn
+from graphslam.graph.gtsam_space import _turn
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -46,6 +47,14 @@ def test_the_residual_is_the_sine_of_the_angle(rng):
     axis = across(seen)[:, 0]
     off = quat_rotate(so3_exp(angle * axis), seen)
     assert np.linalg.norm(attitude_terms(pose[None], tilt, off[None])[0]) == pytest.approx(np.sin(angle), rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 9e-4, 1.1e-3, 0.03, 1.0])
+def test_the_lean_turn_is_the_plain_one(size):
+    E, J = up_turn(size * np.array([0.6, -0.8]))
+    lean_E, lean_J = _turn(size * 0.6, size * -0.8)
+    np.testing.assert_allclose(lean_E, E, atol=1e-13)
+    np.testing.assert_allclose(lean_J, J, atol=1e-11)
 
 
 def levelled_chain(rng: np.random.Generator, m: int = 20) -> tuple[list[Submap], np.ndarray]:
