@@ -16,8 +16,12 @@ from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.identity import doubtful_identities
 from graphslam.graph.landmark_association import AssociationConfig, associate
 from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
+from graphslam.graph.loop_appearance import AppearanceConfig
+from graphslam.graph.loop_candidates import CandidateConfig
+from graphslam.graph.loop_ledger import LoopLedger
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
@@ -41,6 +45,8 @@ class BackEnd:
     """Of two dimensions until a submap of three comes first."""
     seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
     per_submap_s: list[float] = field(default_factory=list)
+    submaps: list[Submap] = field(default_factory=list)
+    """With their maps; kept only where loops are looked for."""
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
@@ -99,6 +105,8 @@ class BackEnd:
             level_sigma=c.level_sigma if dense and submap.dim == 3 and c.level_sigma > 0 else None,
         )
         self._add_matches(submap)
+        if c.loops:
+            self.submaps.append(submap)
         waiting, self._waiting = self._waiting, []
         for gps, config in waiting:
             self.add_gps(gps, config)
@@ -140,12 +148,27 @@ class BackEnd:
             if not self.merge():
                 break
             self.solver.solve_to_optimum()
+        if self.config.loops:
+            self.find_loops()
         start = time.perf_counter()
         self.solver.solve_to_optimum()
         self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start
         return solution
+
+    def find_loops(self) -> LoopLedger:
+        """Look for loops between the submaps, take those that are believed, and note every decision."""
+        start, c = time.perf_counter(), self.config
+        config = FindConfig(
+            candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height),
+            appearance=AppearanceConfig() if c.loop_appearance else None,
+        )
+        ledger = find_loops(self.graph, self.solver, self.submaps, config).ledger
+        for event in ledger.events():
+            self.graph.note(event.pop("event"), **event)
+        self.seconds["loops"] = time.perf_counter() - start
+        return ledger
 
     def split_wrong_identities(self) -> int:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""

@@ -70,9 +70,17 @@ class BackEndConfig:
     """Robust kernel on every match."""
     match_width: float = 2.385
     """Width of that kernel in standard deviations."""
+    loops: bool = False
+    """At the end, look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``)."""
+    loop_overlap: float = 8.0
+    """Maps of two places are matched if the places may be nearer than this [m] …"""
+    loop_height: float = 1.0
+    """… and not farther above each other than this [m]."""
+    loop_appearance: bool = False
+    """Also try places that look alike, wherever they are."""
 
     def __post_init__(self) -> None:
-        for name in ("node_spacing", "level_sigma", "match_support"):
+        for name in ("node_spacing", "level_sigma", "match_support", "loop_overlap", "loop_height"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"backend.{name} must not be negative, got {getattr(self, name)}")
 

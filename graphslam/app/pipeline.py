@@ -48,6 +48,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.formats import load_npz
 from graphslam.io.catalog import load
 from graphslam.solve.solution import Solution
 
@@ -194,7 +195,7 @@ def _front_to_back(
     progress: bool,
 ) -> tuple[list[Submap], FrontEndWork]:
     """Feed every submap to the back end as soon as it is finished and stored."""
-    store = None if folder is None else folder.submaps
+    store = None if folder is None else folder.submaps_with(load_npz if back.config.loops else None)
     submaps = store.complete_prefix() if store is not None else []
     if store is not None and len(submaps) < len(store):
         store.truncate(len(submaps))

@@ -17,7 +17,7 @@ from typing import Any
 from graphslam.app.config import dump_toml
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import RunFolderError
-from graphslam.io.submap_store import SubmapStore
+from graphslam.io.submap_store import GridLoader, SubmapStore
 
 
 class RunFolder:
@@ -78,7 +78,11 @@ class RunFolder:
     @property
     def submaps(self) -> SubmapStore:
         """Store of the finished submaps."""
-        return SubmapStore(self.path / "submaps")
+        return self.submaps_with(None)
+
+    def submaps_with(self, load_grid: GridLoader | None) -> SubmapStore:
+        """Store of the finished submaps, whose grids are read too where a reader is given."""
+        return SubmapStore(self.path / "submaps", load_grid=load_grid)
 
     @property
     def figures(self) -> Path:

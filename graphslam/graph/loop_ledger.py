@@ -27,6 +27,7 @@ COLUMNS = (
     "gain",
     "fitness",
     "margin",
+    "sigma",
     "chi2",
     "weight",
     "effect_predicted",
@@ -69,6 +70,10 @@ class Decision:
         Of that, what the factors bear that were there before.
     factor_id : int
         In the graph; −1 if it is not there.
+    T_ij : list of float
+        The measurement; empty where the registration came to nothing.
+    covariance : list of list of float
+        Of it, right tangent: with the two a loop can be put into another graph.
     """
 
     loop: int
@@ -88,6 +93,8 @@ class Decision:
     effect: float = math.nan
     effect_earlier: float = math.nan
     factor_id: int = -1
+    T_ij: list[float] = field(default_factory=list)
+    covariance: list[list[float]] = field(default_factory=list)
 
     def event(self) -> dict[str, Any]:
         """One line of ``events.jsonl``."""
@@ -177,6 +184,7 @@ class LoopLedger:
         for d in self.decisions if history else self.current():
             row = d.event()
             gates = row.pop("gates") or {}
+            row["sigma"] = max((P[k] for k, P in enumerate(d.covariance)), default=math.nan) ** 0.5
             row["fitness"] = gates.get("fitness_known") or gates.get("fitness", math.nan)
             row["margin"] = gates.get("margin", math.nan)
             rows.append(row)

@@ -276,11 +276,13 @@ class LoopCloser:
     def _write(self, n: int, verdict: Verdict, why: str, **facts: float) -> None:
         x = self.loops[n]
         known: dict[str, float] = dict(facts)
+        measured = bool(np.all(np.isfinite(x.covariance)))
         fid = int(known.pop("factor_id", -1))
         self.ledger.write(
             Decision(
                 loop=n, verdict=verdict, why=why, i=int(x.i), j=int(x.j), submap_i=int(x.submaps[0]),
                 submap_j=int(x.submaps[1]), source=x.source, score=x.score, gain=x.gain, gates=x.gates, factor_id=fid,
+                T_ij=x.T_ij.tolist() if measured else [], covariance=x.covariance.tolist() if measured else [],
                 **known,
             )  # type: ignore[arg-type]
         )  # fmt: skip

@@ -1,0 +1,86 @@
+"""The loops of a finished run, from its events: what was tried, what was believed, and why."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.graph.loop_ledger import Decision, LoopLedger
+
+
+def read_events(folder: str | Path) -> list[dict[str, Any]]:
+    """``events.jsonl`` of a run folder.
+
+    Raises
+    ------
+    RunFolderError
+        It has none.
+    FormatError
+        A line is no JSON object.
+    """
+    file = Path(folder) / "events.jsonl"
+    if not file.is_file():
+        raise RunFolderError(f"{folder}: has no events.jsonl; give a folder of a finished run")
+    out = []
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            event = json.loads(line)
+        except ValueError as error:
+            raise FormatError(f"line {number} is not JSON ({error})", where=str(file)) from None
+        if not isinstance(event, dict):
+            raise FormatError(f"line {number} is no event", where=str(file), got=type(event).__name__)
+        out.append(event)
+    return out
+
+
+def loops_of_run(folder: str | Path) -> LoopLedger:
+    """Ledger of all loops of a run: those that were looked for, then the front end's matches.
+
+    Raises
+    ------
+    RunFolderError, DataError, FormatError
+    """
+    events = read_events(folder)
+    where = str(Path(folder) / "events.jsonl")
+    ledger = LoopLedger.from_events(events, where=where)
+    number = 1 + max((d.loop for d in ledger.decisions), default=-1)
+    removed = {e.get("factor_id"): str(e.get("reason", "")) for e in events if e.get("event") == "removed"}
+    for e in events:
+        match = _match(e, number, removed)
+        if match is not None:
+            ledger.write(match)
+            number += 1
+    return ledger
+
+
+def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Decision | None:
+    """A front end's match that became a factor, or did not; None for other events."""
+    taken = e.get("event") == "between" and e.get("group") == "match"
+    if not taken and e.get("event") != "match-not-used":
+        return None
+
+    def figure(name: str) -> float:
+        value = e.get(name)
+        return math.nan if value is None else float(value)
+
+    fid = int(e.get("factor_id", -1))
+    gone = taken and fid in removed
+    support = figure("support")
+    why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
+    return Decision(
+        loop=number,
+        verdict="undone" if gone else "accepted" if taken else "rejected",
+        why=why if taken else f"{why} is too little",
+        i=int(e.get("i", -1)),
+        j=int(e.get("j", -1)),
+        submap_i=int(e.get("target", -1)),
+        submap_j=int(e.get("submap", -1)),
+        source="front-end",
+        score=support,
+        gates={"fitness": figure("fitness")},
+        factor_id=-1 if gone or not taken else fid,
+    )
