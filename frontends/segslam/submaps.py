@@ -137,6 +137,7 @@ def settle(
     out = []
     for s in segments:
         matches, considered = _matches(segmap, s, segments, keys, config)
+        considered["holds"] = _holds(segmap, s, segments, keys)
         out.append(_submap(segmap, s, drift, config, matches, considered, keys[s.index], uses, reasons, with_grids))
     return out
 
@@ -310,6 +311,12 @@ def _matches(
     out.sort(key=lambda m: (-m.support, m.target))
     kinds = {KINDS[k]: float(share[members[t.kind[members] == k]].sum()) for k in range(len(KINDS))}
     return tuple(out), {"entered_share": kinds, "matches_without_target": lost}
+
+
+def _holds(segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int]) -> list[int]:
+    """Keys of the submaps whose scans are in the map of a segment: its own, and those of maps that it went on in."""
+    scans = segmap.maps.scans[int(segmap.table.map[s.index])]
+    return [keys[c.index] for c in segments if any(a < c.interval[1] and c.interval[0] < b for a, b in scans)]
 
 
 def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Segment, Array] | None:

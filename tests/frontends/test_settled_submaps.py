@@ -78,6 +78,8 @@ def test_a_chain_becomes_submaps_whose_exits_are_the_next_bases() -> None:
     assert submaps[0].uses == {"laser"}
     assert [s.report["ended"] for s in submaps] == ["score", "unknown", "unknown", "unknown", "end-of-log"]
     assert [s.report["entered"] for s in submaps] == ["new", "new", "new", "new", "match"]
+    # the last went on in the map of the first: the two hold the same scans
+    assert [s.report["holds"] for s in submaps] == [[3], [4], [5], [6], [3, 7]]
     json.dumps([dict(s.report) for s in submaps], allow_nan=False)
 
 
