@@ -164,18 +164,32 @@ class LoopCloser:
         return self.ledger.of(loop)
 
     def _decide(self, new: list[int]) -> None:
+        """Rounds: what the graph refuses of the largest set that agrees has no say about the others any more."""
+        out: set[int] = set()
+        while True:
+            refused = self._round(new, out)
+            refused |= self._reconsider()
+            if not refused:
+                break
+            out |= refused
+        self._say_weights()
+
+    def _round(self, new: list[int], out: set[int]) -> set[int]:
+        """One round over all loops but ``out``; those of the largest set that agrees which the graph refused."""
         # loops that disagreed with others may turn out right when more are there
         again = [n for n in self._refused_by_company() if n not in new]
-        numbers = sorted({*new, *self.accepted, *again})
+        numbers = [n for n in sorted({*new, *self.accepted, *again}) if n not in out]
+        if not numbers:
+            return set()
         chain = dict(zip(numbers, self._against_chain(numbers)))
         limit = float(stats.chi2.ppf(self.config.chain, self._dof))
         inside = set(self.accepted)
         for n in numbers:
-            if n not in inside and not chain[n] <= limit and n in new:
-                self._write(n, "rejected", f"chain: χ² {chain[n]:.1f} > {limit:.1f}", chi2=chain[n])
+            if n not in inside and not chain[n] <= limit:
+                self._refuse(n, f"chain: χ² {chain[n]:.1f} > {limit:.1f}", chain[n])
         numbers = [n for n in numbers if n in inside or chain[n] <= limit]
         if not numbers:
-            return
+            return set()
         found = self._consistent(numbers)
         left = []
         for k, n in enumerate(numbers):
@@ -184,10 +198,17 @@ class LoopCloser:
                     left.append((chain[n], n))
             elif n in inside:
                 self._switch_off(n, f"pairwise: {found.reasons[k]}")
-            elif n in new:
-                self._write(n, "rejected", f"pairwise: {found.reasons[k]}", chi2=chain[n])
-        self._one_by_one([n for _, n in sorted(left)])
-        self._reconsider()
+            else:
+                self._refuse(n, f"pairwise: {found.reasons[k]}", chain[n])
+        tried = [n for _, n in sorted(left)]
+        self._one_by_one(tried)
+        return set(tried) - set(self.accepted)
+
+    def _refuse(self, n: int, why: str, chi2: float) -> None:
+        """Write a refusal, unless that is what the ledger says already."""
+        last = [d for d in self.ledger.decisions if d.loop == n][-1:]
+        if not last or last[0].why != why:
+            self._write(n, "rejected", why, chi2=chi2)
 
     def _one_by_one(self, numbers: list[int]) -> None:
         """Add loops in this order, each against the graph as it is by then."""
@@ -220,9 +241,10 @@ class LoopCloser:
             weight = float(self._kernel().weight(np.array([after[fid]]))[0])
             self._write(n, "accepted", found_why(expected, d), factor_id=fid, weight=weight, **facts)
 
-    def _reconsider(self) -> None:
-        """Switch off, worst first, what the rest of the graph contradicts; then say the weights of the others."""
+    def _reconsider(self) -> set[int]:
+        """Switch off, worst first, what the rest of the graph contradicts; which these were."""
         limit = float(stats.chi2.ppf(self.config.off, self._dof))
+        gone: set[int] = set()
         while inside := self.accepted:
             alone = self.without(inside)
             worst = int(np.argmax(alone))
@@ -230,6 +252,11 @@ class LoopCloser:
                 break
             n = inside[worst]
             self._switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
+            gone.add(n)
+        return gone
+
+    def _say_weights(self) -> None:
+        """The kernels' weights have changed since loops were taken."""
         chi2 = self.graph.chi2()
         for n in self.accepted:
             d = self.ledger.of(n)
