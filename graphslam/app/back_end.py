@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.config import BackEndConfig, GpsConfig
+from graphslam.app.loops import ledger_of_events
+from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
@@ -17,7 +20,7 @@ from graphslam.graph.identity import doubtful_identities
 from graphslam.graph.landmark_association import AssociationConfig, associate
 from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
 from graphslam.graph.loop_appearance import AppearanceConfig
-from graphslam.graph.loop_candidates import CandidateConfig
+from graphslam.graph.loop_candidates import FRONT_END, CandidateConfig
 from graphslam.graph.loop_ledger import LoopLedger
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
@@ -140,8 +143,14 @@ class BackEnd:
         self.seconds["merge"] += time.perf_counter() - start
         return merged
 
-    def finish(self) -> Solution:
-        """Merge until nothing merges any more, go to the optimum, and return the solution."""
+    def finish(self, undo: Sequence[int] = ()) -> Solution:
+        """Merge until nothing merges any more, go to the optimum, and return the solution.
+
+        Parameters
+        ----------
+        undo : sequence of int
+            Loops that are taken out again, by their numbers in the ledger of loops.
+        """
         self.graph.finish_gps()
         self.solver.solve_to_optimum()
         for _ in range(10):
@@ -150,6 +159,8 @@ class BackEnd:
             self.solver.solve_to_optimum()
         if self.config.loops:
             self.find_loops()
+        for loop in undo:
+            self.undo_loop(loop)
         start = time.perf_counter()
         self.solver.solve_to_optimum()
         self.split_wrong_identities()
@@ -169,6 +180,23 @@ class BackEnd:
             self.graph.note(event.pop("event"), **event)
         self.seconds["loops"] = time.perf_counter() - start
         return ledger
+
+    def undo_loop(self, loop: int) -> None:
+        """Take a loop, or a front end's match, out of the graph; what was found with it in stays.
+
+        Raises
+        ------
+        DataError
+            It is not in the graph.
+        """
+        d = ledger_of_events(self.graph.events).of(loop)
+        if d.verdict != "accepted" or d.factor_id not in self.graph.records:
+            raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
+        self.graph.remove(d.factor_id, reason="undone")
+        if d.source != FRONT_END:
+            event = replace(d, verdict="undone", why="asked for", weight=0.0, factor_id=-1).event()
+            self.graph.note(event.pop("event"), **event)
+        self.solver.solve_to_optimum()
 
     def split_wrong_identities(self) -> int:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""

@@ -21,12 +21,17 @@ def loops(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
     history: bool = typer.Option(False, help="Every decision, not only those in force."),
     every: bool = typer.Option(False, "--all", help="Also what the registration refused."),
+    undo: int | None = typer.Option(None, help="Take this loop out, solve again, and write the run anew."),
+    source: str | None = typer.Option(None, help="Log of the run, for --undo, where it is no card."),
     as_json: bool = JSON,
 ) -> None:
     """Loops of a run: where each came from, its gates, χ², weight and effect, accepted or not, and why."""
-    from graphslam.app.loops import loops_of_run
+    from graphslam.app.loops import loops_of_run, undo_loop
 
-    ledger = loops_of_run(run)
+    if undo is None:
+        ledger = loops_of_run(run)
+    else:
+        ledger = undo_loop(run, undo, source=source, progress=not as_json)
     frame = ledger.table(history=history)
     rows = [{str(k): v for k, v in row.items()} for row in frame.to_dict("records")]
     counts = ledger.counts()

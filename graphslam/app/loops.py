@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.app.config import read_toml
+from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.graph.loop_ledger import Decision, LoopLedger
 
 
@@ -44,8 +45,11 @@ def loops_of_run(folder: str | Path) -> LoopLedger:
     ------
     RunFolderError, DataError, FormatError
     """
-    events = read_events(folder)
-    where = str(Path(folder) / "events.jsonl")
+    return ledger_of_events(read_events(folder), where=str(Path(folder) / "events.jsonl"))
+
+
+def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
+    """Ledger of all loops in the events of a graph; see :func:`loops_of_run`."""
     ledger = LoopLedger.from_events(events, where=where)
     number = 1 + max((d.loop for d in ledger.decisions), default=-1)
     removed = {e.get("factor_id"): str(e.get("reason", "")) for e in events if e.get("event") == "removed"}
@@ -82,5 +86,51 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
         source="front-end",
         score=support,
         gates={"fitness": figure("fitness")},
+        weight=math.nan if taken and not gone else 0.0,
         factor_id=-1 if gone or not taken else fid,
     )
+
+
+def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
+    """Take a loop out of a finished run: its graph is made again from the stored submaps, solved without the loop, and
+    everything in the folder is written anew.
+
+    Loops that were undone before stay so. What was found with the loop in the graph stays too.
+
+    Parameters
+    ----------
+    folder : path
+    loop : int
+        Number in the ledger.
+    source : path, optional
+        The log of the run, where that is no card.
+    progress : bool
+
+    Raises
+    ------
+    RunFolderError, DataError
+        No run, or no loop of that number in its graph.
+    MissingDataError
+        The log is not to be found: say where with ``source``.
+    """
+    from graphslam.app.pipeline import run
+
+    before = loops_of_run(folder)
+    d = before.of(loop)
+    if d.verdict != "accepted":
+        raise DataError(f"loop {loop} is not in the graph", where=str(folder), got=d.verdict, wanted="an accepted loop")
+    options = read_toml(Path(folder) / "config.toml")
+    said = options.pop("run")
+    undone = sorted({x.loop for x in before.current() if x.verdict == "undone"} | {loop})
+    run(
+        source or said["source"],
+        frontend=said["frontend"],
+        solver=said["solver"],
+        seed=int(said["seed"]),
+        out=folder,
+        config=options,
+        resume=True,
+        progress=progress,
+        undo=undone,
+    )
+    return loops_of_run(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -66,6 +66,7 @@ def run(
     config: Mapping[str, Any] | None = None,
     resume: bool = False,
     progress: bool = True,
+    undo: Sequence[int] = (),
 ) -> Run:
     """Run a front end over a log, join its submaps in a graph, and score what can be scored.
 
@@ -84,6 +85,8 @@ def run(
         Go on after the last finished submap of ``out``, to the same result.
     progress : bool
         Show a progress bar on stderr.
+    undo : sequence of int
+        Loops that are taken out again at the end, by their numbers in the ledger of loops.
 
     Raises
     ------
@@ -91,7 +94,7 @@ def run(
         Or one of its children; says what, where, got, wanted.
     """
     with one_blas_thread():
-        return _run(source, frontend, solver, seed, out, config or {}, resume, progress)
+        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo)
 
 
 def _run(
@@ -103,6 +106,7 @@ def _run(
     config: Mapping[str, Any],
     resume: bool,
     progress: bool,
+    undo: Sequence[int],
 ) -> Run:
     begin = time.perf_counter()
     log = load_log_source(source)
@@ -122,7 +126,7 @@ def _run(
     submaps, work = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
     if not submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
-    solution = back.finish()
+    solution = back.finish(undo)
     seconds["frontend"] = work.seconds
     seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}
     seconds["backend"] = sum(back.seconds.values())

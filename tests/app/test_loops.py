@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from graphslam.app.back_end import BackEnd
 from graphslam.app.cli import app
 from graphslam.app.config import BackEndConfig
-from graphslam.app.loops import loops_of_run
+from graphslam.app.loops import ledger_of_events, loops_of_run, undo_loop
 from graphslam.app.run_folder import RunFolder
 from graphslam.core import se3
 from graphslam.core.errors import DataError, FormatError, RunFolderError
@@ -91,6 +91,27 @@ def test_a_back_end_finds_loops_when_it_is_told_to(finished: tuple) -> None:
     assert back.seconds["loops"] > 0
 
 
+def test_a_loop_can_be_undone(finished: tuple) -> None:
+    """At the end of a run made again from the same submaps; what else was decided stays."""
+    with_all = finished[0]
+    accepted = [d.loop for d in ledger_of_events(with_all.graph.events).current() if d.verdict == "accepted"]
+    gone = accepted[0]
+    back = BackEnd(BackEndConfig(loops=True), "batch")
+    for s in with_all.submaps:
+        back.add(s)
+    back.finish([gone])
+    ledger = ledger_of_events(back.graph.events)
+    assert (ledger.of(gone).verdict, ledger.of(gone).why) == ("undone", "asked for")
+    assert [d.loop for d in ledger.current() if d.verdict == "accepted"] == accepted[1:]
+    factors = [r for r in back.graph.records.values() if r.group == "loop"]
+    assert len(factors) == len(accepted) - 1
+    assert np.abs(back.graph.values.poses - with_all.graph.values.poses).max() > 1e-4
+    with pytest.raises(DataError):
+        back.undo_loop(gone)
+    with pytest.raises(DataError):
+        back.undo_loop(999)
+
+
 def test_submaps_without_maps_cannot_be_searched() -> None:
     submaps, _ = there_and_back()
     back = BackEnd(BackEndConfig(loops=True), "batch")
@@ -142,6 +163,13 @@ def test_front_ends_matches_are_listed_too(tmp_path: Path) -> None:
     back.graph.remove(taken.factor_id, reason="wrong")
     RunFolder(tmp_path).write_lines("events.jsonl", back.graph.events)
     assert loops_of_run(tmp_path).current()[0].verdict == "undone"
+
+
+def test_only_a_loop_that_is_in_can_be_undone(folder: Path) -> None:
+    refused = [d.loop for d in loops_of_run(folder).current() if d.verdict != "accepted"]
+    for number in (*refused[:1], 999):
+        with pytest.raises(DataError):
+            undo_loop(folder, number)
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
