@@ -24,7 +24,7 @@ from graphslam.core.network import PoseNetwork
 Index = npt.NDArray[np.intp]
 Kind = Literal["random", "aliased"]
 # A drawn loop that the reference poses do not contradict with this confidence is not wrong, and is drawn again.
-CONTRADICTED = 0.999
+CONTRADICTED = 1.0 - 1e-9
 ATTEMPTS = 200
 
 
@@ -75,7 +75,7 @@ def add_wrong_loops(
         Independent loops between random poses, or groups that agree with each other.
     reference : (n, 3) or (n, 7), optional
         Poses that say what is wrong: the solved network, or the truth; by default the network's own values. A loop
-        that these poses do not contradict at 0.999 (χ² of its own information) is drawn again, so that every loop
+        that these poses do not contradict at 1 - 1e-9 (χ² of its own information) is drawn again, so that every loop
         that is called wrong is wrong. Without it the noise of aliased loops is drawn from their information instead.
     group_size : int
         Loops in a group of aliased ones.
