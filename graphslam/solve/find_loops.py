@@ -43,11 +43,11 @@ class FindConfig:
     front_end: bool = False
     """Also the front end's matches; not where they are factors of the graph already."""
     rounds: int = 3
-    """Proximity is asked again after loops were taken, at most so often: the graph knows more by then."""
+    """Proximity is asked, again after loops were taken, at most so often: the graph knows more by then (0: never)."""
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ConfigError(f"find loops: rounds = {self.rounds}; wanted at least 1")
+        if self.rounds < 0:
+            raise ConfigError(f"find loops: rounds = {self.rounds}; wanted at least 0")
 
 
 def find_loops(

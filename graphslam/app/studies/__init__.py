@@ -8,4 +8,5 @@ STUDIES: dict[str, str] = {
     "segslam-garage": "graphslam.app.studies.segslam_garage:STUDY",
     "segslam-mine": "graphslam.app.studies.segslam_mine:STUDY",
     "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
+    "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
 }
