@@ -90,7 +90,7 @@ def demo(
 
 
 def simulate(
-    world: str = typer.Argument(..., help="landmark-field, garage, mine or building"),
+    world: str = typer.Argument(..., help="landmark-field, garage, mine, building or court"),
     out: Path = typer.Option(..., help="Folder for the log, truth included."),
     seed: int = typer.Option(0, help="Of every error, and of what can be moved in the world."),
     layout: str | None = typer.Option(None, help="Of the garage: A, B or C."),

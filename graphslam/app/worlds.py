@@ -52,6 +52,7 @@ MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
     "mine": MeshWorld("graphslam.sim.mine", "mine"),
     "building": MeshWorld("graphslam.sim.building", "building"),
+    "court": MeshWorld("graphslam.sim.court", "court"),
 }
 
 
@@ -101,7 +102,7 @@ def simulate(
     Parameters
     ----------
     world : str
-        ``landmark-field``, ``garage``, ``mine`` or ``building``.
+        ``landmark-field``, ``garage``, ``mine``, ``building``; ``court``, the small one.
     seed : int
         Of every error, and of what can be moved in the world.
     preset : str, optional

@@ -107,7 +107,7 @@ def test_every_world_can_be_driven(name: str) -> None:
     wanted = 0.03 * log.meta["length"]
     drawn = log.meta["drawn"]
     turned = abs(drawn["gyro_bias"][2]) * log.meta["duration"]
-    assert 0.4 < turned <= 1.2
+    assert (0.2 if name == "court" else 0.4) < turned <= 1.2  # the court is driven in a minute
     if name == "building":  # a star ends at its middle: its drift is hidden at the end
         assert turned > 0.75
     else:
