@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml setup.py
 
 demo: $(STAMP)
 	$(BIN)/graphslam demo --out demo-run
-	@echo "look at demo-run/figures/map.png"
+	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

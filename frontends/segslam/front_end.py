@@ -9,6 +9,7 @@ from typing import ClassVar
 from frontends.filter_drift import FilterDrift
 from frontends.grid_config import GridFilterConfig
 from frontends.segslam.config import SegSlamConfig
+from frontends.segslam.progress import Watch
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segslam import run_segslam
 from frontends.segslam.submaps import drift_by_path, settle, settled_chain
@@ -43,6 +44,8 @@ class SegSlam:
     """
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
+    watch: Watch | None = field(default=None, compare=False, repr=False)
+    """Called after every step of the filter with how far it is; changes nothing."""
     name: ClassVar[str] = "segslam"
 
     def submaps(
@@ -51,7 +54,7 @@ class SegSlam:
         """See :class:`frontends.base.FrontEnd`: the settled chain of the best particle, segment by segment."""
         c = self.config
         steps = make_steps(log, c.steps, drops=drops)
-        result = run_segslam(steps, c.filter, c.segslam, seed.child(0))
+        result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=self.watch)
         for submap in settled(result, c.drift, c.segslam):
             if after is None or submap.key > after.key:
                 yield submap

@@ -21,6 +21,7 @@ from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.matching import Attempt, Matcher
+from frontends.segslam.progress import Progress, Watch
 from frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
 from frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
 from frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
@@ -42,6 +43,7 @@ def run_segslam(
     *,
     progress: bool = False,
     prune_every: int = 32,
+    watch: Watch | None = None,
 ) -> SegSlamResult:
     """Run SegSLAM over all steps.
 
@@ -57,6 +59,8 @@ def run_segslam(
         Show a progress bar.
     prune_every : int
         See :class:`~frontends.ancestry.Ancestry`.
+    watch : callable, optional
+        Called with a :class:`~frontends.segslam.progress.Progress` after every step; changes nothing.
 
     Raises
     ------
@@ -70,6 +74,8 @@ def run_segslam(
         begin = time.perf_counter()
         run.step(k)
         run.step_seconds[k] = time.perf_counter() - begin
+        if watch is not None:
+            watch(run.progress(k))
     return run.result()
 
 
@@ -303,6 +309,12 @@ class _Run:
         return Segmenter(
             self.config.segmentation, float(self.steps.times[k]), float(self.path_length[k]), float(self.turned[k])
         )
+
+    def progress(self, k: int) -> Progress:
+        """After step k."""
+        best = self.filter.particles.best
+        last = int(self.closed[best]) if k == len(self.steps) - 1 else int(self.segmap.previous[best])
+        return Progress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
 
     # --- the end ---------------------------------------------------------------------------------------------
 

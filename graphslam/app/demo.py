@@ -1,44 +1,126 @@
-"""The first thing a newcomer sees: a simulated drive, a map with ellipses, and every joiner on the same submaps."""
+"""The first thing a newcomer sees: a robot in a garage, SegSLAM, one graph, and the map that follows it."""
 
 from __future__ import annotations
 
+import logging
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
+from tqdm import tqdm
 
-from graphslam.app.compare import compare, methods_json
+from frontends.segslam.progress import Progress
 from graphslam.app.pipeline import run
 from graphslam.app.run import Run
-from graphslam.app.run_folder import RunFolder
-from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import simulate
+from graphslam.core.errors import UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.evaluate.submap_consistency import submaps_consistency
+from graphslam.core.log import SensorLog
+from graphslam.core.trajectory import Trajectory
 from graphslam.plots.comparison import plot_comparison
-from graphslam.plots.consistency import plot_consistency
 from graphslam.plots.save import save
+from graphslam.plots.segments import plot_segments
+
+logger = logging.getLogger(__name__)
+
+PRESETS = {"garage": 20, "quick": 5}
+"""Sizes of the demo, and their particles: the garage of two levels, 305 m; or a court, 51 m, in seconds."""
 
 
-def run_demo(out: Path, *, seed: int = 1, preset: str = "demo", progress: bool = True) -> tuple[Run, pd.DataFrame]:
-    """Simulate, run, compare, draw. Idempotent: a demo folder of the same seed and preset is gone on with.
+def demo_log(preset: str, seed: int) -> SensorLog:
+    """The drive of a demo.
 
-    Returns
-    -------
-    run : Run
-    comparison : DataFrame
-        One row a method.
+    Raises
+    ------
+    UnknownNameError
+    GraphSlamError
+        Open3D, which casts the rays of the scanner, is not there.
     """
-    log = simulate("landmark-field", seed=seed, preset=preset)
-    result = run(log, out=out, seed=seed, resume=True, progress=progress)
-    source = submap_source(result)
-    comparison = compare(source.submaps, truth=source.truth, progress=progress)
-    folder = RunFolder(out)
-    folder.write_json("compare.json", methods_json(comparison))
-    save(comparison_figure(comparison), folder.figures / "compare.png")
-    save(submap_honesty_figure(result), folder.figures / "consistency.png")
-    return result, comparison
+    if preset not in PRESETS:
+        raise UnknownNameError("size of the demo", preset, PRESETS)
+    if preset == "garage":
+        return simulate("garage", seed=seed)
+    from graphslam.sim.court import court
+    from graphslam.sim.crawler import simulate_crawler
+    from graphslam.sim.crawler_config import CrawlerConfig
+
+    return simulate_crawler(court(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+
+
+def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool = True) -> Run:
+    """Simulate, run SegSLAM, join its segments in a graph, fuse the map. A demo that is there already is gone on with.
+
+    ``figures/progress.png`` is drawn anew whenever a segment ends: the first thing to look at.
+    """
+    log = demo_log(preset, seed)
+    options = {"frontend": {"filter": {"particles": PRESETS[preset]}}}
+    truth = None if log.truth is None else log.truth.trajectory
+    with DemoProgress(out / "figures" / "progress.png", truth, shown=progress) as watch:
+        return run(
+            log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=False, watch=watch
+        )
+
+
+@dataclass
+class DemoProgress:
+    """One line on stderr that says where the demo is, and a picture of the segments so far.
+
+    Parameters
+    ----------
+    picture : Path
+    truth : Trajectory or None
+        Drawn beside the segments.
+    shown : bool
+        Show the line.
+    """
+
+    picture: Path
+    truth: Trajectory | None = None
+    shown: bool = True
+    drawn: int = field(default=0, init=False)
+    """Segments of the last picture."""
+    bar: Any = field(default=None, init=False)
+
+    def __enter__(self) -> DemoProgress:
+        self.bar = tqdm(desc="SegSLAM", unit="step", disable=not self.shown, leave=False, dynamic_ncols=True)
+        self.bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def __call__(self, at: Progress) -> None:
+        """After every step of the filter."""
+        if self.bar.total is None:
+            self.bar.total = at.steps
+        self.bar.update(at.step - self.bar.n)
+        last = at.step == at.steps
+        n = at.segments
+        if n > self.drawn:
+            self.draw(at)
+            self.drawn = n
+        where = f"{at.length:.0f} m, {n} segments"
+        if self.drawn:
+            where += f", look at {self.picture}"
+        if last:
+            self.bar.set_description("segments → graph → fused map")
+        self.bar.set_postfix_str(where, refresh=last)
+
+    def draw(self, at: Progress) -> None:
+        """The picture, in place of the one before."""
+        self.picture.parent.mkdir(parents=True, exist_ok=True)
+        paths = at.paths()
+        truth = self.truth
+        if truth is not None:  # as the map is, in the frame of the first base
+            from graphslam.core.poses import group_of, level
+
+            truth = truth.transformed(group_of(truth.poses).inverse(level(truth.poses[0])))
+        title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closed yet"
+        ax = plot_segments(None, paths, truth=truth, title=title)
+        part = self.picture.with_name(f".{self.picture.name}.part.png")
+        save(ax, part)
+        part.replace(self.picture)
 
 
 def comparison_figure(comparison: pd.DataFrame) -> Any:
@@ -55,13 +137,3 @@ def comparison_figure(comparison: pd.DataFrame) -> Any:
         label="NEES / dof of poses and landmarks, before any polish",
         title="The same submaps joined five ways",
     )
-
-
-def submap_honesty_figure(result: Run) -> Any:
-    """NEES of every submap's joint Gaussian over exit and landmarks, each submap against its own truth."""
-    assert result.log is not None
-    assert result.log.truth is not None
-    found = submaps_consistency(result.submaps, result.log.truth)
-    keys = np.array([s.key + 1 for s in result.submaps])
-    curves = {"exit and landmarks": found["joint"]}
-    return plot_consistency(None, curves, submaps=keys, title="Is every submap honest on its own?")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -67,6 +67,7 @@ def run(
     resume: bool = False,
     progress: bool = True,
     undo: Sequence[int] = (),
+    watch: Callable[[Any], None] | None = None,
 ) -> Run:
     """Run a front end over a log, join its submaps in a graph, and score what can be scored.
 
@@ -87,6 +88,8 @@ def run(
         Show a progress bar on stderr.
     undo : sequence of int
         Loops that are taken out again at the end, by their numbers in the ledger of loops.
+    watch : callable, optional
+        Handed to a front end that can be watched (``segslam``: `frontends.segslam.progress`); others ignore it.
 
     Raises
     ------
@@ -94,7 +97,7 @@ def run(
         Or one of its children; says what, where, got, wanted.
     """
     with one_blas_thread():
-        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo)
+        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, watch)
 
 
 def _run(
@@ -107,13 +110,16 @@ def _run(
     resume: bool,
     progress: bool,
     undo: Sequence[int],
+    watch: Callable[[Any], None] | None,
 ) -> Run:
     begin = time.perf_counter()
     log = load_log_source(source)
     seconds = {"load": time.perf_counter() - begin}
     options = cfg.merge(recommended(log, frontend), config)
     settings: cfg.RunConfig = cfg.build(cfg.RunConfig, options)
-    front = make_front_end(frontend, settings.frontend)
+    front: Any = make_front_end(frontend, settings.frontend)
+    if watch is not None and hasattr(front, "watch"):
+        front = replace(front, watch=watch)
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     folder = None if out is None else RunFolder.start(out, effective, resume=resume)
 

@@ -1,0 +1,61 @@
+"""How far a run of SegSLAM is: for whoever waits for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from frontends.segslam.segmap import SegMap
+from frontends.segslam.submaps import base_of, settled_chain
+from graphslam.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """A look at a run. Of use until the next step only: the SegMap goes on.
+
+    Parameters
+    ----------
+    step, steps : int
+        Steps done, of how many.
+    length : float
+        Driven so far, by the odometry [m].
+    segmap : SegMap
+    last : int
+        The segment that the best particle closed last; -1 before the first.
+    """
+
+    step: int
+    steps: int
+    length: float
+    segmap: SegMap
+    last: int
+
+    @property
+    def segments(self) -> int:
+        """Segments of the best particle's chain that are closed."""
+        return 0 if self.last < 0 else len(settled_chain(self.segmap, self.last))
+
+    def paths(self) -> list[Array]:
+        """Paths ``(n, 7|3)`` of the closed segments of the best particle's chain, in the frame of the first base.
+
+        Along the exits, as the segments are handed over: no loop is closed.
+        """
+        if self.last < 0:
+            return []
+        g, out = self.segmap.group, []
+        base = g.identity
+        for i in settled_chain(self.segmap, self.last).tolist():
+            s = self.segmap[i]
+            entry = base_of(self.segmap, s.T_entry)
+            local = g.compose(np.broadcast_to(g.inverse(entry), s.path.shape), s.path)
+            out.append(g.compose(np.broadcast_to(base, local.shape), local))
+            base = g.compose(base, g.between(entry, base_of(self.segmap, s.T_exit)))
+        return out
+
+
+Watch: TypeAlias = Callable[[Progress], None]
+"""Called after every step."""
