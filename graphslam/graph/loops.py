@@ -7,7 +7,8 @@ One wrong loop ruins a map, so a loop passes, in this order,
    consistency);
 3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
 4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
-   are in, every one is asked what the graph *without* it says of it.
+   are in, every one is asked what the graph *without* it says of it;
+5. and if more loops that agree were shut out by a group than the group has, the two change places.
 
 With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
@@ -34,6 +35,9 @@ from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
 from graphslam.graph.noise import Robust
 from graphslam.registration.submap_pairs import prediction_chi2
+
+SHUTS_OUT = 0.25
+"""A loop that contradicts this share of a group that was shut out is a rival of that group."""
 
 
 class LoopGraph(Protocol):
@@ -172,6 +176,8 @@ class LoopCloser:
             if not refused:
                 break
             out |= refused
+        if self._exchange():
+            self._reconsider()
         self._say_weights()
 
     def _round(self, new: list[int], out: set[int]) -> set[int]:
@@ -212,34 +218,79 @@ class LoopCloser:
 
     def _one_by_one(self, numbers: list[int]) -> None:
         """Add loops in this order, each against the graph as it is by then."""
-        c, d = self.config, self._dof
+        for n in numbers:
+            verdict, why, facts = self._try(n)
+            self._write(n, verdict, why, **facts)
+
+    def _try(self, n: int) -> tuple[Verdict, str, dict[str, float]]:
+        """Add one loop if the graph bears it: verdict, reason, figures."""
+        c, d, loop = self.config, self._dof, self.loops[n]
         limit = float(stats.chi2.ppf(c.level, d))
         earlier_limit = float(stats.chi2.ppf(c.earlier, d))
-        for n in numbers:
-            loop = self.loops[n]
-            T, P = self.graph.relative(np.array([loop.i]), np.array([loop.j]))
-            expected = prediction_chi2(loop.T_ij, loop.covariance, T[0], P[0])
-            if not expected <= limit:  # NaN is not
-                self._write(n, "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", chi2=expected)
-                continue
-            before = self.graph.chi2()
-            fid = self.graph.add_loop(loop, self._kernel())
+        T, P = self.graph.relative(np.array([loop.i]), np.array([loop.j]))
+        expected = prediction_chi2(loop.T_ij, loop.covariance, T[0], P[0])
+        if not expected <= limit:  # NaN is not
+            return "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", {"chi2": expected}
+        before = self.graph.chi2()
+        fid = self.graph.add_loop(loop, self._kernel())
+        self.graph.solve()
+        after = self.graph.chi2()
+        effect = sum(after.values()) - sum(before.values())
+        earlier = sum(after[f] - before[f] for f in before)
+        facts = {"chi2": expected, "effect_predicted": expected, "effect": effect, "effect_earlier": earlier}
+        if not earlier <= earlier_limit:
+            self.graph.remove_loop(fid)
             self.graph.solve()
-            after = self.graph.chi2()
-            effect = sum(after.values()) - sum(before.values())
-            earlier = sum(after[f] - before[f] for f in before)
-            facts = {"chi2": expected, "effect_predicted": expected, "effect": effect, "effect_earlier": earlier}
-            if not earlier <= earlier_limit:
-                self.graph.remove_loop(fid)
-                self.graph.solve()
-                worst = max(before, key=lambda f: after[f] - before[f])
-                why = (
-                    f"effect: χ² of earlier factors rises by {earlier:.1f} > {earlier_limit:.1f} (most: factor {worst})"
-                )
-                self._write(n, "switched-off", why, **facts)
-                continue
-            weight = float(self._kernel().weight(np.array([after[fid]]))[0])
-            self._write(n, "accepted", found_why(expected, d), factor_id=fid, weight=weight, **facts)
+            worst = max(before, key=lambda f: after[f] - before[f])
+            why = f"effect: χ² of earlier factors rises by {earlier:.1f} > {earlier_limit:.1f} (most: factor {worst})"
+            return "switched-off", why, facts
+        weight = float(self._kernel().weight(np.array([after[fid]]))[0])
+        return "accepted", found_why(expected, d), {**facts, "factor_id": fid, "weight": weight}
+
+    def _exchange(self) -> bool:
+        """Were more loops shut out by the company of others than these are? Then they take the others' place.
+
+        Pairs are compared with the chain between them, which may bear much; loops that agree two by two may still not
+        fit into one graph together with a group that is wrong, and each of them is refused by itself.
+        """
+        inside, outside = self.accepted, self._refused_by_company()
+        outside = [n for n in outside if self._bears(n)]
+        if not inside or len(outside) < 2:
+            return False
+        agreed = self._consistent(outside).accepted
+        outside = [n for n, good in zip(outside, agreed) if good]
+        both = self._consistent([*inside, *outside])
+        clash = both.chi2[: len(inside), len(inside) :] > both.limit
+        # a right pair disagrees now and then by chance: rivals are those that shut out many
+        rivals = [n for n, row in zip(inside, clash) if row.mean() > SHUTS_OUT]
+        if not rivals or len(outside) <= len(rivals):
+            return False
+        for n in rivals:
+            self.graph.remove_loop(self.ledger.of(n).factor_id)
+        self.graph.solve()
+        added = {}
+        for _, n in sorted(zip(self._against_chain(outside), outside)):
+            verdict, why, facts = self._try(n)
+            if verdict == "accepted":
+                added[n] = (why, facts)
+        if len(added) > len(rivals):
+            for n in rivals:
+                why = f"exchange: shut out {len(added)} that agree with each other, {len(rivals)} did"
+                self.ledger.write(replace(self.ledger.of(n), verdict="switched-off", why=why, weight=0.0, factor_id=-1))
+            for n, (why, facts) in added.items():
+                self._write(n, "accepted", why, **facts)
+            return True
+        for _, facts in added.values():
+            self.graph.remove_loop(int(facts["factor_id"]))
+        for n in rivals:
+            fid = self.graph.add_loop(self.loops[n], self._kernel())
+            self.ledger.write(replace(self.ledger.of(n), factor_id=fid))
+        self.graph.solve()
+        return False
+
+    def _bears(self, n: int) -> bool:
+        """Whether the chain alone bears a loop."""
+        return self._against_chain([n])[0] <= float(stats.chi2.ppf(self.config.chain, self._dof))
 
     def _reconsider(self) -> set[int]:
         """Switch off, worst first, what the rest of the graph contradicts; which these were."""

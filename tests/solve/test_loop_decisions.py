@@ -91,6 +91,32 @@ def test_a_wrong_loop_that_came_first_is_switched_off_when_the_right_ones_come()
     assert history == ["accepted", "switched-off"]
 
 
+def test_a_group_that_shuts_out_more_than_it_has_is_exchanged() -> None:
+    """Three wrong loops that agree with each other came first; right ones come one at a time, each refused by them."""
+    poses = square_poses(3)
+    closer, net = closer_of(poses, 3)
+    _, P = net.relative(np.array([10]), np.array([58]))
+    off = np.zeros(6)
+    off[3] = 2.0 * math.sqrt(P[0, 3, 3])
+    g = group_of(poses)
+    W = g.compose(g.compose(poses[58], g.exp(off)), g.inverse(poses[58]))  # one motion of the whole second round
+    moved = g.compose(np.broadcast_to(W, poses[56:61].shape), poses[56:61])
+    wrong = []
+    for j in (57, 58, 59):
+        x = loop_of(poses, j - 48, j, np.random.default_rng(j))
+        wrong.append(replace(x, T_ij=g.between(poses[j - 48], moved[j - 56])))
+    first = [d.loop for d in closer.propose(wrong)]
+    assert closer.accepted == first
+    for k, i in enumerate((8, 9, 10, 11, 12)):
+        closer.propose([loop_of(poses, i, i + 48, np.random.default_rng(500 + i))])
+        assert k >= 3 or set(first) <= set(closer.accepted)
+    assert not set(first) & set(closer.accepted)
+    assert len(closer.accepted) >= 4
+    assert np.abs(net.poses - poses)[:, :3].max() < 0.5
+    for n in first:
+        assert closer.ledger.of(n).factor_id == -1
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_graph_without_a_loop_is_what_it_is_without_it(dim: int) -> None:
     """Against the graph that never had it."""
