@@ -13,7 +13,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network_batch import BatchProblem, is_converged, polish
+from graphslam.solve.network_batch import BatchProblem, Polished, is_converged, polish
 from graphslam.solve.network_certificate import Certificate, certify
 from graphslam.solve.network_consensus import odometry_edges
 from graphslam.solve.network_diagnose import check_determined, check_full_rank
@@ -34,6 +34,8 @@ from graphslam.solve.network_sparse import PcgProblem
 INLIER_PROBABILITY = 0.9999
 # Least squares of all measurements, beside the robust answer, gets so many steps.
 BATCH_STEPS = 10
+# … unless more than this share of everything is left out.
+FEW = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ class NetworkSolution:
     gap : float
         Objective minus the lowest that any start reached in this run. For gnc it is what leaving out outliers costs
         in the objective of all measurements, against what a few steps of least squares from there reach (or the
-        starts that were asked for).
+        starts that were asked for); nan if so much is left out that this was not tried.
     start : str
         Which start won.
     starts : tuple of StartReport
@@ -316,6 +318,10 @@ def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
 def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: Robust) -> Optimum:
     """What least squares of everything makes of the robust answer, in a few steps: the gap is measured against it."""
     initial = problem.objective(robust.end.values)
+    if np.mean(~robust.inliers) > FEW:
+        # random loops fill the factorisation: a step of everything costs many times the whole robust solve
+        unknown = Polished(robust.end.values, float("nan"), float("inf"), 0, "rejected")
+        return Optimum(problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),))
     best = polish(problem, robust.end.values, max_iterations=BATCH_STEPS)
     report = StartReport("inliers", initial, best.objective, best.iterations, best.status)
     return Optimum(problem, best, "inliers", (report,))

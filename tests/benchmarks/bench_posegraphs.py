@@ -52,9 +52,10 @@ def main() -> int:
             bad = solver != "gnc" and (abs(off) > 1e-6 or not r["converged"])
             failed += bad
             others = ", ".join(f"{s['name']} {s['objective'] or float('nan'):.6g} ({s['status']})" for s in r["starts"])
+            gap = float("nan") if r["gap"] is None else r["gap"]
             print(
                 f"{Path(name).name:32} {solver:6} {r['objective_initial']:12.6g} {r['objective']:14.9g} {off:10.1e} "
-                f"{r['gap']:9.2g} {r.get('gap_incremental', float('nan')):10.3g} {r['iterations']:4d} {cpu:7.2f} "
+                f"{float('nan') if r['gap'] is None else r['gap']:9.2g} {r.get('gap_incremental', float('nan')):10.3g} {r['iterations']:4d} {cpu:7.2f} "
                 f"{r['seconds']:7.2f} {r['start']:11} {others}"
                 + (f"; {r['outliers']} outliers" if solver == "gnc" else "")
                 + ("  <-- NOT at the best known" if bad else ""),

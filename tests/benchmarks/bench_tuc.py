@@ -108,6 +108,8 @@ def draw(path: str, truth: np.ndarray, paths: dict[str, np.ndarray], network: Po
         axis.plot(*xy.T, linewidth=0.8, label=name)
         axis.set_aspect("equal")
         axis.set_title(name)
+    for axis in axes.ravel()[len(paths) :]:
+        axis.set_visible(False)
     figure.tight_layout()
     figure.savefig(path, dpi=70)
 
