@@ -64,7 +64,9 @@ def places_of_graph(graph: PoseGraph) -> Places:
 
 
 def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
-    """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the factors of the chain say.
+    """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
+
+    The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
 
     Raises
     ------
@@ -78,7 +80,7 @@ def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
             if not isinstance(r, BetweenRecord) or (r.i, r.j) != (s.nodes[k], s.nodes[k + 1]):
                 raise DataError(f"the chain of submap {s.key} is not whole", got=f"factor {fid}")
             T.append(r.T_ij)
-            P.append(np.linalg.inv(r.whitener.T @ r.whitener))
+            P.append(s.stated[k])
     return np.stack(T), np.stack(P)
 
 

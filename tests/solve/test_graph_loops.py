@@ -15,6 +15,7 @@ from graphslam.graph.loop_places import places_of
 from graphslam.graph.loops import LoopCloser
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.solve.loop_network import LoopNetwork
@@ -117,3 +118,18 @@ def test_what_is_no_chain_is_refused() -> None:
     graph.add_submap(submaps[2], spacing=3.0)
     with pytest.raises(DataError, match="one chain"):
         places_of_graph(graph)
+
+
+def test_the_chain_of_levelled_submaps_is_what_they_stated() -> None:
+    """A levelled exit gave its relative roll and pitch to an attitude: the chain by itself still has them."""
+    submaps = submaps_of(square_poses(3, nodes=37), np.random.default_rng(1))
+    plain, level = PoseGraph(3), PoseGraph(3)
+    for s in submaps:
+        plain.add_submap(s, spacing=3.0)
+        level.add_submap(s, spacing=3.0, level_sigma=0.006)
+    for a, b in zip(chain_of_graph(plain), chain_of_graph(level)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    r = level.records[level.submaps[0].factor_ids[len(level.submaps[0].nodes) - 2]]
+    assert isinstance(r, BetweenRecord)
+    given_up = np.linalg.inv(r.whitener.T @ r.whitener)
+    assert given_up[0, 0] > 100 * chain_of_graph(level)[1][len(level.submaps[0].nodes) - 2][0, 0]
