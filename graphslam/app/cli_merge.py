@@ -18,7 +18,9 @@ def register(app: typer.Typer) -> None:
 
 def merge(
     runs: list[Path] = typer.Argument(..., help="Run folders, at least two; the first one's base is the origin."),
-    by: str = typer.Option("auto", help="identity, constellation (the pattern of the landmarks), or auto."),
+    by: str = typer.Option(
+        "auto", help="Landmarks: identity, constellation (their pattern). Dense submaps: places, gps. Or auto."
+    ),
     solver: str = typer.Option("batch", help="isam2 or batch."),
     identity_gate: float = typer.Option(25.0, help="Split off sightings beyond this χ² (2 dof); 0 = never."),
     tolerance: float = typer.Option(0.5, help="Landmarks of two maps this near after alignment agree [m]."),

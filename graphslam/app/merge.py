@@ -8,12 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from graphslam.app.dense_sessions import is_dense
+from graphslam.app.merge_dense import MergedSubmaps, merge_dense, write_merged_dense
 from graphslam.app.merge_metrics import merge_metrics
 from graphslam.app.outputs import open_run
 from graphslam.app.run import GlobalMap, Run
@@ -32,7 +34,7 @@ from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
-By = Literal["auto", "identity", "constellation"]
+By = Literal["auto", "identity", "constellation", "places", "gps"]
 IDENTITY_GATE = 25.0
 MERGE_GATE = 11.8
 
@@ -129,7 +131,7 @@ def merge(
     identity_gate: float = IDENTITY_GATE,
     tolerance: float = 0.5,
     out: str | Path | None = None,
-) -> MergedMap:
+) -> MergedMap | MergedSubmaps:
     """Merge runs into one map: align them by common landmarks, then solve all their submaps together.
 
     The first base of the first run is fixed, the first bases of the others are free. Every submap of every run is one
@@ -139,9 +141,10 @@ def merge(
     ----------
     runs : sequence of Run or run folder
         At least two. A run joins when it shares landmarks with those that are in already, most shared first.
-    by : {"auto", "identity", "constellation"}
+    by : {"auto", "identity", "constellation", "places", "gps"}
         Landmarks are the same by their identities, or by the pattern they form. ``auto``: by identity where every run
-        took the identities of its log, else by constellation.
+        took the identities of its log, else by constellation. Dense submaps are tied by ``places`` or by ``gps``
+        (:func:`graphslam.app.merge_dense.merge_dense`).
     solver : str
         Registered solver.
     identity_gate : float
@@ -158,11 +161,17 @@ def merge(
     DataError
         Runs that share fewer than two landmarks, or whose landmarks do not say how they lie; names the run.
     """
-    if by not in ("auto", "identity", "constellation"):
-        raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:
         raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
+    if all(is_dense(r) for r in opened):
+        with one_blas_thread():
+            dense = merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
+        if out is not None:
+            write_merged_dense(Path(out), dense)
+        return dense
+    if by not in ("auto", "identity", "constellation"):
+        raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
     if by == "auto":
         by = "identity" if all(r.report.get("identities") == "truth" for r in opened) else "constellation"
     with one_blas_thread():

@@ -204,6 +204,21 @@ def truth_path(log: SensorLog, times: Array, first: Submap | None = None) -> Tra
     return Trajectory(inside, group_of(poses).between(np.broadcast_to(base, poses.shape), poses))
 
 
+def true_first_base(log: SensorLog, first: Submap) -> list[float] | None:
+    """Where the first base truly was in the world of the log, which several logs may share; None where not known.
+
+    Logs of one simulated world share its frame (``meta["T_world_frame"]``); what is said of others is in the frame of
+    their truth.
+    """
+    if log.truth is None or not _covered(log.truth.trajectory, np.array([first.interval[0]]))[0]:
+        return None
+    path = log.truth.trajectory
+    base = true_base(path, first) if path.dim == 3 else path.interpolate(np.array([first.interval[0]]))[0]
+    if "T_world_frame" in log.meta:
+        base = group_of(base).compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)
+    return [float(v) for v in base]
+
+
 def truth_metrics(
     out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool, path: Trajectory | None = None
 ) -> None:

@@ -17,6 +17,7 @@ from graphslam.app.run_maps import draw_run_map, write_run_map
 from graphslam.core.atomic import read_json, read_npz, write_npz
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.geometry import Array
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
@@ -27,6 +28,7 @@ from graphslam.io.tum import read_tum, write_tum
 
 MAP_FORMAT = "graphslam.map/1"
 GPS_FORMAT = "graphslam.gps-residuals/1"
+FIXES_FORMAT = "graphslam.fixes/1"
 ASSOCIATION_FORMAT = "graphslam.association/1"
 
 
@@ -48,6 +50,10 @@ def write_outputs(folder: RunFolder, run: Run) -> None:
     for name, r in run.gps.items():
         arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
         write_npz(folder.path / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays})
+    if run.fixes is not None:
+        g = run.fixes
+        arrays = {"times": g.times, "positions": g.positions, "sigma": g.sigma, "lever": g.lever}
+        write_npz(folder.path / "fixes.npz", {"format": FIXES_FORMAT, **arrays})
     folder.write_lines("events.jsonl", run.events)
     if run.ledger is not None:
         folder.write_text("ledger.csv", run.ledger.to_csv(index=False))
@@ -164,6 +170,7 @@ def open_run(path: str | Path) -> Run:
         ledger=pd.read_csv(root / "ledger.csv", keep_default_na=False) if (root / "ledger.csv").is_file() else None,
         folder=root,
         gps={p.stem.removeprefix("gps_"): _gps(p) for p in sorted(root.glob("gps_*.npz"))},
+        fixes=_fixes(root / "fixes.npz"),
         truth=read_truth(root),
         truth_path=_path(root / "truth.tum", m.dim),
         dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
@@ -182,6 +189,13 @@ def _gps(file: Path) -> GpsResiduals:
         outside=int(a["outside"]),
         in_gap=int(a["in_gap"]),
     )
+
+
+def _fixes(file: Path) -> Gps | None:
+    if not file.is_file():
+        return None
+    a = read_npz(file, fmt=FIXES_FORMAT)
+    return Gps(times=a["times"], positions=a["positions"], sigma=a["sigma"], lever=a["lever"])
 
 
 def _path(file: Path, dim: int) -> Trajectory | None:

@@ -29,6 +29,7 @@ from graphslam.app.metrics import (
     map_truth,
     solution_metrics,
     time_metrics,
+    true_first_base,
     truth_metrics,
     truth_path,
 )
@@ -285,6 +286,9 @@ def _judge(
     report = {
         "format": "graphslam.run/1",
         **effective["run"],
+        "backend": effective["backend"],
+        "gps": effective["gps"],
+        "T_world_base": true_first_base(log, submaps[0]),
         "versions": versions(),
         "seconds": seconds,
         "resumed_submaps": work.resumed,
@@ -308,6 +312,7 @@ def _judge(
         events=list(back.graph.events),
         ledger=back.graph.ledger.table(),
         gps=residuals,
+        fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
         log=log,
         truth=truth,
         truth_path=true_path,

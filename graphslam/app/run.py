@@ -14,6 +14,7 @@ import pandas as pd
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
@@ -93,6 +94,8 @@ class Run:
         Which factor spent which stream when.
     gps : mapping of str to GpsResiduals
         ``all`` and, where GPS was in the graph, ``withheld``; empty for a run read back from disk.
+    fixes : Gps or None
+        What of GPS became factors.
     folder : Path or None
     log : SensorLog or None
     truth : MapTruth or None
@@ -115,6 +118,7 @@ class Run:
     events: list[dict[str, Any]] = field(default_factory=list)
     ledger: pd.DataFrame | None = None
     gps: dict[str, GpsResiduals] = field(default_factory=dict)
+    fixes: Gps | None = None
     folder: Path | None = None
     log: SensorLog | None = None
     truth: MapTruth | None = None
