@@ -19,6 +19,7 @@ _VERBS = {
     "join_submaps": "graphslam.app.verbs",
     "local_maps": "graphslam.app.verbs",
     "merge": "graphslam.app.merge",
+    "localise": "graphslam.app.localise",
     "export": "graphslam.app.export",
     "solve_file": "graphslam.app.verbs",
     "simulate": "graphslam.app.verbs",

@@ -15,7 +15,18 @@ import graphslam
 # Before NumPy loads: thousands of small matrices, whose BLAS threads would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from graphslam.app import cli_data, cli_export, cli_join, cli_loops, cli_map, cli_merge, cli_run, cli_study, cli_tools
+from graphslam.app import (
+    cli_data,
+    cli_export,
+    cli_join,
+    cli_localise,
+    cli_loops,
+    cli_map,
+    cli_merge,
+    cli_run,
+    cli_study,
+    cli_tools,
+)
 from graphslam.app.terminal import log_to_stderr
 from graphslam.core.errors import GraphSlamError
 
@@ -47,6 +58,7 @@ cli_join.register(app)
 cli_map.register(app)
 cli_merge.register(app)
 cli_loops.register(app)
+cli_localise.register(app)
 cli_export.register(app)
 cli_study.register(app)
 cli_tools.register(app)

@@ -29,6 +29,9 @@ def run(
     seed: int = typer.Option(0, help="Root of the seed tree."),
     out: Path = typer.Option(..., help="Run folder."),
     resume: bool = typer.Option(False, "--resume", help="Go on after the last finished submap."),
+    saved: list[Path] = typer.Option(
+        [], "--continue", help="Run folder whose graph this session joins, in OUT/continued; may be repeated."
+    ),
     as_json: bool = JSON,
 ) -> None:
     """Raw log → submaps → graph → map, with everything that was measured on the way."""
@@ -46,7 +49,15 @@ def run(
         progress=not as_json,
     )
     rows = result.metrics.to_dict("records")
-    emit({"out": str(out), "metrics": rows, "report": result.report}, _summary(result, out), as_json=as_json)
+    value, text = {"out": str(out), "metrics": rows, "report": result.report}, _summary(result, out)
+    if saved:
+        from graphslam.app.continue_run import continue_runs
+
+        joined = continue_runs(saved, result, out=out / "continued")
+        value["continued"] = joined.report
+        figures = table(joined.metrics.to_dict("records"), ["key", "value", "unit"])
+        text += f"\n{figures}\n{joined!r}, in {out / 'continued'}"
+    emit(value, text, as_json=as_json)
 
 
 def _options(config: Path | None, settings: list[str]) -> dict[str, Any]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graphslam.app import config as cfg
-from graphslam.app.dense_sessions import DenseSession, attach, back_end_config, is_dense, put, session_of
+from graphslam.app.dense_sessions import DenseSession, back_end_config, is_dense, put, session_of, with_grids
+from graphslam.app.dense_ties import attach
 from graphslam.app.front_ends import make_front_end
 from graphslam.app.outputs import open_run
+from graphslam.app.pipeline import load_log_source
 from graphslam.app.run import Run
 from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import DataError, MissingDataError, SolverError
@@ -108,6 +111,43 @@ def localise(
         else:
             submaps = [source] if isinstance(source, Submap) else list(source)
         return _localise(opened, submaps, config or TieConfig(), solver, progress)
+
+
+def source_of(
+    source: str | Path, keys: Sequence[int] = (), begin: float | None = None, end: float | None = None
+) -> Sequence[Submap] | SensorLog:
+    """What is to be found: submaps of a run folder, or a stretch of a log.
+
+    Parameters
+    ----------
+    source : path or card name
+    keys : sequence of int
+        Of a run folder, only these submaps, which must follow one another.
+    begin, end : float, optional
+        Of a log [s].
+
+    Raises
+    ------
+    DataError
+        Keys that are not there, or not in a row; a stretch without records.
+    """
+    path = Path(source)
+    if (path / "run.json").is_file():
+        run = open_run(path)
+        known = [s.key for s in run.submaps]
+        rows = [known.index(k) for k in keys if k in known]
+        if len(rows) != len(keys) or any(b != a + 1 for a, b in pairwise(rows)):
+            raise DataError(
+                "submaps do not follow one another in this run", where=str(path), got=list(keys), wanted=known
+            )
+        submaps = with_grids(run)
+        return submaps if not rows else [submaps[k] for k in rows]
+    log = load_log_source(source)
+    a, b = log.interval
+    part = log.slice(a if begin is None else begin, b if end is None else end)
+    if not any(len(s.times) for s in part.streams.values()):
+        raise DataError("no records in this stretch", where=log.name, got=(begin, end), wanted=log.interval)
+    return part
 
 
 def window_submaps(run: Run, log: SensorLog) -> list[Submap]:

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from graphslam.app.dense_sessions import SESSION, Attached, DenseSession, attach, attach_by_gps, put, session_of
+from graphslam.app.dense_sessions import DenseSession, put, session_of
+from graphslam.app.dense_ties import SESSION, Attached, attach, attach_by_gps
 from graphslam.app.metrics import Metrics
 from graphslam.app.plan_view import plan_path
 from graphslam.app.run import Run
