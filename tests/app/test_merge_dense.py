@@ -54,7 +54,9 @@ class Ready:
 def log_of(d: HallDrive, name: str, seed: int) -> SensorLog:
     """Truth in the frame of the first pose, that frame in the hall's, and GPS of 5 cm that both share."""
     frame, rng = d.path.poses[0], np.random.default_rng(seed)
-    own = Trajectory(d.path.times, se3.se3_between(np.broadcast_to(frame, d.path.poses.shape), d.path.poses))
+    fine = np.linspace(d.path.times[0], d.path.times[-1], 10 * len(d.path) - 9)  # a path with holes is no truth
+    poses = d.path.interpolate(fine)
+    own = Trajectory(fine, se3.se3_between(np.broadcast_to(frame, poses.shape), poses))
     z = se3.se3_transform(np.broadcast_to(T_GPS_WORLD, d.path.poses.shape), d.path.positions)
     z = z + 0.05 * rng.standard_normal(z.shape)
     gps = Gps(times=d.path.times, positions=z, sigma=np.full(len(z), 0.05), lever=np.zeros(3))
