@@ -36,7 +36,7 @@ Mask = npt.NDArray[np.bool_]
 ROUNDS = 12
 # The bulk of recorded loops says little of the tail: with an estimated scale, the limit is so many times wider, though
 # never beyond that of the stated noise.
-MARGIN = 25.0
+MARGIN = 20.0
 # Limits are widened so far to look for what was left out together.
 WIDER = (10.0, 100.0)
 # Loops left out that are tested against the covariance of the answer, at a time, and how often.

@@ -55,7 +55,7 @@ def main() -> int:
             gap = float("nan") if r["gap"] is None else r["gap"]
             print(
                 f"{Path(name).name:32} {solver:6} {r['objective_initial']:12.6g} {r['objective']:14.9g} {off:10.1e} "
-                f"{float('nan') if r['gap'] is None else r['gap']:9.2g} {r.get('gap_incremental', float('nan')):10.3g} {r['iterations']:4d} {cpu:7.2f} "
+                f"{gap:9.2g} {r.get('gap_incremental', float('nan')):10.3g} {r['iterations']:4d} {cpu:7.2f} "
                 f"{r['seconds']:7.2f} {r['start']:11} {others}"
                 + (f"; {r['outliers']} outliers" if solver == "gnc" else "")
                 + ("  <-- NOT at the best known" if bad else ""),
