@@ -56,6 +56,7 @@ def test_there_are_notebooks() -> None:
         "02_what_a_submap_is",
         "03_copy_on_write",
         "04_segslam_garage",
+        "05_from_segmap_to_map",
         "06_consistency_study",
         "07_one_set_of_submaps",
     } <= {p.stem for p in NOTEBOOKS}
