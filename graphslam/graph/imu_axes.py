@@ -1,0 +1,145 @@
+"""Are the axes of an IMU those that its mounting says? Swapped or turned ones are found by their residuals, and named.
+
+Over windows of about a second the gyro's turn and the mean specific force are compared with what a path says of them,
+``m = A r + b T`` and ``f = A Rᵀ (0, 0, g)``, for all 48 ways A in which three axes can be exchanged and turned round.
+What moves the body cancels out of f over many windows; the bias b is solved for. Ways that nothing tells apart (x and y
+of a body that stays level) are no reproach: only what contradicts the stated mounting is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY, Imu
+from graphslam.core.trajectory import Trajectory
+
+_AXES = "xyz"
+
+
+def signed_permutations() -> Array:
+    """All ways ``(48, 3, 3)`` to exchange axes and turn them round, the identity first; half of them are mirrored."""
+    out = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            A = np.zeros((3, 3))
+            A[np.arange(3), order] = signs
+            out.append(A)
+    return np.stack(out)
+
+
+@dataclass(frozen=True, slots=True)
+class AxesCheck:
+    """What a path says of the axes of an IMU.
+
+    Parameters
+    ----------
+    wrong : bool
+        The stated mounting is contradicted.
+    A : (3, 3)
+        What explains the readings best: ``reading = A · what the stated mounting would read``.
+    excess : float
+        By how much the residuals of the stated mounting are larger, in units of the noise that the best leaves (χ²).
+    alike : int
+        Ways that explain the readings as well as the best one.
+    windows : int
+    """
+
+    wrong: bool
+    A: Array
+    excess: float
+    alike: int
+    windows: int
+
+    def words(self) -> str:
+        """Which axis reads what: ``"x reads −y, y reads x"``; empty if they are as stated."""
+        if not self.wrong:
+            return ""
+        said = []
+        for row in range(3):
+            column = int(np.argmax(np.abs(self.A[row])))
+            sign = "" if self.A[row, column] > 0 else "−"
+            if column != row or sign:
+                said.append(f"{_AXES[row]} reads {sign}{_AXES[column]}")
+        return ", ".join(said)
+
+    def raise_if_wrong(self, where: str = "imu") -> None:
+        """Raise if the stated mounting is contradicted.
+
+        Raises
+        ------
+        DataError
+        """
+        if self.wrong:
+            several = "" if self.alike == 1 else f" (or one of {self.alike - 1} others that fit as well)"
+            raise DataError(
+                f"the axes are not those that its mounting says: {self.words()}{several}",
+                where=where,
+                got=f"χ² {self.excess:.0f} more than the best explanation over {self.windows} windows",
+                wanted="T_base_imu as the unit is mounted",
+            )
+
+
+def check_imu_axes(
+    imu: Imu, path: Trajectory, *, window: float = 1.0, limit: float = 50.0, force_sigma: float = 0.3
+) -> AxesCheck:
+    """Compare an IMU with a path that is about right and whose frame is about level.
+
+    Parameters
+    ----------
+    imu : Imu
+    path : Trajectory
+        ``T_world_base``, z up.
+    window : float
+        [s]
+    limit : float
+        The stated mounting is contradicted if its χ² exceeds that of the best explanation by this.
+    force_sigma : float
+        What accelerations leave in the mean specific force of a window at least [m/s²].
+
+    Raises
+    ------
+    DataError
+        Path and readings share fewer than ten windows.
+    """
+    begin, end = max(imu.times[0], path.times[0]), min(imu.times[-1], path.times[-1])
+    n = int((end - begin) // window)
+    if n < 10:
+        raise DataError("IMU and path share too little time", got=f"{end - begin:.1f} s", wanted=f"{10 * window:g} s")
+    edges = begin + window * np.arange(n + 1)
+    which = np.searchsorted(edges, imu.times, side="right") - 1
+    used = (which >= 0) & (which < n)
+    counts = np.bincount(which[used], minlength=n)
+    full = counts >= max(2, 0.5 * np.median(counts))
+
+    def mean(values: Array) -> Array:
+        sums = np.stack([np.bincount(which[used], weights=values[used, k], minlength=n) for k in range(3)], axis=1)
+        return np.asarray(sums[full] / counts[full, None])
+
+    q = se3.quat_multiply(path.interpolate(edges)[:, 3:], np.broadcast_to(imu.T_base_imu[3:], (n + 1, 4)))
+    R = se3.quat_to_matrix(q)
+    turn = se3.so3_log(se3.quat_multiply(_conjugate(q[:-1]), q[1:]))[full] / window
+    up = (0.5 * (R[:-1] + R[1:]))[full, 2, :] * GRAVITY
+    rate, force = mean(imu.angular_rate), mean(imu.specific_force)
+    ways = signed_permutations()
+    r = rate - np.einsum("aij,kj->aki", ways, turn)
+    r -= r.mean(axis=1, keepdims=True)  # the bias
+    f = force - np.einsum("aij,kj->aki", ways, up)
+    gyro, pull = (r**2).sum(axis=(1, 2)), (f**2).sum(axis=(1, 2))
+    # what the best way of each sensor leaves is its noise, path errors and all
+    rows = 3.0 * len(rate)
+    s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / window, 1e-12)
+    s2_pull = max(float(pull.min()) / rows, force_sigma**2)
+    chi2 = gyro / s2_gyro + pull / s2_pull
+    best = int(np.argmin(chi2))
+    excess = float(chi2[0] - chi2[best])
+    return AxesCheck(excess > limit, ways[best], excess, int(np.sum(chi2 - chi2[best] <= limit)), len(rate))
+
+
+def _conjugate(q: Array) -> Array:
+    return np.asarray(q * np.array([-1.0, -1.0, -1.0, 1.0]))
