@@ -27,6 +27,7 @@ PAGES = [
     "plaza.md",
     "pose-graphs.md",
     "registration.md",
+    "robust.md",
     "segmap-graph.md",
     "segslam-recorded.md",
     "segslam.md",
