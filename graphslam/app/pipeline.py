@@ -355,14 +355,17 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
     )
 
 
-def dead_reckoning(log: SensorLog, path: Trajectory) -> Trajectory | None:
+def dead_reckoning(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:
     """Path from the log's motion stream alone, in the frame of the first base; None without one.
 
     Parameters
     ----------
-    path : Trajectory
+    path : Trajectory, or times (n,)
         The solved path: its times, its dimension, and in space its first pose, since a base need not be the body.
+        Times alone: in the plane.
     """
+    if not isinstance(path, Trajectory):
+        path = Trajectory(path, np.zeros((len(path), 3)))
     try:
         stream = motion.motion_stream(log)[1]
     except MissingDataError:
