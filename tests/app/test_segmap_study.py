@@ -56,7 +56,7 @@ def test_nothing_fails_and_the_graph_is_better_than_its_chain(table: pd.DataFram
 
 def test_nodes_are_as_far_off_as_their_covariances_say() -> None:
     """With the truth moved by what a covariance draws, NEES is that of the draws."""
-    config = STUDY.quick_graphs["court-quick"]
+    config = STUDY.quick["court-quick"]
     trial = GraphTrial(config.grid, 1, graph=config)
     result = trial.outcome("segslam-5").result
     assert result is not None

@@ -28,9 +28,8 @@ from graphslam.app.studies.segmap_trial import GraphStudy, GraphTrialConfig
 from graphslam.app.studies.segslam_building import SEGSLAM as BUILDING
 from graphslam.app.studies.segslam_mine import SEGSLAM as MINE
 from graphslam.app.studies.segslam_trial import LEVEL, QUICK, Figure, GridTrialConfig
+from graphslam.app.studies.worlds_study import draw_runs
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.plots.association import plot_runs
-from graphslam.plots.save import save
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy")
 _GARAGE = GridTrialConfig(
@@ -85,12 +84,7 @@ class SegMapGraph(GraphStudy):
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         """Errors and entropies of all runs."""
-        made = []
-        for quantity, label in DRAWN.items():
-            rows = tables.whole(table, quantity)
-            if not rows.empty:
-                made.append(save(plot_runs(rows, label=label), folder / f"{quantity}.png"))
-        return made
+        return draw_runs(table, DRAWN, folder)
 
 
 def gain_table(table: pd.DataFrame) -> pd.DataFrame:

@@ -8,9 +8,8 @@ against the truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -18,9 +17,9 @@ import numpy as np
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.submaps import base_of, drift_by_path, settle, settled_chain
 from graphslam.app.studies import segslam_judge as judge
-from graphslam.app.studies.segslam_trial import GridStudy, GridTrial, GridTrialConfig, Outcome
+from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
+from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
-from graphslam.core.errors import UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.submap import Submap
@@ -194,27 +193,7 @@ def is_right(loop: Loop, truth: Array) -> bool:
     return bool(np.linalg.norm(error[: g.dim]) < RIGHT_DISTANCE and turned < RIGHT_ANGLE)
 
 
-class GraphStudy(GridStudy):
+class GraphStudy(WorldsStudy[GraphTrialConfig]):
     """A study of graphs: as of grids, with trials of their own."""
 
-    def __init__(
-        self,
-        name: str,
-        description: str,
-        full: Mapping[str, GraphTrialConfig],
-        quick: Mapping[str, GraphTrialConfig],
-        trials: int = 20,
-    ) -> None:
-        super().__init__(name, description, {}, {}, trials)
-        self.graphs, self.quick_graphs = full, quick
-
-    def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        return tuple(self.quick_graphs if quick else self.graphs)
-
-    def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        known = {**self.graphs, **self.quick_graphs}
-        if world not in known:
-            raise UnknownNameError(f"world of {self.name}", world, known)
-        return partial(run_graph_trial, known[world])
+    run_one = staticmethod(run_graph_trial)

@@ -25,8 +25,7 @@ from frontends.segslam.config import SegmentationConfig, SegSlamConfig
 from graphslam.app.studies import segslam_report as tables
 from graphslam.app.studies.segslam_garage import path_figure
 from graphslam.app.studies.segslam_trial import DEAD_RECKONING, LEVEL, QUICK, Figure, GridStudy, GridTrialConfig
-from graphslam.plots.association import plot_runs
-from graphslam.plots.save import save
+from graphslam.app.studies.worlds_study import draw_runs
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy", "legs", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")
@@ -77,11 +76,7 @@ class SegSlamBuilding(GridStudy):
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         """Entropies, errors and angles of all runs; the path of one run by segments."""
-        made = []
-        for quantity, label in DRAWN.items():
-            rows = tables.whole(table, quantity)
-            if not rows.empty:
-                made.append(save(plot_runs(rows, label=label), folder / f"{quantity}.png"))
+        made = draw_runs(table, DRAWN, folder)
         for world in dict.fromkeys(table["world"].astype(str)):
             made += path_figure(table, world, folder)
         return made

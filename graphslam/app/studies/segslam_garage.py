@@ -38,7 +38,7 @@ from graphslam.app.studies.segslam_trial import (
     GridTrialConfig,
     family_of,
 )
-from graphslam.plots.association import plot_runs
+from graphslam.app.studies.worlds_study import draw_runs
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
 from graphslam.plots.segslam_study import Curve, plot_by_particles
@@ -100,10 +100,7 @@ class SegSlamGarage(GridStudy):
                 ax = plot_by_particles(None, seconds, label="run time [s]", title=world)
                 made.append(save(ax, folder / f"{world}-seconds.png"))
             made += path_figure(table, world, folder)
-        runs = tables.whole(table, "final_error")
-        if not runs.empty:
-            made.append(save(plot_runs(runs, label="error at the end [m]"), folder / "final_error.png"))
-        return made
+        return made + draw_runs(table, {"final_error": "error at the end [m]"}, folder)
 
 
 def error_curves(table: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.studies.segslam_trial import family_of
+from graphslam.app.studies.worlds_study import whole
 from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
@@ -39,11 +40,6 @@ COVARIANCES = {
     "exit_nees_stated": "particles + stated motion",
     "exit_nees_matched": "moment matching (paper)",
 }
-
-
-def whole(table: pd.DataFrame, quantity: str) -> pd.DataFrame:
-    """Rows of one figure of whole runs that are numbers."""
-    return table[(table["quantity"] == quantity) & (table["submap"] == -1) & table["value"].notna()]
 
 
 def values(table: pd.DataFrame, world: str, algorithm: str, quantity: str) -> Array:

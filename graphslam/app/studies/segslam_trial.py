@@ -7,9 +7,8 @@ filters have the same noise, beams and weights.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 from typing import Literal
 
@@ -24,9 +23,10 @@ from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segslam import run_segslam
 from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.app.studies import segslam_judge as judge
+from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import mesh_world
-from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
@@ -300,42 +300,10 @@ class GridTrial:
             yield Measurement(name, "path_segment", float(segment[k]), k)
 
 
-class GridStudy:
-    """Worlds and trials of a study of grid front ends; what is made of the table is the study's own.
+class GridStudy(WorldsStudy[GridTrialConfig]):
+    """A study of grid front ends."""
 
-    Parameters
-    ----------
-    name, description : str
-    full, quick : mapping of world to GridTrialConfig
-    trials : int
-        Of each world where none are asked for; two in quick mode.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        description: str,
-        full: Mapping[str, GridTrialConfig],
-        quick: Mapping[str, GridTrialConfig],
-        trials: int = 20,
-    ) -> None:
-        self.name, self.description = name, description
-        self.full, self.quick, self._trials = full, quick, trials
-
-    def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        return tuple(self.quick if quick else self.full)
-
-    def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        return 2 if quick else self._trials
-
-    def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
-        known = {**self.full, **self.quick}
-        if world not in known:
-            raise UnknownNameError(f"world of {self.name}", world, known)
-        return partial(run_trial, known[world])
+    run_one = staticmethod(run_trial)
 
 
 LEVEL = StepConfig(max_range=25.0, level_floors=True)
