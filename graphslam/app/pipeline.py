@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from frontends import motion
 from graphslam.app import config as cfg
 from graphslam.app.audit import audit_association
 from graphslam.app.back_end import BackEnd
@@ -35,26 +32,24 @@ from graphslam.app.metrics import (
 )
 from graphslam.app.metrics_space import truth_metrics_in_space
 from graphslam.app.outputs import write_outputs
-from graphslam.app.plan_view import plan_path
+from graphslam.app.reckoning import dead_reckoning
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.run_maps import RunMap, has_grids, make_run_map, sensor_reach
 from graphslam.app.threads import one_blas_thread
+from graphslam.app.versions import versions
 from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import SE3, group_of
 from graphslam.core.random import SeedTree
-from graphslam.core.records import Gps, Odometry
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
-from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.formats import load_npz
 from graphslam.io.catalog import load
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
-PACKAGES = ("graphslam-submaps", "gtsam", "numpy", "scipy", "numba", "matplotlib", "pandas")
 
 
 def run(
@@ -353,54 +348,3 @@ def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], co
         T_gps_world=solution.T_gps_world,
         base_nodes=np.append(solution.base_nodes, solution.exit_nodes[-1]).astype(np.int64),
     )
-
-
-def dead_reckoning(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:
-    """Path from the log's motion stream alone, in the frame of the first base; None without one.
-
-    Parameters
-    ----------
-    path : Trajectory, or times (n,)
-        The solved path: its times, its dimension, and in space its first pose, since a base need not be the body.
-        Times alone: in the plane.
-    """
-    if not isinstance(path, Trajectory):
-        path = Trajectory(path, np.zeros((len(path), 3)))
-    try:
-        stream = motion.motion_stream(log)[1]
-    except MissingDataError:
-        return None
-    last = stream.times[-1] if isinstance(stream, Odometry) else np.inf  # the last control is held
-    times = path.times[(path.times >= stream.times[0]) & (path.times <= last)]
-    if len(times) < 2:
-        return None
-    if isinstance(stream, Odometry) and stream.increments.shape[1] == 7:
-        return _reckoned_in_space(stream, times, path)
-    steps = motion.dead_reckoning(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[0].increments
-    group = group_of(steps)
-    poses = np.tile(group.identity, (len(steps), 1))
-    for k in range(1, len(steps)):
-        poses[k] = group.compose(poses[k - 1], steps[k])
-    return Trajectory(times, poses)
-
-
-def _reckoned_in_space(odometry: Odometry, times: Array, path: Trajectory) -> Trajectory:
-    poses = np.tile(SE3.identity, (len(odometry.times), 1))
-    for k in range(1, len(poses)):
-        poses[k] = SE3.compose(poses[k - 1], odometry.increments[k])
-    at = Trajectory(odometry.times, poses).interpolate(times)
-    if path.dim == 2:
-        return plan_path(Trajectory(times, SE3.between(np.broadcast_to(at[0], at.shape), at)))
-    start = SE3.compose(path.interpolate(times[:1])[0], SE3.inverse(at[0]))
-    return Trajectory(times, SE3.compose(np.broadcast_to(start, at.shape), at))
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computed the run."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found

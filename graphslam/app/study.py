@@ -13,10 +13,10 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
-from graphslam.app.pipeline import versions
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint, source_digest
 from graphslam.app.study_folder import StudyFolder
 from graphslam.app.threads import hold_one_thread, one_blas_thread
+from graphslam.app.versions import versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import heeded_interrupts
 from graphslam.evaluate.executors import Executor, Job, execute

@@ -24,7 +24,7 @@ from graphslam.app import config as cfg
 from graphslam.app.audit import reference_labels
 from graphslam.app.back_end import BackEnd
 from graphslam.app.front_ends import make_front_end, recommended
-from graphslam.app.pipeline import dead_reckoning
+from graphslam.app.reckoning import dead_reckoning
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
