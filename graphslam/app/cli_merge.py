@@ -28,8 +28,8 @@ def merge(
     as_json: bool = JSON,
 ) -> None:
     """Merge runs of several robots or days into one map, solved as one problem, by the landmarks they share."""
-    from graphslam.app.merge import By
     from graphslam.app.merge import merge as merge_runs
+    from graphslam.app.merge_align import By
 
     merged = merge_runs(runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out)
     rows = merged.metrics.to_dict("records")

@@ -8,33 +8,32 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.dense_sessions import is_dense
-from graphslam.app.merge_dense import MergedSubmaps, merge_dense, write_merged_dense
+from graphslam.app.merge_align import By, align_runs, of_session
+from graphslam.app.merge_dense import MergedSubmaps, merge_dense
 from graphslam.app.merge_metrics import merge_metrics
 from graphslam.app.outputs import open_run
-from graphslam.app.run import GlobalMap, Run
+from graphslam.app.run import GlobalMap, Run, metric_value
 from graphslam.app.threads import one_blas_thread
-from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.geometry import Array, se2_transform
-from graphslam.core.submap import Submap
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
 from graphslam.graph.identity import doubtful_identities
 from graphslam.graph.landmark_merging import mahalanobis_merges
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.sessions import Alignment, align_by_constellation, align_by_identity
+from graphslam.graph.sessions import Alignment
 from graphslam.graph.submap_blocks import scale_covariances
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
-By = Literal["auto", "identity", "constellation", "places", "gps"]
 IDENTITY_GATE = 25.0
 MERGE_GATE = 11.8
 
@@ -95,10 +94,7 @@ class MergedMap:
 
     def metric(self, key: str) -> float:
         """Value of one metric; KeyError if there is none."""
-        row = self.metrics[self.metrics["key"] == key]
-        if row.empty:
-            raise KeyError(key)
-        return float(row["value"].iloc[0])
+        return metric_value(self.metrics, key)
 
     def plot(self, ax: Any = None) -> Any:
         """Landmarks and the path of every session; the ellipses say how well the *shape* of the map is known."""
@@ -164,6 +160,8 @@ def merge(
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:
         raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
+    from graphslam.app.merge_outputs import write_merged, write_merged_dense
+
     if all(is_dense(r) for r in opened):
         with one_blas_thread():
             dense = merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
@@ -177,8 +175,6 @@ def merge(
     with one_blas_thread():
         merged = _merge(opened, by, solver, identity_gate, tolerance)
     if out is not None:
-        from graphslam.app.merge_outputs import write_merged
-
         write_merged(Path(out), merged)
     return merged
 
@@ -199,7 +195,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
     start = time.perf_counter()
     names = _names(runs)
     graph = PoseGraph()
-    order, alignments, renamed = _align(runs, names, by, tolerance)
+    order, alignments, renamed = align_runs(runs, names, by, tolerance)
     keys: dict[int, tuple[int, ...]] = {}
     first: dict[int, int] = {}
     next_key = 0
@@ -211,7 +207,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
         scale = float(runs[r].report.get("covariance_scale", 1.0))
         submaps = list(runs[r].submaps)
         for s in submaps if scale == 1.0 else scale_covariances(submaps, scale):
-            graph.add_submap(_of_session(s, next_key, names[r], renamed[r]))
+            graph.add_submap(of_session(s, next_key, names[r], renamed[r]))
             keys[r] = (*keys.get(r, ()), next_key)
             next_key += 1
     solver = make_solver(solver_name, graph)
@@ -268,87 +264,6 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
         metrics=metrics,
         report=report,
     )
-
-
-def _own_identities(run: Run) -> set[int]:
-    """Landmarks that the run's back end made when it split a sighting off: their ids mean nothing to other runs."""
-    return {int(e["new"]) for e in run.events if e.get("event") == "split"}
-
-
-def _align(
-    runs: list[Run], names: list[str], by: By, tolerance: float
-) -> tuple[list[int], dict[int, Alignment | None], dict[int, dict[int, int]]]:
-    """Order of joining, start of every run in the first one's frame, and new names of its landmarks."""
-    fresh = 1 + max((int(s.landmarks.ids.max(initial=-1)) for r in runs for s in r.submaps if s.landmarks), default=0)
-    renamed: dict[int, dict[int, int]] = {}
-    world_ids: Ints = np.zeros(0, dtype=np.int64)
-    world: Array = np.zeros((0, 2))
-    order: list[int] = [0]
-    alignments: dict[int, Alignment | None] = {0: None}
-
-    def rename(r: int, known: dict[int, int]) -> dict[int, int]:
-        nonlocal fresh
-        private = _own_identities(runs[r])
-        table: dict[int, int] = {}
-        for i in sorted({int(i) for s in runs[r].submaps if s.landmarks is not None for i in s.landmarks.ids}):
-            if i in known:
-                table[i] = known[i]
-            elif r == 0 or (by == "identity" and i not in private):
-                table[i] = i
-            else:
-                table[i] = fresh
-                fresh += 1
-        return table
-
-    def take(r: int, T: Array) -> None:
-        nonlocal world_ids, world
-        m = runs[r].map
-        ids = np.array([renamed[r][int(i)] for i in m.landmark_ids], dtype=np.int64)
-        new = ~np.isin(ids, world_ids)
-        world_ids = np.concatenate([world_ids, ids[new]])
-        world = np.concatenate([world, se2_transform(T, m.landmarks[new])])
-
-    renamed[0] = rename(0, {})
-    take(0, np.zeros(3))
-    waiting = list(range(1, len(runs)))
-    while waiting:
-        found: dict[int, Alignment] = {}
-        errors: dict[int, DataError] = {}
-        for r in waiting:
-            m = runs[r].map
-            try:
-                if by == "identity":
-                    usable = ~np.isin(m.landmark_ids, list(_own_identities(runs[r])))
-                    ids = np.where(usable, m.landmark_ids, -1 - np.arange(len(usable)))
-                    found[r] = align_by_identity(ids, m.landmarks, world_ids, world, tolerance=tolerance)
-                else:
-                    found[r] = align_by_constellation(m.landmarks, world, tolerance=tolerance)
-            except DataError as error:
-                errors[r] = error
-        if not found:
-            r = waiting[0]
-            placed = ", ".join(names[k] for k in order)
-            raise DataError(f"cannot be merged with {placed} ({errors[r]})", where=names[r])
-        r = max(found, key=lambda k: (len(found[k].pairs), -k))
-        alignments[r] = found[r]
-        known = {}
-        if by == "constellation":
-            m = runs[r].map
-            known = {int(m.landmark_ids[i]): int(world_ids[j]) for i, j in found[r].pairs}
-        renamed[r] = rename(r, known)
-        take(r, found[r].T_reference_map)
-        order.append(r)
-        waiting.remove(r)
-        logger.info("%s joins by %d landmarks, rms %.3f m", names[r], len(found[r].pairs), found[r].rms)
-    return order, alignments, renamed
-
-
-def _of_session(submap: Submap, key: int, session: str, renamed: dict[int, int]) -> Submap:
-    """The submap with its key and landmark ids in the common graph; its streams are those of its own robot."""
-    s = replace(submap, key=key, uses=frozenset(f"{session}/{u}" for u in submap.uses))
-    if s.landmarks is None:
-        return s
-    return s.with_ids([renamed[int(i)] for i in s.landmarks.ids])
 
 
 def _confirmed(run: Run) -> int:

@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -16,25 +15,20 @@ from graphslam.app.dense_sessions import DenseSession, put, session_of
 from graphslam.app.dense_ties import SESSION, Attached, attach, attach_by_gps
 from graphslam.app.metrics import Metrics
 from graphslam.app.plan_view import plan_path
-from graphslam.app.run import Run
-from graphslam.app.run_folder import RunFolder
-from graphslam.core.atomic import write_npz
-from graphslam.core.errors import ConfigError, DataError, RunFolderError
+from graphslam.app.run import Run, metric_value
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.session_ties import TieConfig
-from graphslam.io.tum import write_tum
 from graphslam.plots.paths import plot_paths
-from graphslam.plots.save import save
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
 By = Literal["auto", "places", "gps"]
-MERGED_DENSE_FORMAT = "graphslam.merged-submaps/1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +82,7 @@ class MergedSubmaps:
 
     def metric(self, key: str) -> float:
         """Value of one metric; KeyError if there is none."""
-        row = self.metrics[self.metrics["key"] == key]
-        if row.empty:
-            raise KeyError(key)
-        return float(row["value"].iloc[0])
+        return metric_value(self.metrics, key)
 
     def plot(self, ax: Any = None) -> Any:
         """The paths of all sessions from above, with their ellipses."""
@@ -287,40 +278,3 @@ def _said(s: PlacedSession) -> dict[str, Any]:
         "ties_dropped": None if a is None else a.dropped,
         "candidates": [] if a is None or a.ties is None else a.ties.rows(),
     }
-
-
-def write_merged_dense(path: Path, merged: MergedSubmaps) -> None:
-    """Write ``merged.npz``, one ``trajectory_<session>.tum`` each, metrics, events, a picture; ``merge.json`` last.
-
-    Raises
-    ------
-    RunFolderError
-        The folder holds something already, or cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be made ({error.strerror})") from None
-    if any(path.iterdir()):
-        raise RunFolderError(f"{path}: not empty; choose another --out")
-    folder = RunFolder(path)
-    for s in merged.sessions:
-        write_tum(path / f"trajectory_{s.name}.tum", s.trajectory)
-    nodes = merged.solution.base_nodes
-    write_npz(
-        path / "merged.npz",
-        {
-            "format": MERGED_DENSE_FORMAT,
-            "sessions": np.array([s.name for s in merged.sessions]),
-            "session_of_submap": np.repeat(
-                np.arange(len(merged.sessions)), [len(s.session.submaps) for s in merged.sessions]
-            ),
-            "keys": np.concatenate([[m.key for m in s.run.submaps] for s in merged.sessions]),
-            "bases": merged.solution.poses[nodes],
-            "base_covariances": merged.solution.node_covariances()[nodes],
-        },
-    )
-    folder.write_lines("events.jsonl", merged.graph.events)
-    folder.write_json("metrics.json", merged.metrics.to_dict("records"))
-    save(merged.plot(), folder.figures / "map.png")
-    folder.write_json("merge.json", merged.report)

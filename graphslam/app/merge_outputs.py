@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.app.merge import MergedMap
+from graphslam.app.merge_dense import MergedSubmaps
 from graphslam.app.outputs import landmarks_csv
 from graphslam.app.run_folder import RunFolder
 from graphslam.core.atomic import write_npz
-from graphslam.core.errors import RunFolderError
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
 
 MERGED_FORMAT = "graphslam.merged-map/1"
+MERGED_DENSE_FORMAT = "graphslam.merged-submaps/1"
 
 
 def write_merged(path: Path, merged: MergedMap) -> None:
@@ -25,13 +26,7 @@ def write_merged(path: Path, merged: MergedMap) -> None:
     RunFolderError
         The folder holds something already, or cannot be made.
     """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be made ({error.strerror})") from None
-    if any(path.iterdir()):
-        raise RunFolderError(f"{path}: not empty; choose another --out")
-    folder = RunFolder(path)
+    folder = RunFolder.new(path)
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.map.trajectory)
     folder.write_text("landmarks.csv", landmarks_csv(merged.sessions[0].map))
@@ -49,6 +44,39 @@ def write_merged(path: Path, merged: MergedMap) -> None:
             "landmark_sessions": merged.landmark_sessions,
         },
     )
+    _finish(folder, merged)
+
+
+def write_merged_dense(path: Path, merged: MergedSubmaps) -> None:
+    """Write ``merged.npz``, one ``trajectory_<session>.tum`` each, metrics, events, a picture; ``merge.json`` last.
+
+    Raises
+    ------
+    RunFolderError
+        The folder holds something already, or cannot be made.
+    """
+    folder = RunFolder.new(path)
+    for s in merged.sessions:
+        write_tum(path / f"trajectory_{s.name}.tum", s.trajectory)
+    nodes = merged.solution.base_nodes
+    write_npz(
+        path / "merged.npz",
+        {
+            "format": MERGED_DENSE_FORMAT,
+            "sessions": np.array([s.name for s in merged.sessions]),
+            "session_of_submap": np.repeat(
+                np.arange(len(merged.sessions)), [len(s.session.submaps) for s in merged.sessions]
+            ),
+            "keys": np.concatenate([[m.key for m in s.run.submaps] for s in merged.sessions]),
+            "bases": merged.solution.poses[nodes],
+            "base_covariances": merged.solution.node_covariances()[nodes],
+        },
+    )
+    _finish(folder, merged)
+
+
+def _finish(folder: RunFolder, merged: MergedMap | MergedSubmaps) -> None:
+    """What both kinds of merged maps have; ``merge.json`` last."""
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
     save(merged.plot(), folder.figures / "map.png")

@@ -136,10 +136,7 @@ class Run:
         ------
         KeyError
         """
-        row = self.metrics[self.metrics["key"] == key]
-        if row.empty:
-            raise KeyError(key)
-        return float(row["value"].iloc[0])
+        return metric_value(self.metrics, key)
 
     def plot(self, ax: Any = None) -> Any:
         """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""
@@ -159,3 +156,17 @@ class Run:
             f"<b>Run of {self.name}</b>{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
             f"<table><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
         )
+
+
+def metric_value(metrics: pd.DataFrame, key: str) -> float:
+    """Value of one row of a table of metrics (``key, value, …``).
+
+    Raises
+    ------
+    KeyError
+        There is no such metric.
+    """
+    row = metrics[metrics["key"] == key]
+    if row.empty:
+        raise KeyError(key)
+    return float(row["value"].iloc[0])

@@ -42,10 +42,7 @@ class RunFolder:
         """
         folder = cls(path)
         text = dump_toml(config)
-        try:
-            folder.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RunFolderError(f"{folder.path}: cannot be made ({error.strerror})") from None
+        folder._make()
         old = folder.path / "config.toml"
         if old.is_file():
             if not resume:
@@ -60,6 +57,27 @@ class RunFolder:
                 stream.write(text)
         folder._sweep()
         return folder
+
+    @classmethod
+    def new(cls, path: str | os.PathLike[str]) -> RunFolder:
+        """Make a folder, or take one that is empty.
+
+        Raises
+        ------
+        RunFolderError
+            The folder holds something already, or cannot be made.
+        """
+        folder = cls(path)
+        folder._make()
+        if any(folder.path.iterdir()):
+            raise RunFolderError(f"{folder.path}: not empty; choose another --out")
+        return folder
+
+    def _make(self) -> None:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunFolderError(f"{self.path}: cannot be made ({error.strerror})") from None
 
     def _check_same(self, old: Path, config: Mapping[str, Any]) -> None:
         """A resumed run must be the run that was stopped."""
