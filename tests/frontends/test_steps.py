@@ -1,4 +1,4 @@
-"""Logs become steps: deskewed, thinned, complete; bad input is counted or refused."""
+"""Logs become steps: deskewed, thinned, complete."""
 
 from __future__ import annotations
 
@@ -9,34 +9,19 @@ import pytest
 
 from frontends.deskew import assign, cut_beams, spread
 from frontends.reckoned import Reckoned
-from frontends.steps import StepConfig, Steps, level_on_the_whole, make_steps
+from frontends.steps import StepConfig, level_on_the_whole, make_steps
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
-from graphslam.core.geometry import se2_between, se2_transform
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
-from graphslam.core.range_scans import RangeScans
-from graphslam.core.records import LaserScans, Odometry, VelocityControls
-from graphslam.core.trajectory import Trajectory
+from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled
 from tests.reference.imu_drive import drive
 from tests.reference.plain_steps import deskew_all, room_scans, winding_path
-
-HALF = np.array([6.0, 5.0, 2.0])
-
-
-def odometry_of(path: Trajectory, sigma: float = 1e-3) -> Odometry:
-    steps = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(path), 1)) if path.dim == 3 else np.zeros((len(path), 3))
-    between = se3.se3_between if path.dim == 3 else se2_between
-    steps[1:] = between(path.poses[:-1], path.poses[1:])
-    d = 6 if path.dim == 3 else 3
-    return Odometry(times=path.times, increments=steps, covariances=np.tile(sigma**2 * np.eye(d), (len(path), 1, 1)))
 
 
 @pytest.fixture(scope="module")
 def room() -> SensorLog:
-    path = winding_path()
-    streams = {"scanner": room_scans(path, HALF), "odometry": odometry_of(path)}
-    return SensorLog(name="room", streams=streams, truth=Truth(path))
+    return room_log()
 
 
 def test_equals_deskewing_beam_by_beam(room: SensorLog) -> None:
@@ -146,94 +131,6 @@ def test_long_beams_are_cut_and_met_nothing(room: SensorLog) -> None:
     np.testing.assert_array_equal(met, [False, False])
 
 
-def spoiled(room: SensorLog, **changes: object) -> SensorLog:
-    streams = {**room.streams, **changes}
-    return SensorLog(name="spoiled", streams=streams, truth=room.truth)
-
-
-def test_readings_that_say_nothing_are_counted(room: SensorLog) -> None:
-    scans, clean = room["scanner"], make_steps(room)
-    ranges = scans.ranges.copy()
-    ranges[3, 4] = np.nan
-    ranges[5] = np.nan
-    ranges[7, :2] = [0.01, -1.0]
-    ranges[9] = 8.0
-    ranges[11, 0] = np.inf
-    drops = DropCounter()
-    steps = make_steps(spoiled(room, scanner=replace(scans, ranges=ranges)), drops=drops)
-    assert drops.counts == {
-        "scanner: beam without a reading": 16,
-        "scanner: scan without a reading": 1,
-        "scanner: nearer than 0.1 m": 2,
-        "scanner: scan that met nothing (kept)": 1,
-    }
-    assert len(steps.points) == len(clean.points) - 18
-    assert np.sum(~steps.returns) >= np.sum(~clean.returns) + 10
-    assert np.all(np.isfinite(steps.points))
-
-
-@pytest.mark.parametrize("value", [np.nan, 8.0])
-def test_a_scanner_that_sees_nothing_gives_steps_all_the_same(room: SensorLog, value: float) -> None:
-    scans = replace(room["scanner"], ranges=np.full_like(room["scanner"].ranges, value))
-    drops = DropCounter()
-    steps = make_steps(spoiled(room, scanner=scans), drops=drops)
-    assert len(steps) == 10
-    assert not np.any(steps.returns)
-    if np.isnan(value):
-        assert len(steps.points) == 0
-        assert drops.counts["steps: step without a beam (kept)"] == 10
-    else:
-        np.testing.assert_allclose(np.linalg.norm(steps.points - steps.origins, axis=1), 8.0)
-        assert drops.counts["scanner: scan that met nothing (kept)"] == len(scans.times)
-
-
-def test_a_pause_of_the_scanner_leaves_empty_steps(room: SensorLog) -> None:
-    scans = room["scanner"]
-    drops = DropCounter()
-    steps = make_steps(spoiled(room, scanner=scans.take((scans.times < 1.0) | (scans.times > 2.6))), drops=drops)
-    assert len(steps) == 10
-    assert drops.counts["steps: step without a beam (kept)"] == 3
-    assert np.all(np.linalg.norm(steps.odometry.increments[1:, :3], axis=1) > 0.1)
-    points, origins, met = steps.scan(4)
-    assert points.shape == origins.shape == (0, 3)
-    assert met.shape == (0,)
-
-
-def test_gaps_and_jumps_of_recorded_odometry(room: SensorLog) -> None:
-    o, path = room["odometry"], room.truth.trajectory
-    keep = (path.times < 1.01) | (path.times > 2.99)
-    sparse = odometry_of(Trajectory(path.times[keep], path.poses[keep]))
-    drops = DropCounter()
-    steps = make_steps(spoiled(room, odometry=sparse), drops=drops)
-    assert drops.counts == {"spoiled/odometry: gap bridged": 1}
-    doubt = np.sqrt(steps.odometry.covariances[:, 3, 3])
-    assert doubt[5] > 0.1  # 20 % of a metre a second, over a fifth of the gap, which is white in it
-    assert doubt[1] < 0.01
-    whole = steps.errors.between(1, 8)[1]
-    assert 0.35 < np.sqrt(whole[3, 3]) < 0.6  # 20 % of some 2 m
-    with pytest.raises(DataError, match=r"gap without records: 2\.\d+ s after record 50.*at most 1.5 s"):
-        make_steps(spoiled(room, odometry=sparse), StepConfig(longest_record=1.5))
-    late = replace(o, times=o.times + 3600.0 * (o.times > 2.0))
-    scans = room["scanner"]
-    jumped = replace(scans, times=scans.times + 3600.0 * (scans.times > 2.0))
-    with pytest.raises(DataError, match="gap without records: 3600"):
-        make_steps(spoiled(room, odometry=late, scanner=jumped))
-    never = replace(o, times=o.times + 1e9 * (o.times > 2.0))
-    jumped = replace(scans, times=scans.times + 1e9 * (scans.times > 2.0))
-    with pytest.raises(DataError, match="gap without records"):
-        make_steps(spoiled(room, odometry=never, scanner=jumped))
-
-
-def test_clocks_that_differ(room: SensorLog) -> None:
-    scans = room["scanner"]
-    drops = DropCounter()
-    steps = make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 1.0)), drops=drops)
-    assert drops.counts["scanner: beam outside the motion"] > 150
-    assert len(steps) == 8
-    with pytest.raises(DataError, match="are the clocks the same"):
-        make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 100.0)))
-
-
 def test_two_scanners_share_the_beams_of_a_step(room: SensorLog) -> None:
     other = replace(room["scanner"], max_range=4.0, ranges=np.minimum(room["scanner"].ranges, 4.0))
     steps = make_steps(spoiled(room, scanner2=other), StepConfig(most_points=40))
@@ -322,63 +219,6 @@ def test_steps_on_level_floors() -> None:
     np.testing.assert_array_equal(plain.odometry.increments, level.odometry.increments)
 
 
-def planar_log(**more: object) -> SensorLog:
-    """A square room of 8 m, seen by a laser at 5 Hz from a base that turns and drives."""
-    n = 41
-    t = 0.2 * np.arange(n)
-    wheels = VelocityControls(times=t, speed=np.full(n, 0.5), yaw_rate=np.full(n, 0.4))
-    heading = 0.4 * t
-    xy = 0.5 / 0.4 * np.column_stack([np.sin(heading), 1 - np.cos(heading)])
-    truth = Trajectory(t, np.column_stack([xy, np.arctan2(np.sin(heading), np.cos(heading))]))
-    bearings = np.linspace(-np.pi / 2, np.pi / 2, 91)
-    laser = np.array([0.2, 0.0, 0.1])
-    p = se2_transform(truth.poses, laser[:2])
-    angle = heading[:, None] + laser[2] + bearings
-    d = np.stack([np.cos(angle), np.sin(angle)], -1)
-    ranges = np.min((np.copysign(4.0, d) - p[:, None]) / d, axis=2)
-    scans = LaserScans(times=t, ranges=ranges, bearings=bearings, max_range=5.0, T_base_sensor=laser)
-    streams = {"laser": scans, "wheels": wheels, **more}
-    return SensorLog(name="square", streams=streams, truth=Truth(truth))
-
-
-def test_beams_that_came_back_with_nothing_may_say_nothing() -> None:
-    drops = DropCounter()
-    log = planar_log()
-    free, silent = make_steps(log), make_steps(log, StepConfig(silent="unknown"), drops=drops)
-    assert not free.returns.all()  # the corners are farther than the laser sees
-    assert silent.returns.all()
-    assert drops.counts["laser: beam without a range"] == len(free.points) - len(silent.points) > 0
-    np.testing.assert_array_equal(free.points[free.returns], silent.points)
-    # what is cut at a shorter range did come back: it stays, as free space
-    cut = make_steps(log, StepConfig(silent="unknown", max_range=3.5))
-    assert 0 < np.sum(~cut.returns) < len(cut.returns)
-    with pytest.raises(ConfigError, match="silent"):
-        StepConfig(silent="loud")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("period", [0.05, 0.2, 0.7, None])
-@pytest.mark.parametrize("recorded", [True, False])
-def test_in_the_plane(period: float | None, recorded: bool) -> None:
-    """Several scans a step or several steps a scan: with true motion every return is on a wall."""
-    log = planar_log()
-    streams = {"laser": log["laser"], "odometry": odometry_of(log.truth.trajectory)} if recorded else log.streams
-    drops = DropCounter()
-    steps = make_steps(replace(log, streams=streams), StepConfig(period=period), drops=drops)
-    assert steps.dim == 2
-    truth = steps.truth.interpolate(steps.times)
-    for k in range(len(steps)):
-        points, _, met = steps.scan(k)
-        if np.any(met):
-            world = se2_transform(truth[k], points[met])
-            assert np.abs(np.abs(world).max(axis=1) - 4.0).max() < (2e-2 if period in (0.05, 0.7) else 1e-5)
-    empty = np.sum(np.diff(steps.offsets) == 0)
-    assert empty == drops.counts["steps: step without a beam (kept)"]
-    assert (empty > 100) if period == 0.05 else (empty == 0)
-    T, C = steps.errors.between(0, len(steps) - 1)
-    np.testing.assert_allclose(T, se2_between(truth[0], truth[-1]), atol=2e-3)
-    np.linalg.cholesky(C)
-
-
 def test_motion_of_the_beams_dimension_is_taken(room: SensorLog) -> None:
     """A planar robot with an IMU drives in the plane; a log with both odometries gives each scanner its own."""
     d, flat = drive(None, seconds=8.2), planar_log()
@@ -390,18 +230,6 @@ def test_motion_of_the_beams_dimension_is_taken(room: SensorLog) -> None:
     assert make_steps(log, StepConfig(scanners=("laser",))).uses == {"laser", "flat"}
     with pytest.raises(ConfigError, match="2 dimensions, the motion of odometry 3"):
         make_steps(log, StepConfig(scanners=("laser",), motion=("odometry",)))
-
-
-def test_planar_gap_of_controls() -> None:
-    log = planar_log()
-    wheels = log["wheels"]
-    hole = wheels.take((wheels.times < 3.1) | (wheels.times > 4.5))
-    drops = DropCounter()
-    make_steps(replace(log, streams={**log.streams, "wheels": hole}), drops=drops)
-    assert drops.counts["square/wheels: gap bridged"] == 1
-    hole = wheels.take((wheels.times < 3.1) | (wheels.times > 6.5))
-    with pytest.raises(DataError, match=r"square/wheels: gap without records.*3\.000 to 6\.600"):
-        make_steps(replace(log, streams={**log.streams, "wheels": hole}))
 
 
 def test_clouds_keep_their_order_and_origin(rng: np.random.Generator) -> None:
@@ -426,64 +254,3 @@ def test_clouds_keep_their_order_and_origin(rng: np.random.Generator) -> None:
     far = np.linalg.norm(points[200:350] - [0.5, 0, 0], axis=1) >= 2.5
     np.testing.assert_array_equal(kept, ~far)
     assert 0 < far.sum() < 150
-
-
-def test_refusals(room: SensorLog) -> None:
-    scanner, odometry = room["scanner"], room["odometry"]
-    with pytest.raises(MissingDataError, match="no scanner"):
-        make_steps(SensorLog(name="blind", streams={"odometry": odometry}))
-    with pytest.raises(MissingDataError, match="no motion"):
-        make_steps(SensorLog(name="lame", streams={"scanner": scanner}))
-    with pytest.raises(MissingDataError, match="single record"):
-        make_steps(SensorLog(name="one", streams={"scanner": scanner, "odometry": odometry.take(slice(0, 1))}))
-    with pytest.raises(MissingDataError, match="empty"):
-        make_steps(SensorLog(name="none", streams={"scanner": scanner, "odometry": odometry.take(slice(0, 0))}))
-    with pytest.raises(ConfigError, match="3 dimensions, the motion of wheels 2"):
-        make_steps(SensorLog(name="mixed", streams={"scanner": scanner, "wheels": planar_log()["wheels"]}))
-    with pytest.raises(ConfigError, match="holds no beams"):
-        make_steps(room, StepConfig(scanners=("odometry",)))
-    with pytest.raises(ConfigError, match="motion from scanner"):
-        make_steps(room, StepConfig(motion=("scanner",)))
-    with pytest.raises(MissingDataError, match="no stream 'gyro'"):
-        make_steps(room, StepConfig(motion=("gyro",)))
-    for bad in (
-        {"period": 0.0},
-        {"period": np.nan},
-        {"max_range": -1.0},
-        {"most_points": 0},
-        {"yaw_bias": np.inf},
-        {"min_range": -0.1},
-        {"max_range": 0.05},
-        {"longest_record": 0.0},
-    ):
-        with pytest.raises(ConfigError, match="steps: "):
-            StepConfig(**bad)
-
-
-def test_a_scan_with_no_record(room: SensorLog) -> None:
-    empty = room["scanner"].take(slice(0, 0))
-    assert isinstance(empty, RangeScans)
-    steps = make_steps(spoiled(room, scanner=empty))
-    assert len(steps) == 10
-    assert len(steps.points) == 0
-    with pytest.raises(DataError, match="no record of the scanner"):
-        make_steps(spoiled(room, scanner=empty), StepConfig(period=None))
-
-
-def test_steps_check_themselves(room: SensorLog) -> None:
-    steps = make_steps(room)
-    points = steps.points.copy()
-    points[7, 1] = np.nan
-    for error, bad in (
-        (DataError, {"points": points}),
-        (GeometryError, {"points": steps.points[:, :2]}),
-        (DataError, {"offsets": steps.offsets[:-1]}),
-        (DataError, {"offsets": steps.offsets[::-1]}),
-        (GeometryError, {"returns": steps.returns.astype(float)}),
-        (DataError, {"times": steps.times + 1.0}),
-        (DataError, {"max_range": 0.0}),
-        (GeometryError, {"tilt": np.zeros((3, 2))}),
-    ):
-        with pytest.raises(error):
-            replace(steps, **bad)
-    assert isinstance(replace(steps, name="other"), Steps)
