@@ -42,6 +42,12 @@ def rotation2(theta: ArrayLike) -> Array:
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
 
 
+def arc_length(points: ArrayLike) -> Array:
+    """Length of the way along points ``(n, k)`` up to each of them ``(n,)``; the first is 0. ``n ≥ 1``."""
+    p = np.asarray(points, dtype=np.float64)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+
+
 def se2_compose(T_ab: ArrayLike, T_bc: ArrayLike) -> Array:
     """``T_ac`` from ``T_ab`` and ``T_bc``, each ``(..., 3)``; heading wrapped."""
     a, b = np.asarray(T_ab, dtype=np.float64), np.asarray(T_bc, dtype=np.float64)

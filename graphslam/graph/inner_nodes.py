@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import Group, group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -55,7 +55,7 @@ def inner_rows(path: Trajectory, spacing: float) -> npt.NDArray[np.intp]:
     """Rows of a path about every ``spacing`` metres of the way, without its ends."""
     if len(path) < 3:
         return np.zeros(0, dtype=np.intp)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+    way = arc_length(path.positions)
     pieces = round(way[-1] / spacing)
     goals = way[-1] * np.arange(1, pieces) / max(pieces, 1)
     after = np.clip(np.searchsorted(way, goals), 1, len(way) - 1)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.graph.inner_nodes import inner_rows
@@ -98,26 +98,46 @@ def places_of(submaps: Sequence[Submap], spacing: float = 3.0) -> Places:
     DataError
         A submap without a path.
     """
-    submap: list[int] = []
-    poses, way, times, begin = [], [], [], 0.0
-    for k, s in enumerate(submaps):
+    stretches = []
+    for s in submaps:
         if s.trajectory is None or len(s.trajectory) == 0:
             raise DataError(f"submap {s.key} has no path to put places on", wanted="a trajectory")
         path = s.trajectory
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+        along = arc_length(path.positions)
         rows = np.concatenate([[0], inner_rows(path, spacing)])
         T = path.poses[rows].copy()
         T[0] = group_of(T).identity  # the base itself
-        submap += [k] * len(rows)
-        poses.append(T)
-        way.append(begin + along[rows])
-        times.append(path.times[rows])
-        begin += float(along[-1])
+        stretches.append((T, along[rows], path.times[rows], float(along[-1])))
+    return _places(stretches)
+
+
+def places_at_nodes(poses: Sequence[Array], times: Sequence[Array]) -> Places:
+    """Places at the nodes of a chain of submaps; the way is that from node to node, enough to tell stretches apart.
+
+    Parameters
+    ----------
+    poses : sequence of (n, 7) or (n, 3)
+        ``T_base_node`` of every submap, the base first; the last is its exit and no place, for it is the next one's
+        base.
+    times : sequence of (n,)
+    """
+    stretches = []
+    for T, t in zip(poses, times, strict=True):
+        along = arc_length(T[:, : group_of(T).dim])
+        stretches.append((T[:-1], along[:-1], np.asarray(t[:-1]), float(along[-1])))
+    return _places(stretches)
+
+
+def _places(stretches: Sequence[tuple[Array, Array, Array, float]]) -> Places:
+    """Of every submap poses, ways from its base, times, and its whole length: one after the other."""
+    poses, ways, times, lengths = zip(*stretches)
+    begin = np.concatenate([[0.0], np.cumsum(lengths)])
+    counts = [len(T) for T in poses]
     return Places(
-        np.arange(len(submap), dtype=np.int64),
-        np.array(submap, dtype=np.int64),
+        np.arange(sum(counts), dtype=np.int64),
+        np.repeat(np.arange(len(counts), dtype=np.int64), counts),
         np.concatenate(poses),
-        np.concatenate(way),
+        np.concatenate([b + w for b, w in zip(begin, ways)]),
         np.concatenate(times),
     )
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.graph.consistent_set import Chain, LoopArrays, largest_consistent_set, pair_chi2
@@ -96,7 +96,7 @@ class SessionMap:
             cut = cut_submap(s, spacing)
             n = len(cut.increments)
             path = s.trajectory
-            along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+            along = arc_length(path.positions)
             nodes.append(node + np.arange(n))
             which.append(np.full(n, k))
             poses.append(cut.T_base_node[:-1])

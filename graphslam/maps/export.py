@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import FormatError, GridError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.map_server import save_map_server
@@ -104,7 +104,7 @@ def storeys(positions: Array, *, gap: float = STOREY_GAP, shortest: float = 5.0)
         raise GridError("impossible positions of a path", got=p.shape, wanted="(n, 3), finite")
     if len(p) < 2:
         return []
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    arc = arc_length(p)
     if arc[-1] <= 0:
         return []
     at = np.arange(0.0, arc[-1], 0.25)  # every so often, so that standing weighs nothing

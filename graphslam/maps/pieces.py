@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -279,7 +279,7 @@ def owning_places(path: Trajectory, node_times: Array, config: DivisionConfig) -
     Stretches meet half-way between nodes along the path; where the body stands, half-way in time.
     """
     positions = path.positions
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    arc = arc_length(positions)
     clock = 1e-6 * (path.times - path.times[0]) / max(path.times[-1] - path.times[0], 1e-9)  # [m]: tells standing apart
     along = arc + clock
     node_arc = np.interp(node_times, path.times, along)
@@ -309,7 +309,7 @@ def node_times_every(path: Trajectory, distance: float) -> Array:
     """
     if not (np.isfinite(distance) and distance > 0):
         raise ConfigError(f"nodes every {distance} m; wanted > 0")
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+    arc = arc_length(path.positions)
     count = max(round(float(arc[-1]) / distance), 1)
     index = np.searchsorted(arc, arc[-1] * np.arange(count) / count, side="left")
     return path.times[np.unique(index)]

@@ -20,6 +20,7 @@ from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.submap_consistency import true_submap
 from graphslam.plots import style
+from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.map import landmark_blocks, plot_ellipses
 
 _COLOURS = (style.ESTIMATE, style.VERMILION, style.PURPLE, style.ORANGE, style.SKY)
@@ -58,18 +59,12 @@ def plot_exit(
         weight = np.bincount(which.ravel(), weights=particles.weights)
         ax.scatter(at[:, 0], at[:, 1], s=np.minimum(12.0 * n * weight, 90.0), color=style.GREY, alpha=0.55, lw=0,
                    label="particles", zorder=2)  # fmt: skip
-    for k, (label, submap) in enumerate(handovers.items()):
+    ends = {}
+    for label, submap in handovers.items():
         mean, cov = _vector(submap)
-        colour = _COLOURS[k % len(_COLOURS)]
-        plot_ellipses(ax, mean[:2], cov[None, :2, :2], confidence=confidence, colour=colour, alpha=0.12,
-                      label=f"{label}, {confidence:.0%}")  # fmt: skip
-        ax.plot(*mean[:2], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=5, mec="white", mew=0.6, zorder=4)
-    if truth is not None:
-        exit_pose = true_submap(next(iter(handovers.values())), truth)[0]
-        ax.plot(*exit_pose[:2], "x", color=style.TRUTH, ms=9, mew=1.8, label="true exit", zorder=5)
-    style.metric_axes(ax)
-    if title:
-        ax.set_title(title, fontsize="medium")
+        ends[label] = mean[:2], cov[:2, :2]
+    true_exit = None if truth is None else true_submap(next(iter(handovers.values())), truth)[0]
+    draw_exits(ax, ends, colours=_COLOURS, truth=true_exit, truth_label="true exit", confidence=confidence, title=title)
     style.legend(ax, outside=False, loc="best")
     return ax
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.geometry import Array, arc_length, rotation2
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
@@ -80,7 +80,7 @@ def plot_paths(
         ax.plot(*p[-1], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=6, mec="white", mew=0.7, zorder=5)
         if path.covariances is None or ellipses < 1:
             continue
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))])
+        along = arc_length(path.positions)
         at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ellipses + 1)[1:]).clip(0, len(p) - 1))
         P = position_covariances(path.poses[at], path.covariances[at])[:, ij][:, :, ij]
         plot_ellipses(ax, p[at], P, confidence=confidence, colour=colour, label=f"{label}, {confidence:.0%}")

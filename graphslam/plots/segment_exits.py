@@ -14,7 +14,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.plots import style
-from graphslam.plots.map import plot_ellipses
+from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.paths import position_covariances
 
 _COLOURS = (style.ESTIMATE, style.PURPLE, style.GREEN)
@@ -58,20 +58,11 @@ def plot_segment_exit(
         area = np.clip(20.0 * len(exits) * w, 3.0, 90.0)
         ax.scatter(exits[:, 0], exits[:, 1], s=area, color=style.GREY, alpha=0.6, lw=0, zorder=2,
                    label=f"{len(exits)} segments of the interval")  # fmt: skip
-    for k, (label, submap) in enumerate(handovers.items()):
-        pose, colour = submap.exit_pose[None], _COLOURS[k % len(_COLOURS)]
-        P = position_covariances(pose, submap.exit_covariance[None])[:, :2, :2]
-        plot_ellipses(ax, pose[:, :2], P, confidence=confidence, colour=colour, alpha=0.10,
-                      label=f"{label}, {confidence:.0%}")  # fmt: skip
-        size = 1.2 * np.sqrt(chi2_quantile(confidence, 2) * np.diagonal(P[0]))  # ellipses do not set the limits
-        ax.update_datalim([pose[0, :2] - size, pose[0, :2] + size])
-        ax.plot(*pose[0, :2], "o", color=colour, ms=4, mec="white", mew=0.5, zorder=4)
-    if truth is not None:
-        ax.plot(*truth[:2], "x", color=style.TRUTH, ms=9, mew=1.8, label="truth", zorder=5)
-    ax.autoscale_view()
-    style.metric_axes(ax)
-    if title:
-        ax.set_title(title, fontsize="medium")
+    ends = {
+        label: (s.exit_pose[:2], position_covariances(s.exit_pose[None], s.exit_covariance[None])[0, :2, :2])
+        for label, s in handovers.items()
+    }
+    draw_exits(ax, ends, colours=_COLOURS, truth=truth, truth_label="truth", confidence=confidence, title=title)
     style.legend(ax)
     return ax
 

@@ -10,7 +10,7 @@ import itertools
 
 import numpy as np
 
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, arc_length
 from graphslam.core.random import SeedTree
 from graphslam.sim.clutter import KeepClear
 from graphslam.sim.mesh import MeshBuilder
@@ -125,7 +125,7 @@ def _line(name: str) -> tuple[Array, Array]:
     """Middle line of a gallery ``(k, 3)`` with its bends, and the arc length in the plan ``(k,)`` of each point."""
     a, b = (np.array(_JUNCTIONS[j]) for j in name)
     plan = np.array([a[:2], *_GALLERIES[name], b[:2]])
-    t = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(plan, axis=0), axis=1))])
+    t = arc_length(plan)
     level = _LEVEL if t[-1] > 2.5 * _LEVEL else 0.4 * t[-1]
     z = a[2] + np.clip((t - level) / (t[-1] - 2.0 * level), 0.0, 1.0) * (b[2] - a[2])
     return np.column_stack([plan, z]), t

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.geometry import Array, se2_inverse, se2_transform, wrap_angle
+from graphslam.core.geometry import Array, arc_length, se2_inverse, se2_transform, wrap_angle
 from graphslam.sim.kernels import follow_route_kernel
 
 # Spacing of the route's polyline [m]: small against any look-ahead, so the carrot moves smoothly.
@@ -34,7 +34,7 @@ def wavy_loop(lap_length: float, waves: int, amplitude: float, *, spacing: float
     theta = np.linspace(0.0, 2.0 * np.pi, 200 * max(waves, 1) + 20_000)
     r = 1.0 + amplitude * np.sin(waves * theta)
     curve = np.stack([r * np.cos(theta), r * np.sin(theta)], -1)
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    s = arc_length(curve)
     curve, s = curve * (lap_length / s[-1]), s * (lap_length / s[-1])
     at = np.linspace(0.0, lap_length, max(round(lap_length / spacing), 16), endpoint=False)
     points = np.stack([np.interp(at, s, curve[:, 0]), np.interp(at, s, curve[:, 1])], -1)
@@ -47,7 +47,7 @@ def offset_from_route(route: Array, s: Array, lateral: Array) -> Array:
     """Points ``(n, 2)`` at arc length ``s`` (n,) [m] and ``lateral`` (n,) metres left of a closed route ``(m, 2)``."""
     m = len(route)
     closed = np.concatenate([route, route[:1]])
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    length = arc_length(closed)
     at = np.mod(s, length[-1])
     p = np.stack([np.interp(at, length, closed[:, k]) for k in (0, 1)], -1)
     i = np.clip(np.searchsorted(length, at, side="right") - 1, 0, m - 1)

@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.graph.loop_measure import Loop
-from graphslam.graph.loop_places import Ints, Places
+from graphslam.graph.loop_places import Ints, Places, places_at_nodes
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.records import BetweenRecord
@@ -35,8 +35,6 @@ def places_of_graph(graph: PoseGraph) -> Places:
     """
     if not graph.submaps:
         raise DataError("a graph without submaps has no places")
-    submap: list[int] = []
-    poses, way, times, begin = [], [], [], 0.0
     for k, s in enumerate(graph.submaps):
         wanted = 0 if k == 0 else graph.submaps[k - 1].exit_node
         if not s.nodes or s.nodes != tuple(range(wanted, wanted + len(s.nodes))):
@@ -45,22 +43,7 @@ def places_of_graph(graph: PoseGraph) -> Places:
                 got=s.nodes[:1],
                 wanted=wanted,
             )
-        dim = graph.dim
-        along = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(s.T_base_node[:, :dim], axis=0), axis=1))]
-        )  # between nodes, not along the path: enough to tell stretches apart
-        submap += [k] * (len(s.nodes) - 1)
-        poses.append(s.T_base_node[:-1])
-        way.append(begin + along[:-1])
-        times.append(np.asarray(s.times[:-1]))
-        begin += float(along[-1])
-    return Places(
-        np.arange(len(submap), dtype=np.int64),
-        np.array(submap, dtype=np.int64),
-        np.concatenate(poses),
-        np.concatenate(way),
-        np.concatenate(times),
-    )
+    return places_at_nodes([s.T_base_node for s in graph.submaps], [s.times for s in graph.submaps])
 
 
 def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from graphslam.core import se3
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import (
     align_se2,
+    arc_length,
     circular_mean,
     se2_compose,
     se2_compose_covariance,
@@ -240,3 +241,9 @@ def test_cross_product_is_numpys_to_the_bit(shapes: tuple[tuple[int, ...], tuple
     rng = np.random.default_rng(1)
     a, b = (rng.normal(size=s) * 10.0 ** rng.integers(-8, 8, size=s) for s in shapes)
     assert np.array_equal(se3._cross(a, b), np.cross(a, b))
+
+
+def test_arc_length_is_the_sum_of_the_steps() -> None:
+    p = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 1.0], [3.0, 4.0, 1.0], [3.0, 4.0, -1.0]])
+    np.testing.assert_array_equal(arc_length(p), [0.0, 5.0, 5.0, 7.0])
+    np.testing.assert_array_equal(arc_length(p[:1]), [0.0])

@@ -184,22 +184,27 @@ def test_loops_bend_a_cut_submap(rng, dim):
             np.testing.assert_allclose(bent.interpolate([t])[0], solutions[3.0].poses[node], atol=1e-9)
 
 
+def closed_ring(rng, dim, steps):
+    """Two dense submaps around, cut every 3 m, closed by a loop of 1 cm and 10 mrad, solved; chain and graph."""
+    group, chain = GROUP[dim], dense_chain(rng, dim, m=2, steps=steps)
+    g = PoseGraph(dim)
+    for s in chain.submaps:
+        g.add_submap(s, spacing=3.0)
+    e = group.exp(1e-2 * rng.standard_normal(group.dof))
+    T = group.compose(group.between(chain.poses[0], chain.poses[2]), e)
+    g.add_between(0, g.submaps[-1].exit_node, T, np.diag(np.full(group.dof, 1e-4)), evidence="shared-scan")
+    solver = BatchSolver(g)
+    solver.solve_to_optimum()
+    return chain, g, solver
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_path_covariance_is_honest(rng, dim):
     """At full rate, nodes and the way between them, with a loop: two-sided."""
     group = GROUP[dim]
-    C = np.diag(np.full(group.dof, 1e-4))
     ratios, runs = [], 25
     for _ in range(runs):
-        chain = dense_chain(rng, dim, m=2, steps=30)
-        g = PoseGraph(dim)
-        for s in chain.submaps:
-            g.add_submap(s, spacing=3.0)
-        e = group.exp(1e-2 * rng.standard_normal(group.dof))
-        T = group.compose(group.between(chain.poses[0], chain.poses[2]), e)
-        g.add_between(0, g.submaps[-1].exit_node, T, C, evidence="shared-scan")
-        solver = BatchSolver(g)
-        solver.solve_to_optimum()
+        chain, _, solver = closed_ring(rng, dim, 30)
         path = solver.solution().trajectory()
         truth = np.concatenate([chain.path[0][:-1], chain.path[1]])
         e = group.log(group.between(path.poses, truth))[1:]
@@ -213,16 +218,8 @@ def test_path_covariance_is_honest(rng, dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_nodes_of_a_loop_graph_by_monte_carlo(rng, dim):
     group, runs, d2 = GROUP[dim], 40, []
-    C = np.diag(np.full(group.dof, 1e-4))
     for _ in range(runs):
-        chain = dense_chain(rng, dim, m=2, steps=24)
-        g = PoseGraph(dim)
-        for s in chain.submaps:
-            g.add_submap(s, spacing=3.0)
-        e = group.exp(1e-2 * rng.standard_normal(group.dof))
-        T = group.compose(group.between(chain.poses[0], chain.poses[2]), e)
-        g.add_between(0, g.submaps[-1].exit_node, T, C, evidence="shared-scan")
-        BatchSolver(g).solve_to_optimum()
+        chain, g, _ = closed_ring(rng, dim, 24)
         truth = [chain.poses[0]]
         for s, p in zip(g.submaps, chain.path, strict=True):
             truth += list(p[np.searchsorted(s.trajectory.times, s.times[1:])])

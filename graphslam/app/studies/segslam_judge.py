@@ -18,7 +18,7 @@ from frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of
 from frontends.segslam.segmap import MATCH, SegMap
 from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 from frontends.steps import Steps
-from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.geometry import Array, arc_length, wrap_angle
 from graphslam.core.poses import group_of, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
@@ -164,7 +164,7 @@ def match_errors(segmap: SegMap, truth: Array) -> MatchErrors:
 
 def steps_of_way(truth: Trajectory, times: Array, length: float) -> Array:
     """Arc length of the way at every step ``(n,)`` [m], from the truth; the end of the truth is that of the way."""
-    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
+    driven = arc_length(truth.positions)
     return np.asarray(np.interp(times, truth.times, driven * (length / driven[-1])))
 
 
