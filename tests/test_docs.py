@@ -27,6 +27,7 @@ PAGES = [
     "plaza.md",
     "pose-graphs.md",
     "registration.md",
+    "report.md",
     "robust.md",
     "segmap-graph.md",
     "segslam-recorded.md",
@@ -129,7 +130,7 @@ def test_run_folder_holds_the_files_that_the_how_to_names(tmp_path: Path) -> Non
     import graphslam as gs
 
     table = page("how-to.md").split("## The run folder")[1].split("## ")[0]
-    named = set(re.findall(r"`([\w.]+\.(?:toml|json|npz|tum|csv|g2o|jsonl))`", table))
+    named = set(re.findall(r"`([\w.]+\.(?:toml|json|npz|tum|csv|g2o|jsonl|html))`", table))
     log = gs.simulate("landmark-field", preset="quick", gps_rate=1.0, gps_sigma=0.3)
     options = {"gps": {"use": "every-second"}}  # so that every file is there that a run can have
     run = gs.run(log, out=tmp_path / "run", progress=False, solver="batch", config=options)

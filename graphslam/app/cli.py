@@ -23,6 +23,7 @@ from graphslam.app import (
     cli_loops,
     cli_map,
     cli_merge,
+    cli_report,
     cli_run,
     cli_study,
     cli_tools,
@@ -58,6 +59,7 @@ cli_join.register(app)
 cli_map.register(app)
 cli_merge.register(app)
 cli_loops.register(app)
+cli_report.register(app)
 cli_localise.register(app)
 cli_export.register(app)
 cli_study.register(app)

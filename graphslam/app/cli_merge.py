@@ -33,5 +33,6 @@ def merge(
 
     merged = merge_runs(runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out)
     rows = merged.metrics.to_dict("records")
-    text = f"{table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: map in {out / 'figures' / 'map.png'}"
+    where = f"report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}"
+    text = f"{table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: {where}"
     emit({"out": str(out), "metrics": rows, "report": merged.report}, text, as_json=as_json)

@@ -56,7 +56,7 @@ def run(
         joined = continue_runs(saved, result, out=out / "continued")
         value["continued"] = joined.report
         figures = table(joined.metrics.to_dict("records"), ["key", "value", "unit"])
-        text += f"\n{figures}\n{joined!r}, in {out / 'continued'}"
+        text += f"\n{figures}\n{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"
     emit(value, text, as_json=as_json)
 
 
@@ -76,7 +76,7 @@ def _summary(result: Any, out: Path) -> str:
     if chi2 is not None and not 0.7 < chi2 < 1.4:
         scale = result.report["covariance_scale"] * chi2
         lines.append(f"note: join χ²/dof is {chi2:.2f}, not 1: try --set backend.covariance_scale={scale:.2g}")
-    lines.append(f"written to {out}: map in {out / 'figures' / 'map.png'}")
+    lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
     return "\n".join(lines)
 
 
@@ -94,6 +94,7 @@ def demo(
     text = (
         f"{table(rows, ['key', 'value', 'unit'])}"
         f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
+        f"\nreport: {out / 'report.html'}"
         f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"
     )
     emit({"out": str(out), "metrics": rows, "report": result.report}, text, as_json=as_json)

@@ -6,16 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
+from graphslam.app.graph_facts import graph_facts
 from graphslam.app.merge import MergedMap
 from graphslam.app.merge_dense import MergedSubmaps
 from graphslam.app.outputs import landmarks_csv
+from graphslam.app.report import report_beside
 from graphslam.app.run_folder import RunFolder
 from graphslam.core.atomic import write_npz
+from graphslam.evaluate.without_truth import class_consistency
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
 
 MERGED_FORMAT = "graphslam.merged-map/1"
 MERGED_DENSE_FORMAT = "graphslam.merged-submaps/1"
+MOST_STATES = 6000
+"""Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
 
 
 def write_merged(path: Path, merged: MergedMap) -> None:
@@ -70,6 +75,7 @@ def write_merged_dense(path: Path, merged: MergedSubmaps) -> None:
             "keys": np.concatenate([[m.key for m in s.run.submaps] for s in merged.sessions]),
             "bases": merged.solution.poses[nodes],
             "base_covariances": merged.solution.node_covariances()[nodes],
+            "nodes": merged.solution.poses,
         },
     )
     _finish(folder, merged)
@@ -80,4 +86,7 @@ def _finish(folder: RunFolder, merged: MergedMap | MergedSubmaps) -> None:
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
     save(merged.plot(), folder.figures / "map.png")
-    folder.write_json("merge.json", merged.report)
+    folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
+    classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
+    folder.write_json("merge.json", {**merged.report, "graph": graph_facts(merged.graph, classes)})
+    report_beside(folder.path)

@@ -63,6 +63,9 @@ def write_outputs(folder: RunFolder, run: Run) -> None:
         write_run_map(folder.path, run.fused)
         draw_run_map(run.fused, m.trajectory, folder.figures, name=run.name)
     folder.write_json("run.json", run.report)  # last: its presence says that the run is finished
+    from graphslam.app.report import report_beside  # the page is made from the files, so they come first
+
+    report_beside(folder.path)
 
 
 def landmarks_csv(m: GlobalMap) -> str:

@@ -17,6 +17,7 @@ from graphslam.app.audit import audit_association
 from graphslam.app.back_end import BackEnd
 from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.gps_use import split, used_fixes
+from graphslam.app.graph_facts import graph_facts
 from graphslam.app.metrics import (
     Metrics,
     dead_reckoning_metrics,
@@ -295,6 +296,7 @@ def _judge(
         "covariance_scale": settings.backend.covariance_scale,
         "objective": solution.objective,
         "converged": solution.converged,
+        "graph": graph_facts(back.graph, checks.classes),
     }
     if why_not:
         report["map_left_out"] = why_not

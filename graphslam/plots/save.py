@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -18,3 +19,13 @@ def save(ax: Axes, path: Path) -> Path:
     figure.savefig(path, dpi=style.DPI, bbox_inches="tight", metadata={"Software": None})
     plt.close(figure)
     return path
+
+
+def png(ax: Axes) -> bytes:
+    """The figure of ``ax`` as the bytes of a PNG, as :func:`save` would write them; closes it."""
+    figure = ax.figure
+    assert isinstance(figure, Figure)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=style.DPI, bbox_inches="tight", metadata={"Software": None})
+    plt.close(figure)
+    return out.getvalue()
