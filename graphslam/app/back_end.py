@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.config import BackEndConfig, GpsConfig
-from graphslam.app.loops import ledger_of_events
+from graphslam.app.loops import ledger_of_events, same_loop
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -21,13 +22,14 @@ from graphslam.graph.landmark_association import AssociationConfig, associate
 from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merges
 from graphslam.graph.loop_appearance import AppearanceConfig
 from graphslam.graph.loop_candidates import FRONT_END, CandidateConfig
-from graphslam.graph.loop_ledger import LoopLedger
+from graphslam.graph.loop_ledger import Decision, LoopLedger
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
+logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 
 
@@ -143,13 +145,14 @@ class BackEnd:
         self.seconds["merge"] += time.perf_counter() - start
         return merged
 
-    def finish(self, undo: Sequence[int] = ()) -> Solution:
+    def finish(self, undo: Sequence[int | Decision] = ()) -> Solution:
         """Merge until nothing merges any more, go to the optimum, and return the solution.
 
         Parameters
         ----------
-        undo : sequence of int
-            Loops that are taken out again, by their numbers in the ledger of loops.
+        undo : sequence of int or Decision
+            Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
+            submaps has them, and then one that is not in this graph is noted and stays undone.
         """
         self.graph.finish_gps()
         self.solver.solve_to_optimum()
@@ -160,7 +163,10 @@ class BackEnd:
         if self.config.loops:
             self.find_loops()
         for loop in undo:
-            self.undo_loop(loop)
+            if isinstance(loop, Decision):
+                self._stay_undone(loop)
+            else:
+                self.undo_loop(loop)
         start = time.perf_counter()
         self.solver.solve_to_optimum()
         self.split_wrong_identities()
@@ -197,6 +203,19 @@ class BackEnd:
             event = replace(d, verdict="undone", why="asked for", weight=0.0, factor_id=-1).event()
             self.graph.note(event.pop("event"), **event)
         self.solver.solve_to_optimum()
+
+    def _stay_undone(self, before: Decision) -> None:
+        """Take out a loop that was undone in an earlier run of the same submaps."""
+        ledger = ledger_of_events(self.graph.events)
+        d = same_loop(before, ledger)
+        if d is not None:
+            self.undo_loop(d.loop)
+            return
+        what = f"loop {before.loop} of submaps {before.submap_i} and {before.submap_j}"
+        logger.warning("%s was undone before and was not found this time", what)
+        number = 1 + max((x.loop for x in ledger.decisions), default=-1)
+        event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next time
+        self.graph.note(event.pop("event"), **event)
 
     def split_wrong_identities(self) -> int:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""

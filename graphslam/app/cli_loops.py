@@ -22,16 +22,22 @@ def loops(
     history: bool = typer.Option(False, help="Every decision, not only those in force."),
     every: bool = typer.Option(False, "--all", help="Also what the registration refused."),
     undo: int | None = typer.Option(None, help="Take this loop out, solve again, and write the run anew."),
-    source: str | None = typer.Option(None, help="Log of the run, for --undo, where it is no card."),
+    redo: int | None = typer.Option(None, help="Take in again a loop that was undone."),
+    source: str | None = typer.Option(None, help="Log of the run, for --undo and --redo, where it is no card."),
     as_json: bool = JSON,
 ) -> None:
     """Loops of a run: where each came from, its gates, χ², weight and effect, accepted or not, and why."""
-    from graphslam.app.loops import loops_of_run, undo_loop
+    from graphslam.app.loops import loops_of_run, redo_loop, undo_loop
+    from graphslam.core.errors import ConfigError
 
-    if undo is None:
-        ledger = loops_of_run(run)
-    else:
+    if undo is not None and redo is not None:
+        raise ConfigError("--undo and --redo together; give one of them")
+    if undo is not None:
         ledger = undo_loop(run, undo, source=source, progress=not as_json)
+    elif redo is not None:
+        ledger = redo_loop(run, redo, source=source, progress=not as_json)
+    else:
+        ledger = loops_of_run(run)
     frame = ledger.table(history=history)
     rows = [{str(k): v for k, v in row.items()} for row in frame.to_dict("records")]
     counts = ledger.counts()

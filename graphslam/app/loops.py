@@ -91,11 +91,39 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
     )
 
 
+def undone_of_run(folder: str | Path) -> list[Decision]:
+    """Loops that were taken out of a finished run by hand; none where a run was not finished.
+
+    Raises
+    ------
+    DataError, FormatError
+        The folder's events are damaged.
+    """
+    if not (Path(folder) / "events.jsonl").is_file():
+        return []
+    return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]
+
+
+def same_loop(d: Decision, ledger: LoopLedger) -> Decision | None:
+    """The loop of another ledger that is in the graph, between the same nodes, and found the same way; or None.
+
+    Numbers may differ where something else was tried in between; of several the one of that number is taken.
+    """
+    found = [x for x in ledger.current() if x.verdict == "accepted" and _identity(x) == _identity(d)]
+    found.sort(key=lambda x: x.loop != d.loop)
+    return found[0] if found else None
+
+
+def _identity(d: Decision) -> tuple[str, int, int, int, int]:
+    return d.source, d.submap_i, d.submap_j, d.i, d.j
+
+
 def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
     """Take a loop out of a finished run: its graph is made again from the stored submaps, solved without the loop, and
     everything in the folder is written anew.
 
-    Loops that were undone before stay so. What was found with the loop in the graph stays too.
+    Loops that were undone before stay so, as this one does whenever the run is resumed (:func:`redo_loop` takes it in
+    again). What was found with the loop in the graph stays too.
 
     Parameters
     ----------
@@ -113,15 +141,31 @@ def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None
     MissingDataError
         The log is not to be found: say where with ``source``.
     """
-    from graphslam.app.pipeline import run
-
     before = loops_of_run(folder)
     d = before.of(loop)
     if d.verdict != "accepted":
         raise DataError(f"loop {loop} is not in the graph", where=str(folder), got=d.verdict, wanted="an accepted loop")
+    return _without(folder, [*undone_of_run(folder), d], source, progress)
+
+
+def redo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
+    """Take in again a loop that :func:`undo_loop` took out; others that were undone stay so.
+
+    Parameters and errors are those of :func:`undo_loop`.
+    """
+    before = loops_of_run(folder)
+    d = before.of(loop)
+    if d.verdict != "undone":
+        raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
+    return _without(folder, [x for x in undone_of_run(folder) if x.loop != loop], source, progress)
+
+
+def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path | None, progress: bool) -> LoopLedger:
+    """Make a run again from its submaps without these loops, and write its folder anew."""
+    from graphslam.app.pipeline import run
+
     options = read_toml(Path(folder) / "config.toml")
     said = options.pop("run")
-    undone = sorted({x.loop for x in before.current() if x.verdict == "undone"} | {loop})
     run(
         source or said["source"],
         frontend=said["frontend"],
@@ -131,6 +175,6 @@ def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None
         config=options,
         resume=True,
         progress=progress,
-        undo=undone,
+        undo=sorted(undone, key=lambda x: x.loop),
     )
     return loops_of_run(folder)

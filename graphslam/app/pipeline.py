@@ -18,6 +18,7 @@ from graphslam.app.back_end import BackEnd
 from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.gps_use import split, used_fixes
 from graphslam.app.graph_facts import graph_facts
+from graphslam.app.loops import undone_of_run
 from graphslam.app.metrics import (
     Metrics,
     dead_reckoning_metrics,
@@ -47,6 +48,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
+from graphslam.graph.loop_ledger import Decision
 from graphslam.io.catalog import load
 from graphslam.solve.solution import Solution
 
@@ -63,7 +65,7 @@ def run(
     config: Mapping[str, Any] | None = None,
     resume: bool = False,
     progress: bool = True,
-    undo: Sequence[int] = (),
+    undo: Sequence[int | Decision] | None = None,
     watch: Callable[[Any], None] | None = None,
 ) -> Run:
     """Run a front end over a log, join its submaps in a graph, and score what can be scored.
@@ -83,8 +85,9 @@ def run(
         Go on after the last finished submap of ``out``, to the same result.
     progress : bool
         Show a progress bar on stderr.
-    undo : sequence of int
-        Loops that are taken out again at the end, by their numbers in the ledger of loops.
+    undo : sequence of int or Decision, optional
+        Loops that are taken out again at the end, by their numbers in the ledger of loops, or as an earlier ledger has
+        them. By default those that were undone before where the run is resumed, none otherwise.
     watch : callable, optional
         Handed to a front end that can be watched (``segslam``: `frontends.segslam.progress`); others ignore it.
 
@@ -106,7 +109,7 @@ def _run(
     config: Mapping[str, Any],
     resume: bool,
     progress: bool,
-    undo: Sequence[int],
+    undo: Sequence[int | Decision] | None,
     watch: Callable[[Any], None] | None,
 ) -> Run:
     begin = time.perf_counter()
@@ -129,6 +132,8 @@ def _run(
     submaps, work = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
     if not submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
+    if undo is None:  # what was taken out of a run stays out when it is gone on with
+        undo = undone_of_run(folder.path) if folder is not None and resume else ()
     solution = back.finish(undo)
     seconds["frontend"] = work.seconds
     seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}

@@ -112,6 +112,23 @@ def test_a_loop_can_be_undone(finished: tuple) -> None:
         back.undo_loop(999)
 
 
+def test_a_loop_of_an_earlier_ledger_is_known_by_what_it_joins(finished: tuple) -> None:
+    """Not by its number; and what is not found again is undone still, so that the next time knows of it."""
+    with_all = finished[0]
+    accepted = [d for d in ledger_of_events(with_all.graph.events).current() if d.verdict == "accepted"]
+    renumbered = replace(accepted[0], loop=accepted[0].loop + 50, verdict="undone")
+    elsewhere = replace(accepted[0], loop=3, i=accepted[0].i + 1, verdict="undone")
+    back = BackEnd(BackEndConfig(loops=True), "batch")
+    for s in with_all.submaps:
+        back.add(s)
+    back.finish([renumbered, elsewhere])
+    ledger = ledger_of_events(back.graph.events)
+    undone = [d for d in ledger.current() if d.verdict == "undone"]
+    assert [(d.i, d.j, d.source) for d in undone] == [(d.i, d.j, d.source) for d in (accepted[0], elsewhere)]
+    assert "not found this time" in undone[1].why
+    assert [d.loop for d in ledger.current() if d.verdict == "accepted"] == [d.loop for d in accepted[1:]]
+
+
 def test_submaps_without_maps_cannot_be_searched() -> None:
     submaps, _ = there_and_back()
     back = BackEnd(BackEndConfig(loops=True), "batch")
