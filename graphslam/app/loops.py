@@ -164,6 +164,7 @@ def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path 
     """Make a run again from its submaps without these loops, and write its folder anew."""
     from graphslam.app.pipeline import run
 
+    ordered = sorted(undone, key=lambda x: x.loop)
     options = read_toml(Path(folder) / "config.toml")
     said = options.pop("run")
     run(
@@ -175,6 +176,6 @@ def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path 
         config=options,
         resume=True,
         progress=progress,
-        undo=sorted(undone, key=lambda x: x.loop),
+        undo=ordered,
     )
     return loops_of_run(folder)
