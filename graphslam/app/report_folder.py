@@ -167,7 +167,7 @@ def _loops(events: list[dict[str, Any]]) -> tuple[LoopLedger | None, list[dict[s
     ledger = ledger_of_events(events, where="events.jsonl")
     rows = [{str(k): v for k, v in row.items()} for row in ledger.table().to_dict("records")]
     for row, d in zip(rows, ledger.current()):
-        row["gates"] = dict(d.gates or {})
+        row["gates"] = {k: v for k, v in (d.gates or {}).items() if v is not None and v == v}
     return ledger, rows
 
 
