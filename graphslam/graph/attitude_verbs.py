@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from graphslam.graph.attitude import DOWN
 from graphslam.graph.gps_verbs import GpsVerbs
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.records import AttitudeRecord
+from graphslam.graph.records import AttitudeRecord, GpsRecord
 
 LEVELLED = "levelled"
 """Ledger kind and class of the attitudes of levelled bases."""
@@ -84,11 +85,19 @@ class AttitudeVerbs(GpsVerbs):
             raise ConfigError(f"attitude of x{node} must name the streams and the interval that it spends")
         record = AttitudeRecord(self._next_factor, node, d / length, np.eye(2) / sigma, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
-        if self.values.tilt is None:
-            self.values.tilt = np.zeros(2)
+        self._start_tilt()
         self._insert(record)
         self._event("attitude", factor_id=record.factor_id, node=node, sigma=sigma, evidence=evidence, group=group)
         return record.factor_id
+
+    def _start_tilt(self) -> None:
+        """Bring in the variable ``tilt``; fixes that took the z axis of the first base for up are turned by it."""
+        if self.values.tilt is None:
+            self.values.tilt = np.zeros(2)
+            for fid, r in self.records.items():
+                if isinstance(r, GpsRecord) and self.dim == 3:
+                    self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed
+            self.revision += 1
 
     def _level(self, node: int, sigma: float, time: float) -> int:
         """A base that was levelled: a declared exception of the ledger, see :meth:`PoseGraph.add_submap`."""

@@ -69,7 +69,7 @@ def unreached(records: Sequence[Record], layout: Layout) -> list[str]:
         for other in names[1:]:
             parent[root(other)] = root(names[0])
     # A prior ties its bias to a known value although no other factor has met it yet.
-    prior = {n for r in records if r.group == "gps-bias" for n in r.variables()}
+    prior = {n for r in records if r.group in ("gps-bias", "imu-bias") for n in r.variables()}
     home = {root("x0"), *(root(n) for n in prior)}
     return [n for n in layout.names() if n not in touched or root(n) not in home]
 
@@ -141,6 +141,8 @@ def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
         out.append(f"the GPS datum hangs on {fixes} fixes ({waiting} waiting): it needs two that are metres apart.")
     if "tilt" in lost:
         out.append("nothing says where up is: add the attitude of a node that is tied to x0.")
+    if any(n.startswith(("velocity", "imubias")) for n in lost):
+        out.append("the velocity or the bias of an IMU hangs on nothing: add readings, or remove its factors.")
     if any(n.startswith("bias") for n in lost):
         out.append("a GPS bias has neither a prior nor a fix of its own: set bias_sigma.")
     return out

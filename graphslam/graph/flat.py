@@ -18,6 +18,7 @@ from graphslam.core.geometry import Array
 from graphslam.graph.attitude import AttitudeFamily
 from graphslam.graph.families import BetweenFamily, BiasPriorFamily, Family, SubmapFamily, offsets
 from graphslam.graph.gps_family import GpsFamily
+from graphslam.graph.imu_family import ForceFamily, GyroFamily, ImuBiasFamily, ImuFamily
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.normal_kernels import scatter_dense
 from graphslam.graph.records import Record
@@ -75,7 +76,10 @@ class FactorBlocks:
     weight: Array
 
 
-FAMILIES: tuple[type[Family], ...] = (SubmapFamily, BetweenFamily, GpsFamily, BiasPriorFamily, AttitudeFamily)
+FAMILIES: tuple[type[Family], ...] = (
+    *(SubmapFamily, BetweenFamily, GpsFamily, BiasPriorFamily, AttitudeFamily),
+    *(ImuFamily, GyroFamily, ImuBiasFamily, ForceFamily),
+)
 """Kinds of factors in the order of their blocks."""
 
 
@@ -95,8 +99,9 @@ class FlatGraph:
         for k, rec in enumerate(records):
             order[type(rec)].append(k)
         self._position = np.array([k for ks in order.values() for k in ks], dtype=np.intp)
-        made = [family([records[k] for k in order[family.record]], layout) for family in FAMILIES]
-        self.families: list[Family] = [f for f in made if len(f)]
+        self.families: list[Family] = [
+            family([records[k] for k in order[family.record]], layout) for family in FAMILIES if order[family.record]
+        ]
         widths = [int(w) for f in self.families for w in f.widths]
         self._first = offsets([len(f) for f in self.families])
         self._g_offset = offsets(widths)

@@ -11,9 +11,10 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.graph.gtsam_imu import imu_in_space
 from graphslam.graph.gtsam_space import attitude_in_space, gps_in_space
 from graphslam.graph.gtsam_values import gtsam_pose
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.records import AttitudeRecord, BetweenRecord, BiasPriorRecord, GpsRecord, Record, SubmapRecord
 from graphslam.graph.state import gtsam_key
 from graphslam.graph.submap_factor import submap_factor
@@ -46,7 +47,9 @@ def gtsam_factor(record: Record, origin: Array) -> Any:
         return _gps(record, origin)
     if isinstance(record, AttitudeRecord):
         return attitude_in_space(record, with_kernel(gtsam.noiseModel.Unit.Create(2), record.robust), origin)
-    assert isinstance(record, BiasPriorRecord)
+    if not isinstance(record, BiasPriorRecord):
+        kernel = getattr(record, "robust", NO_KERNEL)
+        return imu_in_space(record, with_kernel(gtsam.noiseModel.Unit.Create(record.rows), kernel), origin)
     noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
     prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
     return prior(gtsam_key(f"bias{record.bias}"), np.zeros(record.dim), noise)

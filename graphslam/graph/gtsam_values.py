@@ -36,6 +36,10 @@ def insert_value(out: gtsam.Values, name: str, values: Values, row_of: dict[int,
     elif name == "tilt":
         assert values.tilt is not None
         out.insert(key, values.tilt)
+    elif name.startswith("velocity"):
+        out.insert(key, values.velocities[int(name[8:])])
+    elif name.startswith("imubias"):
+        out.insert(key, values.imu_biases[int(name[7:])])
     elif name.startswith("bias"):
         out.insert(key, values.biases[int(name[4:])])
     elif name[0] == "x":
@@ -92,4 +96,5 @@ def _from_gtsam_in_space(estimate: gtsam.Values, out: Values, keys: Any, letter:
         elif what == ord("t"):
             out.tilt = np.array(estimate.atVector(key))
         else:
-            out.biases[i] = estimate.atVector(key)
+            rows = {"b": out.biases, "v": out.velocities, "i": out.imu_biases}[chr(what)]
+            rows[i] = estimate.atVector(key)

@@ -116,6 +116,8 @@ def check_imu_axes(
     used = (which >= 0) & (which < n)
     counts = np.bincount(which[used], minlength=n)
     full = counts >= max(2, 0.5 * np.median(counts))
+    if np.count_nonzero(full) < 10:
+        raise DataError("IMU and path share too little time", got=f"{np.count_nonzero(full)} full windows", wanted="10")
 
     def mean(values: Array) -> Array:
         sums = np.stack([np.bincount(which[used], weights=values[used, k], minlength=n) for k in range(3)], axis=1)

@@ -36,7 +36,8 @@ from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.attitude_verbs import AttitudeVerbs, without_tilt
+from graphslam.graph.attitude_verbs import without_tilt
+from graphslam.graph.imu_verbs import ImuVerbs
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, whitener
@@ -46,7 +47,7 @@ from graphslam.graph.submap_node import SubmapNode
 __all__ = ["PoseGraph", "SubmapNode"]
 
 
-class PoseGraph(AttitudeVerbs):
+class PoseGraph(ImuVerbs):
     """A graph of submaps, landmarks and GPS, in the plane or in space: the verbs that add factors.
 
     The first base is fixed at the origin. What the graph holds and what can be asked of it is in

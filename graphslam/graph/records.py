@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
+from graphslam.graph.imu_records import MotionRecord
 from graphslam.graph.noise import NO_KERNEL, Robust
 
 
@@ -195,4 +196,4 @@ class AttitudeRecord:
         return f"{self.group} of x{self.node} (factor {self.factor_id})"
 
 
-Record = SubmapRecord | BetweenRecord | GpsRecord | BiasPriorRecord | AttitudeRecord
+Record = SubmapRecord | BetweenRecord | GpsRecord | BiasPriorRecord | AttitudeRecord | MotionRecord

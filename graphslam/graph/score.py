@@ -21,7 +21,8 @@ class ClassScore:
         Factors, and scalars they measure.
     dof : int
         ``rows`` less the unknowns that this class alone brings in: poses and landmarks for submaps, the datum for GPS,
-        biases for their priors, the tilt for attitudes. Summed over the classes it is the dof of the whole.
+        biases for their priors, the tilt for attitudes, velocities and biases of an IMU for its ways. Summed over the
+        classes it is the dof of the whole.
     """
 
     chi2: float
@@ -81,7 +82,13 @@ def score(flat: FlatGraph, chi2: Array) -> Score:
         "gps": lay.datum_dof if lay.datum else 0,
         "gps-bias": lay.dim * lay.biases,
         "attitude": 2 if lay.tilt else 0,
+        # every record of the class brings in, or ties, one bias; the ways bring in the others and the velocities
+        "imu-bias": 6 * int(sums.get("imu-bias", [0.0, 0, 0])[1]),
+        "imu": 3 * lay.velocities + 6 * (lay.imu_biases - int(sums.get("imu-bias", [0.0, 0, 0])[1])),
     }
+    if lay.tilt and "attitude" not in sums and "levelled" not in sums:
+        owner = "imu" if "imu" in sums else "imu-gravity"
+        unknowns[owner] = unknowns.get(owner, 0) + 2
     chain = next((g for g in ("submap", "dense-submap") if g in sums), next(iter(sums), ""))
     unknowns[chain] = unknowns.get(chain, 0) + lay.datum_start
     return Score(

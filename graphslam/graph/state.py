@@ -2,8 +2,9 @@
 
 Variables are named by short strings that also stand in messages: ``x3`` (pose of node 3), ``l17`` (landmark 17),
 ``datum`` (``T_gps_world``), ``bias2`` (position bias of GPS segment 2), ``tilt`` (where up is in the frame of the first
-base, in space only). The first base ``x0`` is fixed at the origin and is no variable at all: no prior has to hold it,
-and nothing is lost to a badly scaled one.
+base, in space only), ``velocity4`` and ``imubias4`` (of an IMU, in the order in which its nodes were tied). The first
+base ``x0`` is fixed at the origin and is no variable at all: no prior has to hold it, and nothing is lost to a badly
+scaled one.
 
 Poses are SE(2) ``(3,)`` or SE(3) ``(7,)`` and move by right tangents in GTSAM's order: x, y, θ in the plane, rotation
 before translation in space. The datum is SE(2) in the plane. In space it is ``[x, y, z, heading]``: the GPS frame and
@@ -13,7 +14,7 @@ the frame of the first base are both level, so four numbers lie between them, an
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +24,8 @@ from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, rotation2, se2_compose, se2_exp
 from graphslam.core.poses import Group, group_of
 
+_WORDS = ("bias", "velocity", "imubias")
+
 
 def gtsam_key(name: str) -> int:
     """GTSAM's 64-bit symbol of a variable name (letter in the top byte)."""
@@ -30,8 +33,9 @@ def gtsam_key(name: str) -> int:
         return ord("g") << 56
     if name == "tilt":
         return ord("t") << 56
-    if name.startswith("bias"):
-        return (ord("b") << 56) | int(name[4:])
+    for word in _WORDS:
+        if name.startswith(word):
+            return (ord(name[0]) << 56) | int(name[len(word) :])
     return (ord(name[0]) << 56) | int(name[1:])
 
 
@@ -39,7 +43,8 @@ def key_name(key: int) -> str:
     """Inverse of :func:`gtsam_key`."""
     letter, index = chr(key >> 56), key & ((1 << 56) - 1)
     whole = {"g": "datum", "t": "tilt"}
-    return whole.get(letter) or (f"bias{index}" if letter == "b" else f"{letter}{index}")
+    words = {word[0]: word for word in _WORDS}
+    return whole.get(letter) or f"{words.get(letter, letter)}{index}"
 
 
 @dataclass(slots=True)
@@ -59,6 +64,10 @@ class Values:
         GPS biases of the segments in the GPS frame [m].
     tilt : (2,) or None
         Rotation vector about x and y [rad] that takes the z axis of the first base to where up is.
+    velocities : (v, 3)
+        Of an IMU in the frame of the first base [m/s]; which nodes they are of, the factors say.
+    imu_biases : (b, 6)
+        Of its gyro [rad/s] and its accelerometer [m/s²].
     """
 
     poses: Array
@@ -67,6 +76,8 @@ class Values:
     datum: Array | None = None
     biases: Array = field(default_factory=lambda: np.zeros((0, 2)))
     tilt: Array | None = None
+    velocities: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    imu_biases: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @classmethod
     def empty(cls, dim: int) -> Values:
@@ -93,6 +104,8 @@ class Values:
             None if self.datum is None else self.datum.copy(),
             self.biases.copy(),
             None if self.tilt is None else self.tilt.copy(),
+            self.velocities.copy(),
+            self.imu_biases.copy(),
         )
 
     def layout(self) -> Layout:
@@ -104,6 +117,8 @@ class Values:
             len(self.biases),
             self.dim,
             self.tilt is not None,
+            len(self.velocities),
+            len(self.imu_biases),
         )
 
     def retract(self, step: Array) -> Values:
@@ -119,20 +134,26 @@ class Values:
             k = len(datum)
             datum = se2_compose(datum, se2_exp(step[c : c + k])) if dim == 2 else datum + step[c : c + k]
             c += k
+        biases = self.biases + step[c : c + self.biases.size].reshape(-1, dim)
+        c += self.biases.size
         if tilt is not None:
-            tilt, step = tilt + step[-2:], step[:-2]
-        biases = self.biases + step[c:].reshape(-1, dim)
-        return replace(self, poses=poses, landmarks=landmarks, datum=datum, biases=biases, tilt=tilt)
+            tilt = tilt + step[c : c + 2]
+            c += 2
+        velocities = self.velocities + step[c : c + self.velocities.size].reshape(-1, 3)
+        imu_biases = self.imu_biases + step[c + self.velocities.size :].reshape(-1, 6)
+        return Values(poses, self.landmark_ids, landmarks, datum, biases, tilt, velocities, imu_biases)
 
     def is_finite(self) -> bool:
         """Every number finite."""
-        arrays = (self.poses, self.landmarks, self.datum, self.biases, self.tilt)
+        arrays: tuple[Array | None, ...] = (self.poses, self.landmarks, self.datum, self.biases, self.tilt)
+        arrays += (self.velocities, self.imu_biases)
         return all(a is None or bool(np.all(np.isfinite(a))) for a in arrays)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns: ``[x_1 … x_m (3 | 6 each), landmarks, datum (3 | 4), biases, tilt (2)]``; x_0 has none.
+    """Columns: ``[x_1 … x_m (3 | 6 each), landmarks, datum (3 | 4), biases, tilt (2), velocities (3 each),
+    biases of an IMU (6 each)]``; x_0 has none.
 
     Parameters
     ----------
@@ -145,6 +166,7 @@ class Layout:
     dim : int
         2 or 3: of points and biases.
     tilt : bool
+    velocities, imu_biases : int
     """
 
     nodes: int
@@ -153,6 +175,8 @@ class Layout:
     biases: int
     dim: int = 2
     tilt: bool = False
+    velocities: int = 0
+    imu_biases: int = 0
 
     @property
     def pose_dof(self) -> int:
@@ -185,9 +209,19 @@ class Layout:
         return self.bias_start + self.dim * self.biases
 
     @property
+    def velocity_start(self) -> int:
+        """First column of the velocities."""
+        return self.tilt_start + (2 if self.tilt else 0)
+
+    @property
+    def imu_bias_start(self) -> int:
+        """First column of the biases of an IMU."""
+        return self.velocity_start + 3 * self.velocities
+
+    @property
     def size(self) -> int:
         """Number of free scalars (``states``)."""
-        return self.tilt_start + (2 if self.tilt else 0)
+        return self.imu_bias_start + 6 * self.imu_biases
 
     @cached_property
     def row_of(self) -> dict[int, int]:
@@ -198,11 +232,13 @@ class Layout:
         """Names of the variables in column order."""
         out = [f"x{k}" for k in range(1, self.nodes)] + [f"l{i}" for i in self.landmark_ids]
         out += (["datum"] if self.datum else []) + [f"bias{s}" for s in range(self.biases)]
-        return out + (["tilt"] if self.tilt else [])
+        out += ["tilt"] if self.tilt else []
+        out += [f"velocity{k}" for k in range(self.velocities)]
+        return out + [f"imubias{k}" for k in range(self.imu_biases)]
 
     def owner_of_columns(self) -> list[str]:
         """Name of the variable that each column belongs to."""
-        width = {"x": self.pose_dof, "d": self.datum_dof, "t": 2}
+        width = {"x": self.pose_dof, "d": self.datum_dof, "t": 2, "v": 3, "i": 6}
         return [name for name in self.names() for _ in range(width.get(name[0], self.dim))]
 
     def columns(self, name: str) -> npt.NDArray[np.intp]:
@@ -222,6 +258,12 @@ class Layout:
             elif name.startswith("bias"):
                 s = int(name[4:])
                 start = self.bias_start + d * s if 0 <= s < self.biases else -1
+            elif name.startswith("velocity"):
+                s, d = int(name[8:]), 3
+                start = self.velocity_start + d * s if 0 <= s < self.velocities else -1
+            elif name.startswith("imubias"):
+                s, d = int(name[7:]), 6
+                start = self.imu_bias_start + d * s if 0 <= s < self.imu_biases else -1
             elif name[0] == "x":
                 k, d = int(name[1:]), self.pose_dof
                 if k == 0:

@@ -170,6 +170,7 @@ class Isam2Solver:
             widths = {"x": (2, 1), "g": (2, 1), "l": (2, 0), "b": (2, 0)}
         else:  # GTSAM's Pose3 has its rotation first; the datum here has its heading last
             widths = {"x": (3, -3), "g": (3, 1), "b": (3, 0), "t": (0, 2)}
+            widths |= {"v": (3, 0), "i": (3, -3)}  # of an IMU's velocity [m/s]; of its biases [rad/s, m/s²]
         for letter, (m, r) in widths.items():
             parts = [np.full(m, metres), np.full(abs(r), radians)]
             thresholds.insert((letter, np.concatenate(parts if r >= 0 else parts[::-1])))
@@ -297,6 +298,10 @@ def _first_line(error: Exception) -> str:
 def _distance(a: Values, b: Values) -> float:
     """Greatest change of any component."""
     parts = [np.abs(a.poses - b.poses).max(initial=0.0), np.abs(a.landmarks - b.landmarks).max(initial=0.0)]
+    parts += [
+        np.abs(a.velocities - b.velocities).max(initial=0.0),
+        np.abs(a.imu_biases - b.imu_biases).max(initial=0.0),
+    ]
     for one, other in ((a.datum, b.datum), (a.tilt, b.tilt)):
         if one is not None and other is not None:
             parts.append(np.abs(one - other).max())

@@ -89,3 +89,9 @@ def test_too_little_in_common_is_refused() -> None:
     late = Trajectory(path.times + 10.0, path.poses)
     with pytest.raises(DataError, match="too little time"):
         check_imu_axes(imu, late)
+
+
+def test_readings_too_thin_for_windows_are_refused() -> None:
+    imu, path = drive(tilt=0.1)
+    with pytest.raises(DataError, match="too little time"):
+        check_imu_axes(imu.take(slice(None, None, 60)), path)

@@ -1,0 +1,338 @@
+"""Verbs of a graph in space that take an IMU: ways between near nodes, gravity at far ones, biases.
+
+Everything about the states of an IMU can be read off the factors: which velocity and which bias are a node's, and in
+which order the biases follow each other. So that is where it is kept, and removing factors needs no other book.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY, Imu
+from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
+from graphslam.graph.attitude import up_turn
+from graphslam.graph.attitude_verbs import AttitudeVerbs
+from graphslam.graph.imu_axes import check_imu_axes
+from graphslam.graph.imu_config import ImuConfig, Place, path_of, places_of
+from graphslam.graph.imu_family import GYRO_ROWS, XI, XJ, Ways, way_terms
+from graphslam.graph.imu_plan import FEWEST, Plan, joined, plan_of, window_of
+from graphslam.graph.imu_records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
+from graphslam.graph.imu_states import ImuStates, compacted, links_wanted
+from graphslam.graph.noise import whitener
+from graphslam.graph.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
+
+logger = logging.getLogger(__name__)
+
+RECENTRE = 2e-3
+"""A way is preintegrated again if the bias has moved by more than turns it so far [rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuUse:
+    """An IMU in a graph: its readings so far, and how they were to be used."""
+
+    imu: Imu
+    config: ImuConfig
+
+
+class ImuVerbs(AttitudeVerbs):
+    """The part of a :class:`~graphslam.graph.pose_graph.PoseGraph` that takes inertial readings."""
+
+    def __init__(self, dim: int = 2) -> None:
+        super().__init__(dim)
+        self.imus: dict[str, ImuUse] = {}
+
+    def add_imu(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None) -> list[int]:
+        """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
+
+        Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
+        preintegrated way (:mod:`graphslam.graph.preintegration`, :mod:`graphslam.graph.imu_family`), inner nodes
+        included. It brings in the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise``
+        says, and walks on over pauses. A node without a way sees gravity: the mean specific force about it, as sure as
+        the body was still. The first factor brings in the ``tilt`` (:mod:`graphslam.graph.attitude`).
+
+        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
+        are there stay. Everything left out is counted by reason (event ``imu``).
+
+        Parameters
+        ----------
+        imu : Imu
+            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
+        stream : str
+            Its name in the ledger.
+        config : ImuConfig, optional
+            By default that of the call before.
+
+        Returns
+        -------
+        list of int
+            Ids of the new factors.
+
+        Raises
+        ------
+        EvidenceReusedError
+            A submap, or another factor, spent the stream over an overlapping interval. Nothing is changed then.
+        DataError
+            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
+        GeometryError
+            In the plane.
+        ConfigError, CovarianceError
+        """
+        if self.dim != 3:
+            raise GeometryError("an IMU says little of poses in the plane", where=stream, wanted="a graph in space")
+        known = self.imus.get(stream)
+        cfg = config or (ImuConfig() if known is None else known.config)
+        imu = imu if known is None else joined(known.imu, imu, stream)
+        if len(imu.times) < 2:
+            raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
+        bias_sigma(imu.noise)
+        places = places_of(self.submaps, cfg.window)
+        plan = plan_of(self.submaps, self.records.values(), imu, stream, cfg, places)
+        for a, b in plan.pairs:
+            self.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
+        for n in plan.gravity:
+            self.ledger.check(f"gravity seen by {stream} at x{n}", [stream], window_of(places[n].time, cfg))
+        self.check_imu(imu, stream=stream, axes=cfg.axes)
+        self.imus[stream] = ImuUse(imu, cfg)
+        ids = self._add_ways(imu, stream, cfg, places, plan.pairs)
+        ids += self._add_forces(imu, stream, cfg, places, plan)
+        ids += self._relink(stream)
+        self._event(
+            "imu", stream=stream, factors=len(ids), ways=len(plan.pairs), gravity=len(plan.gravity),
+            dropped=dict(plan.dropped),
+        )  # fmt: skip
+        return ids
+
+    def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
+        """Hold the axes of an IMU against the paths of the submaps; returns what is wrong in words, or nothing.
+
+        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
+
+        Raises
+        ------
+        DataError
+            The mounting is contradicted and ``axes`` is ``"refuse"``.
+        """
+        if axes == "ignore":
+            return ""
+        try:
+            found = check_imu_axes(imu, path_of(self.submaps, self.values))
+        except DataError as error:
+            self._event("imu-axes", stream=stream, verdict="not checked", why=str(error))
+            return ""
+        words = found.words()
+        self._event(
+            "imu-axes", stream=stream, verdict="wrong" if found.wrong else "as stated", words=words,
+            excess=found.excess, alike=found.alike, windows=found.windows,
+        )  # fmt: skip
+        if axes == "refuse":
+            found.raise_if_wrong(stream)
+        elif found.wrong:
+            logger.warning("%s: the axes are not those that its mounting says: %s", stream, words)
+        return words
+
+    def recentre_imu(self, *, limit: float = RECENTRE) -> int:
+        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
+
+        Ways know how they change with the biases to first order only. After solving, call this and solve again until
+        it returns nothing: twice is enough, most of the time.
+        """
+        changed = 0
+        for stream, use in self.imus.items():
+            old = [r for r in self.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
+            now = np.array([self.values.imu_biases[r.biases[0]] for r in old]).reshape(-1, 6)
+            about = np.array([r.bias for r in old]).reshape(-1, 6)
+            turned = np.linalg.norm((now - about)[:, :3], axis=1) * np.array([r.seconds for r in old])
+            some = np.flatnonzero(turned > limit)
+            if len(some):
+                begin, end = np.array([old[k].interval for k in some]).T
+                self._weigh([old[k] for k in some], preintegrate(use.imu, begin, end, now[some]))
+                changed += len(some)
+        return changed
+
+    def imu_states(self, stream: str = "imu") -> ImuStates:
+        """Nodes, velocities and biases of an IMU, in order of time."""
+        return ImuStates.of(self.records.values(), stream)
+
+    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
+        """See :meth:`~graphslam.graph.graph_record.GraphRecord.remove`; what an IMU said inside a submap goes with it.
+
+        A bias that loses the way to the one before walks over the time between instead.
+        """
+        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
+        if owner is not None and factor_id in self.records:
+            inside = set(owner.nodes)
+            for fid, r in list(self.records.items()):
+                way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
+                if way or (isinstance(r, ForceRecord) and r.node in inside):
+                    self._take_out(fid, "its submap was removed")
+        super().remove(factor_id, reason=reason)
+        if self.imus:
+            for stream in self.imus:
+                self._relink(stream)
+            self._compact()
+            if self.values.tilt is not None and not any("tilt" in r.variables() for r in self.records.values()):
+                self.values.tilt = None
+                self.revision += 1
+
+    # ---------------------------------------------------------------- inside
+
+    def _add_ways(
+        self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], pairs: Sequence[tuple[int, int]]
+    ) -> list[int]:
+        if not pairs:
+            return []
+        self._start_tilt()
+        begin, end = (np.array([places[pair[k]].time for pair in pairs]) for k in (0, 1))
+        unit = {n: places[n].unit(imu.T_base_imu) for pair in pairs for n in pair}
+        states = self.imu_states(stream)
+        start = self._start_bias(states, preintegrate(imu, begin, end), pairs, unit)
+        pim = preintegrate(imu, begin, end, start)
+        velocities, biases = dict(states.velocity), dict(states.bias)
+        kind = ImuRecord if cfg.accelerometer else GyroRecord
+        new_v, made = len(self.values.velocities), []
+        for k, (a, b) in enumerate(pairs):
+            for n in (a, b):
+                if n not in biases:
+                    biases[n] = len(self.values.imu_biases)
+                    self.values.imu_biases = np.vstack([self.values.imu_biases, start])
+                if cfg.accelerometer and n not in velocities:
+                    velocities[n] = len(self.values.velocities)
+                    self.values.velocities = np.vstack([self.values.velocities, np.full(3, np.nan)])
+            va, vb = velocities.get(a, -1), velocities.get(b, -1)
+            local = np.stack([unit[a][1], unit[b][1]])
+            made.append(
+                kind(
+                    self._next_factor + k, stream, a, b, (begin[k], end[k]), (va, vb), (biases[a], biases[b]),
+                    unit[a][0], unit[b][0], pim.R[k], pim.p[k], pim.v[k], pim.J[k], pim.bias[k],
+                    np.eye(15 if cfg.accelerometer else 9), local, cfg.robust,
+                )
+            )  # fmt: skip
+        self._start_velocities(made, new_v)
+        self._weigh(made, pim)
+        for r in made:
+            self.ledger.spend(r.factor_id, r.label(), [stream], r.interval)
+        return [r.factor_id for r in made]
+
+    def _start_bias(
+        self,
+        states: ImuStates,
+        pim: Preintegrated,
+        pairs: Sequence[tuple[int, int]],
+        unit: dict[int, tuple[Array, Array]],
+    ) -> Array:
+        """Where biases start: at the last one known, or by how much faster the gyro turns than the nodes do."""
+        if states.bias:
+            return self.values.imu_biases[states.bias[states.order[-1]]].copy()
+        i, j = np.array(pairs).T
+        q = [quat_multiply(self.values.poses[n, 3:], np.array([unit[k][0][3:] for k in n.tolist()])) for n in (i, j)]
+        turn = quat_multiply(q[0] * [-1.0, -1.0, -1.0, 1.0], q[1])
+        excess = np.swapaxes(quat_to_matrix(turn), 1, 2) @ pim.R
+        w = so3_log(matrix_to_quat(excess)) / pim.seconds[:, None]
+        weight = pim.seconds >= np.median(pim.seconds)
+        return np.concatenate([np.median(w[weight], axis=0), np.zeros(3)])
+
+    def _start_velocities(self, ways: Sequence[ImuRecord], first: int) -> None:
+        """Velocities from ``first`` on, by the ways (eq. 33 solved for them)."""
+        v = self.values.velocities
+        assert self.values.tilt is not None
+        up = GRAVITY * up_turn(self.values.tilt)[0][:, 2]
+        for r in ways:
+            a, b = r.velocities
+            if a < 0:
+                return
+            X = se3_compose(self.values.poses[[r.i, r.j]], np.stack([r.T_i_imu, r.T_j_imu]))
+            T, R = r.seconds, quat_to_matrix(X[0, 3:])
+            at_i = (X[1, :3] - X[0, :3] + 0.5 * up * T**2 - R @ r.p) / T
+            if a >= first and not np.isfinite(v[a, 0]):
+                v[a] = at_i
+            if b >= first:
+                v[b] = at_i - up * T + R @ r.v  # the next way, if there is one, knows no better
+
+    def _weigh(self, records: Sequence[ImuRecord], pim: Preintegrated) -> None:
+        """Put ways into the graph as preintegrated, with the covariance of where the unit is on the nodes."""
+        assert self.values.tilt is not None
+        v = np.vstack([self.values.velocities, np.zeros(3)])  # row -1: of ways by the gyro alone
+        b, x = self.values.imu_biases, self.values.poses
+        fresh = [replace(r, R=R, p=p, v=w, J=J, bias=c) for r, R, p, w, J, c in zip(
+            records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
+        i, j = (np.array([getattr(r, n) for r in fresh]) for n in "ij")
+        vs, bs = np.array([r.velocities for r in fresh]), np.array([r.biases for r in fresh])
+        ways = Ways(fresh)
+        J = way_terms(
+            ways, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], self.values.tilt
+        )[1]  # fmt: skip
+        local = np.array([r.local for r in fresh])
+        P = pim.covariance.copy()
+        for side, (columns, L) in enumerate(((XI, ways.L_i), (XJ, ways.L_j))):
+            U = J[:, :, columns] @ se3_adjoint(L)  # by the unit's own right tangent
+            P += U @ local[:, side] @ np.swapaxes(U, 1, 2)
+        for r, Pk in zip(fresh, P):
+            gyro = isinstance(r, GyroRecord)
+            Pk = Pk[np.ix_(GYRO_ROWS, GYRO_ROWS)] if gyro else Pk
+            W = whitener(Pk, what=f"covariance of {r.label()}", dim=len(Pk))
+            self._insert(replace(r, whitener=W))
+
+    def _add_forces(self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], plan: Plan) -> list[int]:
+        if not plan.gravity:
+            return []
+        self._start_tilt()
+        at = np.array([places[n].time for n in plan.gravity])
+        force, count, quiet = mean_force(imu, at, 0.5 * cfg.window)
+        states, ids = self.imu_states(stream), []
+        known = states.bias
+        for k, n in enumerate(plan.gravity):
+            if count[k] < FEWEST:
+                plan.dropped["gravity with too few readings"] += 1
+                continue
+            L, E = places[n].unit(imu.T_base_imu)
+            white = imu.noise.accelerometer / np.sqrt(cfg.window)
+            still = bool(quiet[k]) and places[n].moved < cfg.still
+            sigma = white if still else float(np.hypot(white, cfg.acceleration))
+            tilted = GRAVITY**2 * (np.trace(E[:3, :3]) * np.eye(3) - E[:3, :3])
+            W = whitener(sigma**2 * np.eye(3) + tilted, what=f"specific force at x{n}", dim=3)
+            row = known.get(n)
+            if row is None:
+                row = len(self.values.imu_biases)
+                start = self.values.imu_biases[-1] if row else np.zeros(6)
+                self.values.imu_biases = np.vstack([self.values.imu_biases, start])
+            r = ForceRecord(self._next_factor, stream, n, float(at[k]), row, L, force[k], W, cfg.robust)
+            self.ledger.spend(r.factor_id, r.label(), [stream], window_of(at[k], cfg))
+            self._insert(r)
+            ids.append(r.factor_id)
+        return ids
+
+    def _relink(self, stream: str) -> list[int]:
+        """The first bias starts, and each that no way ties to the one before walks on from it."""
+        noise = self.imus[stream].imu.noise
+        wanted = links_wanted(self.imu_states(stream), self.records.values(), stream, noise)
+        for fid, r in list(self.records.items()):
+            if isinstance(r, ImuBiasRecord) and r.stream == stream:
+                sigma = wanted.get((r.before, r.bias))
+                if sigma is None or not np.array_equal(sigma, r.sigma):
+                    self.records.pop(fid)
+                    self.ledger.refund(fid)
+                    self.revision += 1
+                else:
+                    del wanted[(r.before, r.bias)]
+        ids = []
+        for (before, bias), sigma in wanted.items():
+            r = ImuBiasRecord(self._next_factor, stream, before, bias, sigma)
+            self.ledger.spend(r.factor_id, r.label(), ["-"], (0.0, 0.0), "prior")
+            self._insert(r)
+            ids.append(r.factor_id)
+        return ids
+
+    def _compact(self) -> None:
+        """Velocities and biases that no factor holds any more go; the others move up."""
+        changed, v, b = compacted(self.records)
+        if changed or len(v) < len(self.values.velocities) or len(b) < len(self.values.imu_biases):
+            self.values.velocities, self.values.imu_biases = self.values.velocities[v], self.values.imu_biases[b]
+            self.records.update(changed)
+            self.revision += 1
