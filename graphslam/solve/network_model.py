@@ -7,10 +7,11 @@ GTSAM 4.3 evaluates a ``BetweenFactor`` as ``r = Log(z⁻¹ x_i⁻¹ x_j)`` with
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from graphslam.core import se3
@@ -144,6 +145,21 @@ def square_root(information: Array) -> Array:
     except np.linalg.LinAlgError:
         w, V = np.linalg.eigh(information)
         return np.asarray(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2))
+
+
+def subnetwork(network: PoseNetwork, used: npt.NDArray[np.bool_]) -> PoseNetwork:
+    """The network with only the edges and observations of ``used`` (m + k,)."""
+    m = len(network.edges)
+    e, o = np.flatnonzero(used[:m]), np.flatnonzero(used[m:])
+    return replace(
+        network,
+        edges=network.edges[e],
+        measurements=network.measurements[e],
+        information=network.information[e],
+        observations=network.observations[o],
+        observation_values=network.observation_values[o],
+        observation_information=network.observation_information[o],
+    )
 
 
 @dataclass(frozen=True, slots=True)

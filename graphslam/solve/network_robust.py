@@ -4,7 +4,8 @@ A measurement pays at most ``s² χ²_d(p)`` (Yang, Antonante, Tzoumas & Carlone
 file misstates its variance. Graduated non-convexity finds a good local minimum if it begins near one; least squares of
 everything, its usual start, is no such place when a third of the loops are wrong. So it begins from the loops that
 their neighbours bear out (:mod:`~graphslam.solve.network_consensus`), with the schedule as late as the residuals there
-allow. Plain trimming from every start is the competitor, and the lowest truncated cost wins.
+allow. Plain trimming from every start is the competitor. What it ends with is settled by evidence, loop by loop and
+group by group (:mod:`~graphslam.solve.network_settle`), with the file's own limit, and the lowest truncated cost wins.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 from scipy import stats
 from tqdm import tqdm
 
@@ -26,21 +26,17 @@ from graphslam.core.network import PoseNetwork
 from graphslam.solve.network_batch import BatchProblem, Polished, polish
 from graphslam.solve.network_consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network_diagnose import check_determined
-from graphslam.solve.network_model import Layout, edge_costs, linearise, observation_costs
-from graphslam.solve.network_sparse import factor
+from graphslam.solve.network_model import edge_costs, observation_costs, subnetwork
+from graphslam.solve.network_settle import Settled, settle
 from graphslam.solve.network_start import chordal_start, landmarks_from, odometry_start
 
 log = logging.getLogger(__name__)
 
 Mask = npt.NDArray[np.bool_]
 ROUNDS = 12
-# The bulk of recorded loops says little of the tail: with an estimated scale, the limit is so many times wider, though
-# never beyond that of the stated noise.
+# The bulk of recorded loops says little of the tail: with an estimated scale, the limit is so many times wider until
+# the tail is known, though never beyond that of the stated noise.
 MARGIN = 20.0
-# Limits are widened so far to look for what was left out together.
-WIDER = (10.0, 100.0)
-# Loops left out that are tested against the covariance of the answer, at a time, and how often.
-TESTED, TESTS = 300, 4
 # Growth of μ, descent steps at each, and when to stop (Yang et al. 2020 use 1.4).
 GROWTH, STEPS, STAGES = 1.4, 2, 60
 # Residuals of the loops believed at the start are taken to be at most so many times the limit: μ starts there.
@@ -49,7 +45,7 @@ WORST = 1e3
 CONFIRMED = 0.001
 # Steps of a solve between two choices of inliers; the last solve goes to the end.
 TRIM_STEPS = 6
-FINAL_STEPS, SETTLE = 200, 40
+FINAL_STEPS = 200
 # Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
 START_STEPS = 40
 
@@ -69,7 +65,7 @@ class Robust:
     truncated : float
         Truncated cost here.
     limit : (m + k,)
-        What a measurement pays at most; infinite for trusted ones.
+        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
     scale : float
         True over stated variance of the edges, as estimated or given.
     start : str
@@ -157,7 +153,7 @@ def truncated_least_squares(
             starts["odometry"] = (begun, used)
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
-    found: list[tuple[str, _Trimmed]] = []
+    found: list[tuple[str, Settled]] = []
     for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
         if name not in starts:
             continue
@@ -167,18 +163,28 @@ def truncated_least_squares(
         if not (name == "consensus" and confirmed):
             weights, annealed = _anneal(network, values, limit, believed)
             trimmed = min(trimmed, _trim(network, annealed, weights > 0.5, limit), key=lambda t: t.cost)
-        best = _readmit(network, _widen(network, trimmed, limit), limit)
+        best = settle(
+            network,
+            trimmed.end.values,
+            trimmed.inliers,
+            limit,
+            probability=probability,
+            own_tail=noise_scale is None,
+        )
         found.append((name, best))
         if name == "consensus" and (best.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED:
             starts.pop("core", None)  # the loops believed first are believed last
     if not found:
         raise IndeterminateError(f"{network.source}: no robust start could be made")
+    # one limit for all, that of the cleanest answer: wrong loops widen the tail that they are judged by
+    limit = np.min([f.limit for _, f in found], axis=0)
     reached: dict[str, float] = {}
-    for name, trimmed in found:
-        reached[name] = min(trimmed.cost, reached.get(name, np.inf))
-    name, best = min(found, key=lambda f: f[1].cost)
-    best = _trim(network, best.end.values, best.inliers, limit, steps=FINAL_STEPS)
-    return Robust(best.inliers, best.problem, best.end, best.cost, limit, scale, name, reached)
+    for name, settled in found:
+        arrays = settled.problem.arrays(settled.end.values)
+        reached[name] = min(truncated_cost(network, arrays, limit), reached.get(name, np.inf))
+    name, best = min(found, key=lambda f: reached[f[0]])
+    final = _trim(network, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
+    return Robust(final.inliers, final.problem, final.end, final.cost, best.limit, best.scale, name, reached)
 
 
 def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
@@ -195,21 +201,6 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
-
-
-def subnetwork(network: PoseNetwork, used: Mask) -> PoseNetwork:
-    """The network with only the edges and observations of ``used`` (m + k,)."""
-    m = len(network.edges)
-    e, o = np.flatnonzero(used[:m]), np.flatnonzero(used[m:])
-    return replace(
-        network,
-        edges=network.edges[e],
-        measurements=network.measurements[e],
-        information=network.information[e],
-        observations=network.observations[o],
-        observation_values=network.observation_values[o],
-        observation_information=network.observation_information[o],
-    )
 
 
 def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
@@ -275,90 +266,21 @@ class _Trimmed:
 
 
 def _trim(
-    network: PoseNetwork,
-    values: gtsam.Values,
-    inliers: Mask,
-    limit: Array,
-    *,
-    steps: int = TRIM_STEPS,
-    settle: bool = False,
+    network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
 ) -> _Trimmed:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
-    Neither step raises the truncated cost, so it ends. ``settle``: the first solve is a longer one, because the
-    choice at the start is not one by cost.
+    Neither step raises the truncated cost, so it ends.
     """
     for _ in range(ROUNDS):
         inner = BatchProblem(network, inliers)
-        end = polish(inner, values, max_iterations=SETTLE if settle else steps)
-        settle = False
+        end = polish(inner, values, max_iterations=steps)
         costs = _costs(network, *inner.arrays(end.values))
         fresh = costs <= limit
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values
     return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
-
-
-def _widen(network: PoseNetwork, best: _Trimmed, limit: Array) -> _Trimmed:
-    """Look again at what was left out by a little: with wider limits for a while, kept if the cost falls.
-
-    Loops that alone tie a stretch of the path are left out together, because without them the stretch lies elsewhere;
-    each is then too far off to be taken back in alone.
-    """
-    for widest in WIDER:
-        wide = best
-        for step in np.geomspace(widest, 1.0, 4):
-            costs = _costs(network, *wide.problem.arrays(wide.end.values))
-            inliers = costs <= step * limit
-            if step == widest and (inliers == wide.inliers).all():
-                break
-            wide = _trim(network, wide.end.values, inliers, step * limit)
-        if wide.cost < best.cost * (1.0 - 1e-9):
-            best = wide
-    return best
-
-
-def _readmit(network: PoseNetwork, best: _Trimmed, limit: Array) -> _Trimmed:
-    """Take back what the answer is too uncertain to contradict: ``rᵀ (Ω⁻¹ + J Σ Jᵀ)⁻¹ r`` within the limit.
-
-    That is what a measurement left out would add to the objective, to first order; its cost at the answer says
-    nothing where the answer is free to move. Kept if the truncated cost falls.
-    """
-    m = len(network.edges)
-    for _ in range(TESTS):
-        poses, landmarks = best.problem.arrays(best.end.values)
-        costs = edge_costs(network, poses)
-        w = np.linalg.eigvalsh(network.information)
-        outside = np.flatnonzero(~best.inliers[:m] & (w[:, 0] > 1e-12 * w[:, -1]))
-        outside = outside[np.argsort(costs[outside], kind="stable")][:TESTED]
-        if not len(outside):
-            break
-        D = _predicted(network, best.inliers, outside, poses, landmarks)
-        fresh = best.inliers.copy()
-        fresh[outside[limit[outside] >= D]] = True
-        if (fresh == best.inliers).all():
-            break
-        tried = _trim(network, best.end.values, fresh, limit, settle=True)
-        if not tried.cost < best.cost * (1.0 - 1e-9):
-            break
-        best = tried
-    return best
-
-
-def _predicted(network: PoseNetwork, inliers: Mask, rows: npt.NDArray[np.intp], poses: Array, marks: Array) -> Array:
-    """``D²`` of edges against the posterior of the inliers."""
-    layout, d = Layout.of(network), network.tangent_dim
-    J, _ = linearise(subnetwork(network, inliers), poses, marks, layout)
-    part = subnetwork(network, np.isin(np.arange(len(inliers)), rows))
-    back = np.argsort(np.argsort(rows))
-    # whitened: S = I + A H⁻¹ Aᵀ, in the order of the file
-    A, r = linearise(part, poses, marks, layout)
-    solved = factor(sp.csc_matrix(J.T @ J)).solve(A.T.toarray())
-    blocks = np.asarray(A @ solved).reshape(len(rows), d, len(rows), d)
-    S = np.eye(d) + blocks[np.arange(len(rows)), :, np.arange(len(rows))]
-    r = r.reshape(-1, d)
-    return np.einsum("ki,ki->k", r, np.linalg.solve(S, r[..., None])[..., 0])[back]
 
 
 def _costs(network: PoseNetwork, poses: Array, landmarks: Array) -> Array:

@@ -18,7 +18,7 @@ from graphslam.solve.network_certificate import Certificate, certify
 from graphslam.solve.network_consensus import odometry_edges
 from graphslam.solve.network_diagnose import check_determined, check_full_rank
 from graphslam.solve.network_incremental import Isam2Options, relinearise_all, run_isam2
-from graphslam.solve.network_model import objective
+from graphslam.solve.network_model import objective, subnetwork
 from graphslam.solve.network_multistart import (
     SAME,
     Optimum,
@@ -27,7 +27,7 @@ from graphslam.solve.network_multistart import (
     canonical_start,
     default_starts,
 )
-from graphslam.solve.network_robust import Robust, subnetwork, truncated_cost, truncated_least_squares
+from graphslam.solve.network_robust import Robust, truncated_cost, truncated_least_squares
 from graphslam.solve.network_sparse import PcgProblem
 
 # A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
