@@ -160,7 +160,7 @@ class ImuFamily(UniformFamily):
         return np.einsum("kij,kj->ki", self._W, r), self._W @ J
 
     def _plain(self, values: Values) -> tuple[Array, Array]:
-        assert values.tilt is not None
+        assert values.tilt is not None  # every way by the accelerometer brings it in
         x, v, b = values.poses, values.velocities, values.imu_biases
         (vi, vj), (bi, bj) = self._v.T, self._b.T
         return way_terms(self._ways, x[self._i], v[vi], b[bi], x[self._j], v[vj], b[bj], values.tilt)

@@ -188,7 +188,8 @@ class ImuVerbs(AttitudeVerbs):
     ) -> list[int]:
         if not pairs:
             return []
-        self._start_tilt()
+        if cfg.accelerometer:
+            self._start_tilt()
         begin, end = (np.array([places[pair[k]].time for pair in pairs]) for k in (0, 1))
         unit = {n: places[n].unit(imu.T_base_imu) for pair in pairs for n in pair}
         states = self.imu_states(stream)
@@ -241,12 +242,12 @@ class ImuVerbs(AttitudeVerbs):
     def _start_velocities(self, ways: Sequence[ImuRecord], first: int) -> None:
         """Velocities from ``first`` on, by the ways (eq. 33 solved for them)."""
         v = self.values.velocities
+        if len(v) == first:
+            return
         assert self.values.tilt is not None
         up = GRAVITY * up_turn(self.values.tilt)[0][:, 2]
         for r in ways:
             a, b = r.velocities
-            if a < 0:
-                return
             X = se3_compose(self.values.poses[[r.i, r.j]], np.stack([r.T_i_imu, r.T_j_imu]))
             T, R = r.seconds, quat_to_matrix(X[0, 3:])
             at_i = (X[1, :3] - X[0, :3] + 0.5 * up * T**2 - R @ r.p) / T
@@ -257,7 +258,7 @@ class ImuVerbs(AttitudeVerbs):
 
     def _weigh(self, records: Sequence[ImuRecord], pim: Preintegrated) -> None:
         """Put ways into the graph as preintegrated, with the covariance of where the unit is on the nodes."""
-        assert self.values.tilt is not None
+        tilt = np.zeros(2) if self.values.tilt is None else self.values.tilt  # the gyro alone asks for none
         v = np.vstack([self.values.velocities, np.zeros(3)])  # row -1: of ways by the gyro alone
         b, x = self.values.imu_biases, self.values.poses
         fresh = [replace(r, R=R, p=p, v=w, J=J, bias=c) for r, R, p, w, J, c in zip(
@@ -266,7 +267,7 @@ class ImuVerbs(AttitudeVerbs):
         vs, bs = np.array([r.velocities for r in fresh]), np.array([r.biases for r in fresh])
         ways = Ways(fresh)
         J = way_terms(
-            ways, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], self.values.tilt
+            ways, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], tilt
         )[1]  # fmt: skip
         local = np.array([r.local for r in fresh])
         P = pim.covariance.copy()
