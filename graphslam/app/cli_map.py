@@ -10,6 +10,11 @@ import typer
 from graphslam.app.cli_run import JSON
 from graphslam.app.terminal import emit, table
 
+CANDIDATES = (
+    *("verdict", "choice", "matches", "loops", "objective", "chi2", "dof", "chi2_per_dof"),
+    *("entropy", "known_volume", "why"),
+)
+
 
 def register(app: typer.Typer) -> None:
     """Add the verb to the command line."""
@@ -22,7 +27,8 @@ def make_map(
     minimum_entropy: bool = typer.Option(
         False,
         "--minimum-entropy",
-        help="Solve the run with other choices of its matches too, and write the clearest map: clearest.*",
+        help="Solve the run with other choices of its matches and loops too, and keep the clearest map that its own "
+        "graph does not contradict (clearest.*) and the runners-up (alternatives/).",
     ),
     low: float | None = typer.Option(None, help="Floor plans begin this far above the path [m]; default the run's."),
     high: float | None = typer.Option(None, help="Floor plans end this far above the path [m]; default the run's."),
@@ -46,8 +52,12 @@ def make_map(
 
         found = clearest_of_run(result, made, progress=not as_json)
         files += write_clearest(run, found, bands=made.bands)
-        value["candidates"] = found.rows
-        text += "\n\n" + table(found.rows)
+        value |= {"candidates": found.rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
+        text += f"\n\n{table(found.rows, CANDIDATES)}\nchosen: {found.choice.why()}"
+        if found.choice.scale > 1.0:
+            text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
+        if found.left_out:
+            text += f"\n{found.left_out} more choices were not solved"
     value |= {"out": str(run), "files": [str(p) for p in files], "figures": [str(p) for p in figures]}
     text += f"\n\nwritten: {', '.join(p.name for p in files)}; figures: {', '.join(p.name for p in figures)}"
     emit(value, text, as_json=as_json)

@@ -4,18 +4,19 @@ Particles that entered different older maps, or none, tell different topologies;
 the map would be without it, which is the null match that every particle could have drawn. Each is settled into submaps,
 made a graph of its own with loops of its own, and only then compared: the entropy of a map sample says more of how its
 segments happen to hang together than of which topology is right. SegSLAM's authors take the sample of least entropy;
-here the choice is made after optimisation, among those that their own graph does not contradict.
+here the choice is made after optimisation, among those that their own graph does not contradict
+(:mod:`graphslam.app.alternatives`, which also has the choice among the matches and loops of a finished run).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 from tqdm import tqdm
 
 from frontends.filter_drift import FilterDrift
@@ -23,6 +24,8 @@ from frontends.segslam.config import HandoverConfig
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segmap import KINDS, MATCH, SegMap
 from frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam.app.alternatives import CONTRADICTION, Alternative, Choice, built, choose
+from graphslam.app.config import BackEndConfig
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
@@ -31,11 +34,10 @@ from graphslam.graph.loop_ledger import LoopLedger
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.entropy import Clarity
 from graphslam.maps.fuse import FusedMap
-from graphslam.maps.minimum_entropy import Candidate, rank_by_entropy
+from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
-from graphslam.solve.batch import BatchSolver
 from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.solution import Solution
 
@@ -66,7 +68,7 @@ class HypothesesConfig:
     """Also what would be without each of the first topology's entries, the least supported first."""
     placements: int = 1
     """Ways in which the grid stands when entropies are taken."""
-    contradiction: float = 1e-4
+    contradiction: float = CONTRADICTION
     """A graph whose χ² is greater than an honest one's with this probability is no choice while others are."""
 
     def __post_init__(self) -> None:
@@ -99,8 +101,10 @@ class Hypothesis:
         What was made of it.
     clarity : Clarity
         Of its fused map.
+    chi2 : float
+        Of its graph, loops without their kernels.
     contradicted : bool
-        By its own χ².
+        By that.
     """
 
     number: int
@@ -114,6 +118,7 @@ class Hypothesis:
     solution: Solution
     ledger: LoopLedger
     clarity: Clarity
+    chi2: float
     contradicted: bool
 
     @property
@@ -129,16 +134,21 @@ class Hypotheses:
     Parameters
     ----------
     order : tuple of Hypothesis
-        Those that nothing contradicts before the others, and among them by entropy.
-    best_map : FusedMap
-        Of the first.
+        As they were judged.
+    choice : Choice
+        The same as alternative graphs.
     left_out : int
         Topologies with too little weight, or beyond the number that was asked for.
     """
 
     order: tuple[Hypothesis, ...]
-    best_map: FusedMap
+    choice: Choice
     left_out: int
+
+    @property
+    def best_map(self) -> FusedMap:
+        """The map of the chosen one."""
+        return self.choice.best_map
 
     @property
     def best(self) -> Hypothesis:
@@ -151,12 +161,8 @@ class Hypotheses:
         if len(self.order) == 1:
             return f"all particles that count tell one topology (support {a.support:.2f})"
         b = self.order[1]
-        if b.contradicted and not a.contradicted:
-            return f"hypothesis {b.number} is contradicted by its own graph (χ² {b.solution.objective:.1f})"
-        return (
-            f"hypothesis {a.number} has an entropy of {a.clarity.entropy:.1f} nat m³, the next one ({b.number}) "
-            f"{b.clarity.entropy:.1f}; their supports are {a.support:.2f} and {b.support:.2f}"
-        )
+        said = f"hypothesis {a.number} before {b.number} (supports {a.support:.2f} and {b.support:.2f})"
+        return f"{said}: {self.choice.why()}"
 
     def table(self) -> pd.DataFrame:
         """One row a hypothesis, the chosen one first."""
@@ -180,7 +186,7 @@ def facts(h: Hypothesis) -> dict[str, Any]:
         "submaps": len(h.submaps),
         "entries": [list(e) for e in h.entries],
         "loops": h.loops,
-        "chi2": h.solution.objective,
+        "chi2": h.chi2,
         "dof": h.solution.score.dof,
         "contradicted": h.contradicted,
         "entropy": h.clarity.entropy,
@@ -253,7 +259,7 @@ def find_hypotheses(
         told.append(_Told(particle, support, None, chain, submaps, own_evidence_of(result.segmap, chain, submaps)))
     if c.withdraw:
         told += _withdrawn(told[0])[: c.most - len(told)]
-    made, candidates = [], []
+    alternatives, ledgers = [], []
     pieces: dict[int, DividedSubmaps] = {}
     for number, h in enumerate(tqdm(told, "hypotheses", disable=not progress, leave=False)):
         # what is withdrawn must not come back by registration: that is the other hypothesis
@@ -263,22 +269,21 @@ def find_hypotheses(
             nodes = {s.key: np.asarray(s.times[:-1]) for s in graph.submaps}
             pieces[id(h.grids)] = divide_submaps(h.submaps, config=c.division, grids=h.grids, nodes=nodes)
         divided = pieces[id(h.grids)]
-        candidates.append(Candidate(divided.pieces, divided.along(solution.trajectory()), f"hypothesis {number}"))
-        made.append((h, graph, solution, ledger))
-    ranking = rank_by_entropy(candidates, model=model, count=c.placements)
-    clarity = {r.index: r.clarity for r in ranking.order}
-    all_ = [
-        Hypothesis(
-            k, h.particle, h.support, h.withdrawn, h.chain, _entries(h.submaps), h.submaps, graph, solution, ledger,
-            clarity[k], _contradicted(solution, c),
-        )
-        for k, (h, graph, solution, ledger) in enumerate(made)
-    ]  # fmt: skip
-    order = sorted(all_, key=lambda h: (h.contradicted, h.clarity.entropy, h.number))
-    best = ranking.best
-    if order[0].number != ranking.order[0].index:
-        best = rank_by_entropy([candidates[order[0].number]], model=model).best
-    return Hypotheses(tuple(order), best, len(found) - len(kept))
+        name = f"hypothesis {number}"
+        candidate = Candidate(divided.pieces, divided.along(solution.trajectory()), name)
+        alternatives.append(Alternative(name, graph, solution, candidate))
+        ledgers.append(ledger)
+    choice = choose(alternatives, model=model, placements=c.placements, contradiction=c.contradiction)
+    order = []
+    for j in choice.order:
+        h, a = told[j.number], j.alternative
+        order.append(
+            Hypothesis(
+                j.number, h.particle, h.support, h.withdrawn, h.chain, _entries(h.submaps), h.submaps, a.graph,
+                a.solution, ledgers[j.number], j.clarity, j.chi2, j.contradicted,
+            )
+        )  # fmt: skip
+    return Hypotheses(tuple(order), choice, len(found) - len(kept))
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,21 +311,14 @@ def _withdrawn(told: _Told) -> list[_Told]:
 
 
 def _solved(submaps: Sequence[Submap], c: HypothesesConfig, find: FindConfig) -> tuple[PoseGraph, Solution, LoopLedger]:
-    graph = PoseGraph(submaps[0].dim)
-    level = c.level_sigma if graph.dim == 3 and c.level_sigma > 0 else None
-    for s in submaps:
-        graph.add_submap(s, spacing=c.spacing, level_sigma=level)
-    solver = BatchSolver(graph)
-    solver.solve_to_optimum()
-    closer = find_loops(graph, solver, submaps, find)
-    return graph, solver.solution(), closer.ledger
+    # no match is a factor at once: `find_loops` decides on them
+    options = BackEndConfig(node_spacing=c.spacing, level_sigma=c.level_sigma, match_support=math.inf)
+    back = built(submaps, options)
+    back.solver.solve_to_optimum()
+    closer = find_loops(back.graph, back.solver, submaps, find)
+    return back.graph, back.solver.solution(), closer.ledger
 
 
 def _entries(submaps: Sequence[Submap]) -> tuple[tuple[int, int], ...]:
     """Of the chain itself, not of particles that tell another topology."""
     return tuple((s.matches[0].target, s.key) for s in submaps if s.report.get("entered") == "match" and s.matches)
-
-
-def _contradicted(solution: Solution, c: HypothesesConfig) -> bool:
-    dof = solution.score.dof
-    return dof > 0 and float(stats.chi2.sf(solution.objective, dof)) < c.contradiction

@@ -128,10 +128,11 @@ def hypotheses(folder: ReportFolder) -> Markup:
     candidates = None if folder.clearest is None else folder.clearest.get("candidates")
     if isinstance(candidates, list) and candidates:
         columns = {
-            **{"choice": "choice of matches", "matches": "matches", "entropy": "entropy [nat m³]"},
-            **{"known_volume": "known [m³]", "objective": "objective"},
+            **{"verdict": "verdict", "choice": "choice of matches", "matches": "matches", "loops": "loops"},
+            **{"objective": "objective", "chi2": "χ²", "dof": "dof", "entropy": "entropy [nat m³]"},
+            **{"known_volume": "known [m³]", "why": "why"},
         }
-        parts.append(element("h3", "Choices of matches, the clearest fused map first (clearest.json)"))
+        parts.append(element("h3", "Choices of matches and loops, the chosen one first (clearest.json)"))
         parts.append(table([c for c in candidates if isinstance(c, Mapping)], columns))
     if not parts:
         parts.append(missing("other hypotheses: none were solved in this folder."))

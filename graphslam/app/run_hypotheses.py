@@ -1,92 +1,158 @@
-"""Other graphs of the same submaps: each choice of matches is solved, and the clearest fused map found.
+"""Other graphs of a finished run: each choice of its matches and loops is solved, and the clearest map found.
 
 SegSLAM draws map samples and takes the one of least entropy. A run hands over one settled chain, whose matches carry
-the share of the particles that took them; which of them to believe is what is left to choose. Each choice is optimised
-*before* its entropy is taken: an unsolved sample is blurred by errors that the graph would have removed.
+the share of the particles that took them, and a ledger of loops; which of them to believe is what is left to choose.
+How the graphs are judged is said in :mod:`graphslam.app.alternatives`.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy import stats
 from tqdm import tqdm
 
 from graphslam.app import config as cfg
+from graphslam.app.alternatives import Alternative, Choice, built, choose, write_choice
 from graphslam.app.back_end import BackEnd
+from graphslam.app.loops import ledger_of_events
 from graphslam.app.run import Run
-from graphslam.app.run_folder import RunFolder
 from graphslam.app.run_maps import RunMap, folder_options, solved_poses
 from graphslam.core.errors import MissingDataError
+from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
-from graphslam.core.trajectory import Trajectory
-from graphslam.io.tum import write_tum
-from graphslam.maps.export import save_maps
-from graphslam.maps.minimum_entropy import Candidate, Ranking, rank_by_entropy
+from graphslam.graph.loop_candidates import FRONT_END
+from graphslam.graph.loop_ledger import Decision
+from graphslam.graph.loop_measure import Loop
+from graphslam.graph.loops import LoopConfig
+from graphslam.graph.noise import Robust
+from graphslam.maps.minimum_entropy import Candidate
+from graphslam.solve.graph_loops import GraphLoops
 from graphslam.solve.solution import Solution
 
+logger = logging.getLogger(__name__)
 MOST = 16
-"""Choices of matches that are solved at most."""
+"""Choices that are solved at most."""
+LOOP = -1
+"""In place of the key of a submap: what follows is the number of a loop."""
 Chosen = frozenset[tuple[int, int]]
-"""Matches as (key of the submap, place among its matches)."""
+"""Matches as (key of the submap, place among its matches), loops that were looked for as (LOOP, number)."""
 
 
 @dataclass(frozen=True)
 class Clearest:
-    """Choices of matches in the order of the entropy of their maps.
+    """Choices of matches and loops, judged.
 
     Parameters
     ----------
-    rows : list of dict
-        ``choice``, ``matches``, ``entropy`` [nat m³], ``known_volume`` [m³], ``objective``; the clearest first.
-    ranking : Ranking
-    trajectory : Trajectory
-        Of the clearest.
+    choice : Choice
+    choices : dict of str to Chosen
+        What each of them holds.
+    left_out : int
+        Choices beyond the number that is solved.
     """
 
-    rows: list[dict[str, Any]]
-    ranking: Ranking
-    trajectory: Trajectory
+    choice: Choice
+    choices: Mapping[str, Chosen]
+    left_out: int
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The table of candidates, the chosen one first, with what each holds."""
+        out = []
+        for row in self.choice.rows():
+            chosen = self.choices[row["choice"]]
+            loops = sum(key == LOOP for key, _ in chosen)
+            row |= {"matches": len(chosen) - loops, "loops": loops}
+            out.append(row)
+        return out
 
 
-def choices_of_matches(submaps: Sequence[Submap], support: float) -> dict[str, Chosen]:
-    """Choices by name: the run's own, every threshold of support, and the run's own less each of its matches.
+def choices_of_matches(
+    submaps: Sequence[Submap],
+    support: float,
+    *,
+    loops: Sequence[Decision] = (),
+    undone: frozenset[tuple[int, int]] = frozenset(),
+) -> dict[str, Chosen]:
+    """Choices by name: the run's own, every threshold of support, and the run's own less each match and loop.
 
     Parameters
     ----------
     submaps : sequence of Submap
     support : float
         The run's own threshold (``backend.match_support``).
+    loops : sequence of Decision
+        Loops of the run's ledger that are in its graph and no matches of the front end.
+    undone : frozenset of (int, int)
+        Matches that were taken out of the run by hand: keys of the submap and of the one it entered.
     """
     every = {(s.key, i): m for s in submaps for i, m in enumerate(s.matches)}
-    own: Chosen = frozenset(k for k, m in every.items() if m.support >= support)
-    found: dict[str, Chosen] = {"as the run": own, "no match": frozenset()}
+    found_loops: Chosen = frozenset((LOOP, d.loop) for d in loops)
+    taken: Chosen = frozenset(k for k, m in every.items() if m.support >= support and (k[0], m.target) not in undone)
+    own = taken | found_loops
+    found: dict[str, Chosen] = {"as the run": own, "no match or loop" if loops else "no match": frozenset()}
+    found["matches alone"] = taken
     for least in sorted({m.support for m in every.values()}, reverse=True):
-        found[f"support ≥ {least:.2g}"] = frozenset(k for k, m in every.items() if m.support >= least)
-    for key, i in sorted(own):
+        at_least: Chosen = frozenset(k for k, m in every.items() if m.support >= least)
+        found[f"support ≥ {least:.2g}"] = at_least | found_loops
+    for key, i in sorted(taken):
         found[f"without {key} → {every[key, i].target}"] = own - {(key, i)}
+    for d in sorted(loops, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
+        found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
     out: dict[str, Chosen] = {}
     for name, chosen in found.items():
         if chosen not in out.values():
             out[name] = chosen
-    return dict(list(out.items())[:MOST])
+    return out
 
 
-def solve_choice(submaps: Sequence[Submap], chosen: Chosen, config: cfg.BackEndConfig) -> Solution:
-    """The graph of submaps with some of their matches, solved to its optimum."""
-    back = BackEnd(replace(config, match_support=0.0), "batch")
+def solve_choice(
+    submaps: Sequence[Submap],
+    chosen: Chosen,
+    config: cfg.BackEndConfig,
+    *,
+    loops: Sequence[Decision] = (),
+    fixes: Gps | None = None,
+    gps: cfg.GpsConfig | None = None,
+) -> BackEnd:
+    """The graph of submaps with some of their matches and loops, solved to its optimum.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+    chosen : Chosen
+    config : BackEndConfig
+        The run's.
+    loops : sequence of Decision
+        With their measurements; those that are chosen become factors as they were in the run.
+    fixes, gps
+        See :func:`graphslam.app.alternatives.built`.
+    """
+    bare = []
     for s in submaps:
         kept: tuple[Match, ...] = tuple(m for i, m in enumerate(s.matches) if (s.key, i) in chosen)
-        back.append(replace(s, matches=kept, grid=None))
-        if len(back.graph.submaps) == 1:
-            back.solver.update()
-    return back.finish()
+        bare.append(replace(s, matches=kept, grid=None))
+    back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps)
+    back.solver.solve_to_optimum()
+    taken = [d for d in loops if (LOOP, d.loop) in chosen]
+    if taken:
+        graph = GraphLoops(back.graph, back.solver)
+        for d in taken:
+            C = np.array(d.covariance)
+            kernel = Robust("huber", math.sqrt(float(stats.chi2.ppf(LoopConfig().kernel, len(C)))))
+            graph.add_loop(Loop(i=d.i, j=d.j, T_ij=np.array(d.T_ij), covariance=C, source=d.source), kernel)
+    return back
 
 
 def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Clearest:
-    """Solve a finished run with every choice of matches, and put these in the order of their maps' entropy.
+    """Solve a finished run with every choice of its matches and loops, and judge the graphs and their maps.
 
     Parameters
     ----------
@@ -103,40 +169,35 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
         The graph of the run held GPS, whose fixes are not in its folder.
     """
     values: Mapping[str, Any] = folder_options(run.folder) if run.folder is not None else {}
-    if values.get("gps", {}).get("use", "none") != "none":
+    gps: cfg.GpsConfig = cfg.build(cfg.GpsConfig, values.get("gps", {}), "gps")
+    if gps.use != "none" and run.fixes is None:
         raise MissingDataError(
             f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
-            wanted="a run with gps.use = none",
+            wanted="fixes.npz, or a run with gps.use = none",
         )
     config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
-    choices = choices_of_matches(run.submaps, config.match_support)
-    solved: dict[str, Solution] = {}
-    for name, chosen in tqdm(choices.items(), desc="choices of matches", unit="graph", disable=not progress):
-        solved[name] = solve_choice(run.submaps, chosen, config)
-    divided = made.divided
-    candidates = [Candidate(divided.pieces, solved_poses(divided, _nodes(run, s)), name) for name, s in solved.items()]
-    ranking = rank_by_entropy(candidates, model=made.fused.grid.model, progress=progress)
-    rows = [
-        {
-            "choice": r.name,
-            "matches": len(choices[r.name]),
-            "entropy": r.clarity.entropy,
-            "known_volume": r.clarity.volume,
-            "objective": solved[r.name].objective,
-        }
-        for r in ranking.order
-    ]
-    return Clearest(rows, ranking, solved[ranking.order[0].name].trajectory(covariances=False))
+    ledger = ledger_of_events(run.events).current()
+    loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
+    undone = frozenset((d.submap_j, d.submap_i) for d in ledger if d.verdict == "undone" and d.source == FRONT_END)
+    every = choices_of_matches(run.submaps, config.match_support, loops=loops, undone=undone)
+    choices = dict(list(every.items())[:MOST])
+    if len(every) > MOST:
+        logger.warning("%d of %d choices of matches and loops are solved", MOST, len(every))
+    alternatives = []
+    for name, chosen in tqdm(choices.items(), desc="choices", unit="graph", disable=not progress):
+        back = solve_choice(run.submaps, chosen, config, loops=loops, fixes=run.fixes, gps=gps)
+        solution = back.finish()
+        poses = solved_poses(made.divided, _nodes(run, solution))
+        alternatives.append(Alternative(name, back.graph, solution, Candidate(made.divided.pieces, poses, name)))
+    choice = choose(alternatives, model=made.fused.grid.model, progress=progress)
+    return Clearest(choice, choices, len(every) - len(choices))
 
 
 def write_clearest(
     folder: Path, found: Clearest, *, bands: Mapping[str, tuple[float, float]] | None = None
 ) -> list[Path]:
-    """Write the clearest map and its path beside those of the run: ``clearest.ply``, ``clearest.tum`` and so on."""
-    made = save_maps(found.ranking.best.grid, folder, name="clearest", bands=bands)
-    write_tum(folder / "clearest.tum", found.trajectory)
-    RunFolder(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", "candidates": found.rows})
-    return [*made, folder / "clearest.tum", folder / "clearest.json"]
+    """Keep the clearest map and the runners-up in the folder (:func:`graphslam.app.alternatives.write_choice`)."""
+    return write_choice(folder, found.choice, found.rows, left_out=found.left_out, bands=bands)
 
 
 def _nodes(run: Run, solution: Solution) -> Any:

@@ -21,6 +21,7 @@ from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.poses import SE3, level
 from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
+from graphslam.io.tum import read_tum
 from graphslam.maps.fuse import fuse
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -79,7 +80,7 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     config = cfg.build(cfg.BackEndConfig, {**values["backend"], "level_sigma": 0.0})
     from graphslam.app.pipeline import make_map
 
-    m = make_map(solve_choice(bare, frozenset(), config), bare, {}, 1)
+    m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
     made = make_run_map(bare, m, reach=8.0)
     assert made.fused.entropy() == pytest.approx(made.open_entropy, rel=0.01)
     assert made.fused.known_volume() == pytest.approx(made.open_volume, rel=0.01)
@@ -115,8 +116,19 @@ def test_the_folder_gives_the_same_map_again(finished: Run, tmp_path: Path) -> N
     assert {n: (folder / n).read_bytes() for n in before} == before
     assert same_map(load_npz(folder / "map.grid.npz"), finished.fused.fused.grid)
     assert all(Path(p).is_file() for p in (*value["files"], *value["figures"]))
-    entropies = [r["entropy"] for r in value["candidates"]]
-    assert entropies == sorted(entropies)
+    rows = value["candidates"]
+    assert [r["verdict"] for r in rows] == ["chosen"] + ["runner-up"] * (len(rows) - 1)
+    honest = [r["entropy"] for r in rows if not r["contradicted"]]
+    assert honest == sorted(honest)
+    assert [r["contradicted"] for r in rows] == sorted(r["contradicted"] for r in rows)
+    kept = json.loads((folder / "clearest.json").read_text())
+    assert kept["why"] == value["chosen_because"] == rows[0]["why"]
+    assert [{k: v for k, v in r.items() if k != "files"} for r in kept["candidates"]] == rows
+    for r in kept["candidates"]:
+        path, graph = (folder / f for f in r["files"])
+        assert len(read_tum(path, dim=3)) == len(again.map.trajectory)
+        assert graph.read_text().count("VERTEX_SE3") == len(again.map.node_poses)
+    assert (folder / kept["candidates"][0]["files"][0]).read_bytes() == (folder / "clearest.tum").read_bytes()
     (own,) = [r for r in value["candidates"] if r["choice"] == "as the run"]
     assert own["entropy"] == pytest.approx(value["entropy"], rel=1e-3)
     higher = graphslam("map", folder, "--low", "1.0", "--high", "0.5")
@@ -141,6 +153,9 @@ def test_every_choice_of_matches_is_solved_before_it_is_ranked(finished: Run) ->
     assert bent
     assert found.rows[0]["choice"] not in bent
     assert all(rows[name]["objective"] > rows["as the run"]["objective"] + 20 for name in bent)
+    assert all(rows[name]["contradicted"] and "contradicted" in rows[name]["why"] for name in bent)
+    # under its kernel a wrong match hardly counts; what is judged is the match without it
+    assert all(rows[name]["chi2"] > 2 * rows[name]["objective"] for name in bent)
 
 
 def test_runs_without_grids_are_as_before_and_say_so(tmp_path: Path) -> None:
