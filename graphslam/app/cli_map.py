@@ -35,6 +35,7 @@ def make_map(
     as_json: bool = JSON,
 ) -> None:
     """The fused map of a run, made again from its folder: no scan is read."""
+    from graphslam.app.report import report_beside
     from graphslam.app.run_folder import RunFolder
     from graphslam.app.run_maps import draw_run_map, map_of_folder, with_heights, write_run_map
 
@@ -58,6 +59,7 @@ def make_map(
             text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
         if found.left_out:
             text += f"\n{found.left_out} more choices were not solved"
+    report_beside(run)  # the page of the run shows the pictures and the choices
     value |= {"out": str(run), "files": [str(p) for p in files], "figures": [str(p) for p in figures]}
     text += f"\n\nwritten: {', '.join(p.name for p in files)}; figures: {', '.join(p.name for p in figures)}"
     emit(value, text, as_json=as_json)

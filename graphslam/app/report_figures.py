@@ -29,6 +29,9 @@ CAPTIONS = {
     "progress.png": "Segments as they came in, before any loop was closed in the graph",
 }
 
+MOST_NAMES = 60
+"""More loops than these are drawn without their numbers."""
+
 
 def figures(folder: ReportFolder) -> Markup:
     """Pictures, the map first."""
@@ -110,15 +113,17 @@ def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Ma
     from graphslam.plots.save import png
 
     n = len(nodes)
-    ends = [(int(r["i"]), int(r["j"]), str(r["verdict"])) for r in folder.loop_rows if r["i"] >= 0 and r["j"] >= 0]
+    rows = [r for r in folder.loop_rows if 0 <= r["i"] < n and 0 <= r["j"] < n]
     if not folder.loop_rows:
         return []  # the part on loops says why there are none
     try:
-        ax = plot_loops(None, path, nodes, [e for e in ends if max(e[:2]) < n], title="loops over the path, from above")
+        ends = [(int(r["i"]), int(r["j"]), str(r["verdict"])) for r in rows]
+        names = [r["loop"] for r in rows] if len(rows) <= MOST_NAMES else None
+        ax = plot_loops(None, path, nodes, ends, names=names, title="loops over the path, from above")
     except DataError as error:
         return [missing("loops over the path: ", error, ".")]
-    out = [picture(png(ax), "Loops over the path: what is in the graph, what was undone, what was refused")]
-    lost = len(folder.loop_rows) - sum(max(e[:2]) < n for e in ends)
+    out = [picture(png(ax), "Loops over the path, by their numbers in the ledger: in the graph, undone, refused")]
+    lost = len(folder.loop_rows) - len(rows)
     return [*out, note(f"{lost} loops have no node that could be drawn.")] if lost else out
 
 

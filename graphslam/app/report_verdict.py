@@ -69,7 +69,10 @@ def _number(value: Any) -> bool:
 
 def _state(folder: ReportFolder) -> list[tuple[str, Any]]:
     if folder.kind == "interrupted":
-        return [(BAD, f"Not finished. {stopped(folder)}"), (PLAIN, "Go on with it: the same command with --resume.")]
+        return [
+            (BAD, f"Not finished. {stopped(folder)}"),
+            (PLAIN, "Go on with it: the same command once more, of “run” with --resume."),
+        ]
     m = folder.values()
     converged = folder.report.get("converged", m.get("converged"))
     if converged is None:
@@ -117,11 +120,17 @@ def _chi2(folder: ReportFolder) -> list[tuple[str, Any]]:
 
 def _nees(folder: ReportFolder) -> list[tuple[str, Any]]:
     m = folder.values()
-    for key, gauge in (("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")):
+    judged = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
+    bases = [f"{s.get('name')}_base_nees" for s in folder.sessions]
+    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and _number(m.get(k))]:
+        m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
+        judged += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
+    out: list[tuple[str, Any]] = []
+    for key, gauge in judged:
         if _number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0:
             text, colour = bounded(m[f"{key}_per_dof"], m[f"{key}_dof"])
-            return [(colour, f"NEES/dof against the truth ({gauge}): {text}. One run: a sample, not a proof.")]
-    return [(PLAIN, "No truth was known, or none to compare with: nothing is said of the true error.")]
+            out.append((colour, f"NEES/dof against the truth ({gauge}): {text}. One run: a sample, not a proof."))
+    return out or [(PLAIN, "No truth was known, or none to compare with: nothing is said of the true error.")]
 
 
 def _certificate(folder: ReportFolder) -> tuple[str, Any]:

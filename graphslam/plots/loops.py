@@ -27,6 +27,7 @@ def plot_loops(
     nodes: ArrayLike,
     loops: Sequence[tuple[int, int, str]],
     *,
+    names: Sequence[object] | None = None,
     title: str | None = None,
 ) -> Axes:
     """Path from above, and a line between the two nodes of every loop.
@@ -40,6 +41,8 @@ def plot_loops(
         Positions of the nodes, in the same frame.
     loops : sequence of (i, j, verdict)
         Nodes and ``accepted``, ``rejected``, ``switched-off`` or ``undone``.
+    names : sequence, optional
+        One a loop, written beside those that are in the graph or were.
 
     Raises
     ------
@@ -65,6 +68,12 @@ def plot_loops(
         ax.add_collection(lines)
         points = segments.reshape(-1, 2)  # where i and j lie on each other the line has no length
         ax.plot(points[:, 0], points[:, 1], "o", color=colour, ms=4.0, mfc="none", mew=1.0, zorder=3 + k)
+    for (i, j, verdict), name in zip(loops, names or ()):
+        if verdict != "rejected":
+            u, v = 0.5 * (x[i, :2] + x[j, :2])
+            ax.annotate(
+                str(name), (float(u), float(v)), xytext=(4, 4), textcoords="offset points", fontsize="small", zorder=9
+            )
     style.metric_axes(ax)
     if title:
         ax.set_title(title, fontsize="medium")

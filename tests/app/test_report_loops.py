@@ -146,7 +146,7 @@ def test_hypotheses_and_runners_up(tmp_path: Path) -> None:
         ("0", "runner-up", "yes"),
     ]
     assert "hypothesis 0 is contradicted" in page.sections["hypotheses"]
-    choices = page.table("hypotheses", "choice of matches").records()
+    choices = page.table("hypotheses", "matches", "entropy [nat m³]").records()
     assert [r["entropy [nat m³]"] for r in choices] == ["11.5", "13.5"]
     assert "hypothesis-chosen" in page.sections["events"]
 
@@ -175,3 +175,39 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
     ]
     np.testing.assert_allclose(drawn[0].nees[0], wanted, rtol=1e-6)
     assert drawn[0].dof[0, 0] == 6
+
+
+def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
+    """A merged folder by hand: two paths side by side, two ties of which one is a factor."""
+    from graphslam.app.merge_outputs import MERGED_DENSE_FORMAT
+    from graphslam.core.atomic import write_npz
+    from graphslam.core.trajectory import Trajectory
+    from graphslam.io.tum import write_tum
+
+    path = np.column_stack([np.arange(5.0), np.zeros((5, 2))])
+    for name, y in (("a", 0.0), ("b", 1.0)):
+        write_tum(tmp_path / f"trajectory_{name}.tum", Trajectory(np.arange(5.0), path + [0.0, y, 0.0]))
+    nodes = np.concatenate([path[[0, 2, 4]], path[[0, 2, 4]] + [0.0, 1.0, 0.0]])
+    write_npz(tmp_path / "merged.npz", {"format": MERGED_DENSE_FORMAT, "nodes": nodes})
+    tie = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
+    candidates = [{**tie, "accepted": True, "why": "agrees"}, {**tie, "accepted": False, "why": "<b>no</b>"}]
+    sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "ties": 1, "candidates": candidates}]
+    report = {"format": "graphslam.merge/1", "by": "auto", "solver": "batch", "sessions": sessions, "seconds": 1.5}
+    (tmp_path / "merge.json").write_text(json.dumps(report))
+    metrics = {"converged": 1.0, "objective": 2.0, "b_base_nees": 60.0, "b_base_nees_dof": 3.0}
+    rows = [{"key": k, "value": v, "unit": "", "direction": "none"} for k, v in metrics.items()]
+    (tmp_path / "metrics.json").write_text(json.dumps(rows))
+    add_events(tmp_path, [{"event": "between", "factor_id": 3, "i": 1, "j": 4, "group": "session"}])
+    page = Page(make_report(tmp_path).html)
+    page.check_alone()
+    assert len(page.sources) == 1
+    assert "places that tie them" in page.sections["figures"]
+    ties = page.table("loops", "submap in the map").records()
+    assert [(r["verdict"], r["why"], r["gates"]) for r in ties] == [
+        ("accepted", "agrees", "a 0.5"),
+        ("rejected", "<b>no</b>", "a 0.5"),
+    ]
+    assert [k for k, t in page.verdict if "base of b in the common frame" in t and "over-confident" in t] == ["bad"]
+    assert "1.5" in page.sections["times"]
+    add_events(tmp_path, [{"event": "between", "factor_id": 4, "i": 1, "j": 9, "group": "session"}])
+    assert "cannot be drawn" in Page(make_report(tmp_path).html).sections["figures"]

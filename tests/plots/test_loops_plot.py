@@ -30,6 +30,13 @@ def test_every_loop_is_a_line_between_its_nodes() -> None:
     plt.close(ax.figure)
 
 
+def test_names_stand_beside_what_is_or_was_in_the_graph() -> None:
+    loops = [(0, 3, "accepted"), (0, 2, "rejected"), (1, 2, "undone")]
+    ax = plot_loops(None, PATH, NODES, loops, names=[7, 8, 9])
+    assert {t.get_text(): tuple(t.xy) for t in ax.texts} == {"7": (0.0, 5.0), "9": (10.0, 5.0)}
+    plt.close(ax.figure)
+
+
 def test_no_loop_is_a_path_alone() -> None:
     ax = plot_loops(None, PATH, NODES, [])
     assert not [c for c in ax.collections if isinstance(c, LineCollection)]
