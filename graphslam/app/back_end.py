@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.config import BackEndConfig, GpsConfig
+from graphslam.app.imu_use import ImuPart, recentred
 from graphslam.app.loops import ledger_of_events, same_loop
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
@@ -52,6 +53,8 @@ class BackEnd:
     per_submap_s: list[float] = field(default_factory=list)
     submaps: list[Submap] = field(default_factory=list)
     """With their maps; kept only where loops are looked for."""
+    imu: ImuPart | None = None
+    """IMUs of the log; None where there is no log."""
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
@@ -112,6 +115,8 @@ class BackEnd:
         self._add_matches(submap)
         if c.loops:
             self.submaps.append(submap)
+        if self.imu is not None:
+            self.imu.look(self.graph)
         waiting, self._waiting = self._waiting, []
         for gps, config in waiting:
             self.add_gps(gps, config)
@@ -155,7 +160,9 @@ class BackEnd:
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
         self.graph.finish_gps()
-        self.solver.solve_to_optimum()
+        if self.imu is not None:
+            self.imu.tie(self.graph)
+        recentred(self.graph, self.solver)
         for _ in range(10):
             if not self.merge():
                 break
@@ -168,7 +175,7 @@ class BackEnd:
             else:
                 self.undo_loop(loop)
         start = time.perf_counter()
-        self.solver.solve_to_optimum()
+        recentred(self.graph, self.solver)
         self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start

@@ -39,6 +39,33 @@ class GpsConfig:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ImuConfig:
+    """How an IMU that the front end did not use enters the graph; and the axes of every IMU."""
+
+    use: str = "none"
+    """``"none"``, ``"auto"`` (every IMU of the log that no submap used), or the name of a stream."""
+    longest: float = 10.0
+    """Nodes that follow each other within so many seconds are tied; farther ones see gravity [s]."""
+    accelerometer: bool = True
+    """False: the gyro alone."""
+    gravity: bool = True
+    """Nodes far from all others see gravity."""
+    acceleration: float = 0.3
+    """σ of the mean acceleration about such a node where the body is not still [m/s²]."""
+    robust: Literal["none", "huber", "cauchy"] = "none"
+    """Robust kernel on every way between two nodes."""
+    robust_width: float = 2.385
+    """Width of that kernel in standard deviations."""
+    axes: Literal["refuse", "warn", "ignore"] = "refuse"
+    """What to do if readings contradict the mounting; in space, and of every IMU, the front end's as well."""
+
+    def __post_init__(self) -> None:
+        for name in ("longest", "acceleration", "robust_width"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"imu.{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndConfig:
     """From submaps to a solved graph."""
 
@@ -115,6 +142,8 @@ class RunConfig:
     """Association, scale, merging."""
     gps: GpsConfig = dataclasses.field(default_factory=GpsConfig)
     """GPS factors and what is withheld."""
+    imu: ImuConfig = dataclasses.field(default_factory=ImuConfig)
+    """IMU factors, and the axes of IMUs."""
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
     """The fused map."""
 

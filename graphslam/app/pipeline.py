@@ -18,6 +18,7 @@ from graphslam.app.back_end import BackEnd
 from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.gps_use import split, used_fixes
 from graphslam.app.graph_facts import graph_facts
+from graphslam.app.imu_use import ImuPart, imu_metrics, imus_of
 from graphslam.app.loops import undone_of_run
 from graphslam.app.metrics import (
     Metrics,
@@ -123,7 +124,7 @@ def _run(
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     folder = None if out is None else RunFolder.start(out, effective, resume=resume)
 
-    back = BackEnd(settings.backend, solver)
+    back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu))
     gps = gps_stream(log)
     if gps is not None and settings.gps.use != "none":
         back.add_gps(split(gps, settings.gps)[0], settings.gps)
@@ -175,6 +176,7 @@ def effective_config(
         "frontend": cfg.as_dict(front_config),
         "backend": cfg.as_dict(settings.backend),
         "gps": cfg.as_dict(settings.gps),
+        "imu": cfg.as_dict(settings.imu),
         "map": cfg.as_dict(settings.map),
     }
 
@@ -258,6 +260,7 @@ def _judge(
     out = Metrics()
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))
+    imu_metrics(out, back.graph, drops)
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     if fused is not None:
         fused.metrics(out)
@@ -289,6 +292,7 @@ def _judge(
         **effective["run"],
         "backend": effective["backend"],
         "gps": effective["gps"],
+        "imu": effective["imu"],
         "T_world_base": true_first_base(log, submaps[0]),
         "versions": versions(),
         "seconds": seconds,

@@ -3,7 +3,9 @@
 Over windows of about a second the gyro's turn and the mean specific force are compared with what a path says of them,
 ``m = A r + b T`` and ``f = A Rᵀ (0, 0, g)``, for all 48 ways A in which three axes can be exchanged and turned round.
 What moves the body cancels out of f over many windows; the bias b is solved for. Ways that nothing tells apart (x and y
-of a body that stays level) are no reproach: only what contradicts the stated mounting is.
+of a body that stays level) are no reproach: only what contradicts the stated mounting is. Where no way
+explains gyro and accelerometer alike, the one that contradicts is named: a path that was made of a turned gyro agrees
+with it, and not with the forces.
 """
 
 from __future__ import annotations
@@ -48,6 +50,8 @@ class AxesCheck:
     alike : int
         Ways that explain the readings as well as the best one.
     windows : int
+    sensor : {"both", "accelerometer", "gyro"}
+        Whose readings A explains.
     """
 
     wrong: bool
@@ -55,6 +59,7 @@ class AxesCheck:
     excess: float
     alike: int
     windows: int
+    sensor: str = "both"
 
     def words(self) -> str:
         """Which axis reads what: ``"x reads −y, y reads x"``; empty if they are as stated."""
@@ -77,8 +82,9 @@ class AxesCheck:
         """
         if self.wrong:
             several = "" if self.alike == 1 else f" (or one of {self.alike - 1} others that fit as well)"
+            whose = "" if self.sensor == "both" else f" of the {self.sensor}"
             raise DataError(
-                f"the axes are not those that its mounting says: {self.words()}{several}",
+                f"the axes{whose} are not those that its mounting says: {self.words()}{several}",
                 where=where,
                 got=f"χ² {self.excess:.0f} more than the best explanation over {self.windows} windows",
                 wanted="T_base_imu as the unit is mounted",
@@ -137,10 +143,14 @@ def check_imu_axes(
     rows = 3.0 * len(rate)
     s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / window, 1e-12)
     s2_pull = max(float(pull.min()) / rows, force_sigma**2)
-    chi2 = gyro / s2_gyro + pull / s2_pull
+    gyro, pull = (gyro - gyro.min()) / s2_gyro, (pull - pull.min()) / s2_pull
+    chi2, sensor = gyro + pull, "both"
+    if max(gyro[np.argmin(chi2)], pull[np.argmin(chi2)]) > limit:
+        # no way explains both: one of them was turned, or the path was made of the very gyro; the other one is named
+        chi2, sensor = (pull, "accelerometer") if pull[0] > limit else (gyro, "gyro")
     best = int(np.argmin(chi2))
     excess = float(chi2[0] - chi2[best])
-    return AxesCheck(excess > limit, ways[best], excess, int(np.sum(chi2 - chi2[best] <= limit)), len(rate))
+    return AxesCheck(excess > limit, ways[best], excess, int(np.sum(chi2 - chi2[best] <= limit)), len(rate), sensor)
 
 
 def _conjugate(q: Array) -> Array:

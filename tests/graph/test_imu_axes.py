@@ -95,3 +95,14 @@ def test_readings_too_thin_for_windows_are_refused() -> None:
     imu, path = drive(tilt=0.1)
     with pytest.raises(DataError, match="too little time"):
         check_imu_axes(imu.take(slice(None, None, 60)), path)
+
+
+@pytest.mark.parametrize("which", ["angular_rate", "specific_force"])
+def test_one_turned_sensor_is_found(which: str) -> None:
+    """The other one is as it should be."""
+    imu, path = drive(tilt=0.15)
+    upside = np.diag([1.0, -1.0, -1.0])
+    found = check_imu_axes(replace(imu, **{which: getattr(imu, which) @ upside}), path)
+    assert found.wrong
+    np.testing.assert_array_equal(found.A, upside)
+    assert found.sensor == {"angular_rate": "gyro", "specific_force": "accelerometer"}[which]
