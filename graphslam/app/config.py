@@ -30,8 +30,8 @@ class GpsConfig:
     """σ of each coordinate of a fix [m] in place of the stream's own."""
     robust: Literal["none", "huber", "cauchy"] = "cauchy"
     """Robust kernel on every GPS factor."""
-    robust_width: float = 1.0
-    """Width of the kernel in standard deviations."""
+    robust_width: float = 2.385
+    """Width of the kernel in standard deviations; less costs accuracy where fixes are good (docs/segmap-graph.md)."""
     bias_sigma: float | None = None
     """With a number [m]: one bias per segment of fixes with that prior."""
     segment_gap: float = 2.0

@@ -57,7 +57,7 @@ class Robust:
     ----------
     kind : {"none", "huber", "cauchy"}
     k : float
-        Width in standard deviations; GTSAM's customary 1.345 (Huber) and 1.0 here for Cauchy.
+        Width in standard deviations; customary are 1.345 for Huber, 2.385 for Cauchy.
     """
 
     kind: Literal["none", "huber", "cauchy"] = "none"
