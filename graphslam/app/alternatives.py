@@ -297,7 +297,6 @@ def write_choice(
         files = [f"alternatives/{k:02d}.tum", f"alternatives/{k:02d}.g2o"]
         write_tum(folder / files[0], path)
         write_g2o(folder / files[1], to_network(j.alternative.graph))
-        made += [folder / name for name in files]
         table.append({**row, "files": files})
     value = {"why": choice.why(), "scale": choice.scale, "left_out": left_out, "candidates": table}
     RunFolder(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})

@@ -57,6 +57,7 @@ def make_map(
         text += f"\n\n{table(found.rows, CANDIDATES)}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
             text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
+        text += f"\npaths and graphs of all: {run / 'alternatives'}"
         if found.left_out:
             text += f"\n{found.left_out} more choices were not solved"
     report_beside(run)  # the page of the run shows the pictures and the choices

@@ -166,7 +166,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     Raises
     ------
     MissingDataError
-        The graph of the run held GPS, whose fixes are not in its folder.
+        The graph of the run held GPS or an IMU, whose records are not in its folder.
     """
     values: Mapping[str, Any] = folder_options(run.folder) if run.folder is not None else {}
     gps: cfg.GpsConfig = cfg.build(cfg.GpsConfig, values.get("gps", {}), "gps")
@@ -174,6 +174,11 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
         raise MissingDataError(
             f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
+        )
+    if values.get("imu", {}).get("use", "none") != "none":
+        raise MissingDataError(
+            f"{run.folder}: the graph of this run holds an IMU, whose readings are not in the folder",
+            wanted="a run without IMU factors (imu.use = none)",
         )
     config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
     ledger = ledger_of_events(run.events).current()
