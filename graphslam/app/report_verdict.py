@@ -87,7 +87,7 @@ def _state(folder: ReportFolder) -> list[tuple[str, Any]]:
         ]
     scale = max(abs(objective or 0.0), 1.0)
     small = gap <= SMALL_GAP * scale
-    text = "no higher than" if gap <= 0 else f"{gap:.3g} above"
+    text = "no higher than" if small else f"{gap:.3g} above"
     return [
         (GOOD if small else LOOK, f"Solved: at the optimum{value}, {text} what a batch solution reaches from there.")
     ]
@@ -148,6 +148,9 @@ def _left_out(folder: ReportFolder) -> list[tuple[str, Any]]:
     flagged = folder.part("flagged_submaps").get("any", 0)
     if _number(flagged) and flagged:
         out.append((LOOK, f"{flagged:g} of the submaps were flagged by the front end."))
+    for e in folder.events or []:
+        if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
+            out.append((BAD, f"IMU {e.get('stream')}: {e.get('words')}"))
     for s in folder.sessions:
         common, rejected = s.get("common_landmarks"), s.get("rejected")
         if isinstance(common, int) and isinstance(rejected, int) and rejected > common:

@@ -44,19 +44,28 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> Page:
+    return read(folder)
+
+
 def read(folder: Path) -> Page:
-    page = Page(make_report(folder).html)
+    return checked(make_report(folder).html)
+
+
+def checked(html: str) -> Page:
+    page = Page(html)
     page.check_alone()
     assert list(page.sections) == [*PARTS, "missing"]
     return page
 
 
-def test_a_run_writes_its_page(folder: Path) -> None:
+def test_a_run_writes_its_page(folder: Path, whole: Page) -> None:
     text = (folder / PAGE).read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>")
     assert make_report(folder).html == text
     assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
-    page = read(folder)
+    page = whole
     figures = {p.read_bytes() for p in (folder / "figures").glob("*.png")}
     shown = [base64.b64decode(s.partition(",")[2]) for s in page.sources]
     assert figures < set(shown)
@@ -65,9 +74,9 @@ def test_a_run_writes_its_page(folder: Path) -> None:
     assert page.sections["missing"].endswith("Nothing that this kind of folder holds.")
 
 
-def test_the_verdict_is_that_of_the_figures(folder: Path) -> None:
+def test_the_verdict_is_that_of_the_figures(folder: Path, whole: Page) -> None:
     m = {r["key"]: r["value"] for r in json.loads((folder / "metrics.json").read_text())}
-    lines = {text.split(":")[0].split(".")[0]: (kind, text) for kind, text in read(folder).verdict}
+    lines = {text.split(":")[0].split(".")[0]: (kind, text) for kind, text in whole.verdict}
     kind, text = lines["Solved"]
     assert kind == "good"
     assert f"{m['objective']:.6g}" in text
@@ -91,6 +100,7 @@ def test_the_verdict_is_that_of_the_figures(folder: Path) -> None:
         ("nees_per_dof", 9.0, "bad", "over-confident"),
         ("nees_per_dof", 0.01, "look", "pessimistic"),
         ("gap", 5.0, "look", "5 above"),
+        ("gap", 1e-9, "good", "no higher than"),
         ("gap", None, "good", "no gap"),
     ],
 )
@@ -108,9 +118,19 @@ def test_an_unsolved_run_is_called_so(copy: Path) -> None:
     assert read(copy).verdict[0] == ("bad", "Not solved: the graph is not at its optimum.")
 
 
-def test_metrics_stand_with_unit_direction_and_bounds(folder: Path) -> None:
+def test_an_imu_of_other_axes_is_told_at_once(copy: Path) -> None:
+    said = {"event": "imu-axes", "stream": "imu", "verdict": "as stated", "words": "x and y swapped <i>"}
+    with (copy / "events.jsonl").open("a") as stream:
+        stream.write(json.dumps(said) + "\n")
+    assert not [t for _, t in read(copy).verdict if "swapped" in t]
+    with (copy / "events.jsonl").open("a") as stream:
+        stream.write(json.dumps(said | {"verdict": "wrong"}) + "\n")
+    assert ("bad", "IMU imu: x and y swapped <i>") in read(copy).verdict
+
+
+def test_metrics_stand_with_unit_direction_and_bounds(folder: Path, whole: Page) -> None:
     rows = json.loads((folder / "metrics.json").read_text())
-    page = read(folder)
+    page = whole
     shown = {r["metric"]: r for r in page.table("metrics", "metric", "which way").records()}
     times = {r["metric"]: r for r in page.table("times", "metric", "value").records()}
     m = {r["key"]: r["value"] for r in rows}
@@ -135,8 +155,8 @@ def test_metrics_stand_with_unit_direction_and_bounds(folder: Path) -> None:
     assert "times_real_time" in times
 
 
-def test_graph_records_and_evidence(folder: Path) -> None:
-    report, page = json.loads((folder / "run.json").read_text()), read(folder)
+def test_graph_records_and_evidence(folder: Path, whole: Page) -> None:
+    report, page = json.loads((folder / "run.json").read_text()), whole
     rows = {r["kind of factor"]: r for r in page.table("graph", "kind of factor").records()}
     for c in report["graph"]["classes"]:
         r = rows[c["class"]]
@@ -197,15 +217,14 @@ def test_an_interrupted_run_says_where_it_stopped(copy: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("how", ["gone", "damaged"])
-def test_what_is_gone_or_damaged_is_named(copy: Path, name: str, part: str, how: str) -> None:
-    whole = read(copy)
-    assert not make_report(copy).problems
+def test_what_is_gone_or_damaged_is_named(copy: Path, whole: Page, name: str, part: str, how: str) -> None:
     file = copy / name
     if how == "gone":
         file.unlink()
     else:
         file.write_bytes(file.read_bytes()[:40] + b"\n{")
-    found, page = make_report(copy), read(copy)
+    found = make_report(copy)
+    page = checked(found.html)
     assert "Missing: " in page.sections[part]
     assert page.sections[part] != whole.sections[part]
     if how == "damaged" or name != "figures/map.png":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,11 @@ def run_ring(dim: int, out: Path) -> Path:
 @pytest.fixture(scope="module", params=[2, 3])
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_ring(request.param, tmp_path_factory.mktemp("ring") / "run")
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
 def decisions() -> list[dict[str, Any]]:
@@ -106,8 +112,8 @@ def test_matches_of_a_front_end(folder: Path) -> None:
     assert declared["shared-scan"]["factors"] == "3"
 
 
-def test_every_decision_with_its_reason(tmp_path: Path) -> None:
-    out = run_ring(3, tmp_path / "run")
+def test_every_decision_with_its_reason(copy: Path) -> None:
+    out = copy
     add_events(out, decisions())
     rows = check_rows(out)
     order = [r["verdict"] for r in rows]
@@ -124,8 +130,8 @@ def test_every_decision_with_its_reason(tmp_path: Path) -> None:
     assert "1 refused by their registration" in page.sections["loops"]
 
 
-def test_hypotheses_and_runners_up(tmp_path: Path) -> None:
-    out = run_ring(2, tmp_path / "run")
+def test_hypotheses_and_runners_up(copy: Path) -> None:
+    out = copy
     assert "Missing: " in Page(make_report(out).html).sections["hypotheses"]
     facts = {"withdrawn": None, "submaps": 4, "entries": [[0, 3]], "loops": 1, "chi2": 7.5, "dof": 9, "entropy": 12.5}
     add_events(
