@@ -8,7 +8,8 @@ One wrong loop ruins a map, so a loop passes, in this order,
 3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
 4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
    are in, every one is asked what the graph *without* it says of it;
-5. and if more loops that agree were shut out by a group than the group has, the two change places.
+5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
+   and by what a second opinion says that judges all of them together.
 
 With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
@@ -19,13 +20,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.errors import DataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
@@ -33,58 +33,12 @@ from graphslam.graph.consistent_set import Chain, ConsistentSet, LoopArrays, cha
 from graphslam.graph.loop_ledger import Decision, LoopLedger, Verdict
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
+from graphslam.graph.loop_rules import Judge, LoopConfig, LoopGraph
 from graphslam.graph.noise import Robust
 from graphslam.registration.submap_pairs import prediction_chi2
 
 SHUTS_OUT = 0.25
 """A loop that contradicts this share of a group that was shut out is a rival of that group."""
-
-
-class LoopGraph(Protocol):
-    """What is asked of a graph that loops are added to."""
-
-    def relative(self, i: Ints, j: Ints) -> tuple[Array, Array]:
-        """``T_ij (k, 7|3)`` and covariances ``(k, d, d)``, right tangents, from the joint marginals."""
-        ...
-
-    def add_loop(self, loop: Loop, robust: Robust) -> int:
-        """Add a between-factor; its id."""
-        ...
-
-    def remove_loop(self, factor_id: int) -> None:
-        """Take it out again."""
-        ...
-
-    def solve(self) -> None:
-        """Bring the values to the optimum."""
-        ...
-
-    def chi2(self) -> dict[int, float]:
-        """``rᵀ P⁻¹ r`` of every factor at the values, without its kernel."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopConfig:
-    """When a loop is believed."""
-
-    level: float = 0.999
-    """A right loop passes the χ² of the graph with this probability."""
-    chain: float = 0.9999
-    """… and that of the chain alone with this: what is wrong with the chain is wrong for all loops at once."""
-    pairwise: float = 0.99
-    """Two right loops agree with this probability."""
-    kernel: float = 0.95
-    """Loops in the graph have a Huber kernel that begins where a right loop lies with this probability."""
-    off: float = 0.9999
-    """A loop is switched off that the graph without it would refuse with this confidence."""
-    earlier: float = 0.9999
-    """… or that raises the χ² of earlier factors by more than this quantile of its own."""
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            if not 0.0 < getattr(self, f.name) < 1.0:
-                raise ConfigError(f"loops: {f.name} = {getattr(self, f.name)}; wanted a probability in (0, 1)")
 
 
 class LoopCloser:
@@ -98,6 +52,10 @@ class LoopCloser:
     config : LoopConfig, optional
     ledger : LoopLedger, optional
         To go on with.
+    judge : callable, optional
+        Which of all loops the chain and the others bear out, judged together: from increments, covariances and the
+        loops' ends, relative poses and covariances to ``(l,) bool``
+        (:func:`graphslam.solve.loop_judge.settled_loops`).
     """
 
     def __init__(
@@ -107,11 +65,13 @@ class LoopCloser:
         covariances: Array,
         config: LoopConfig | None = None,
         ledger: LoopLedger | None = None,
+        judge: Judge | None = None,
     ) -> None:
         self.graph = graph
         self.increments, self.covariances = increments, covariances
         self.config = LoopConfig() if config is None else config
         self.ledger = LoopLedger() if ledger is None else ledger
+        self.judge = judge
         self.loops: dict[int, Loop] = {}
         self._dof = group_of(increments).dof
 
@@ -177,6 +137,8 @@ class LoopCloser:
                 break
             out |= refused
         if self._exchange():
+            self._reconsider()
+        if self._second_opinion():
             self._reconsider()
         self._say_weights()
 
@@ -263,8 +225,21 @@ class LoopCloser:
         clash = both.chi2[: len(inside), len(inside) :] > both.limit
         # a right pair disagrees now and then by chance: rivals are those that shut out many
         rivals = [n for n, row in zip(inside, clash) if row.mean() > SHUTS_OUT]
-        if not rivals or len(outside) <= len(rivals):
+        return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
+
+    def _second_opinion(self) -> bool:
+        """What all loops together say, judged without regard to which came first."""
+        inside = self.accepted
+        asked = sorted({*inside, *(n for n in self._refused_by_company() if self._bears(n))})
+        if self.judge is None or not inside or len(asked) < 2:
             return False
+        good = self.judge(self.increments, self.covariances, self._arrays(asked))
+        believed = {n for n, yes in zip(asked, good) if yes}
+        rivals, outside = [n for n in inside if n not in believed], sorted(believed - set(inside))
+        return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
+
+    def _swap(self, rivals: list[int], outside: list[int]) -> bool:
+        """Take loops out and try others instead; back as it was if not more of them fit."""
         for n in rivals:
             self.graph.remove_loop(self.ledger.of(n).factor_id)
         self.graph.solve()

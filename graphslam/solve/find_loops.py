@@ -10,6 +10,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.submap import Submap
 from graphslam.graph.loop_appearance import AppearanceConfig, appearance_candidates
 from graphslam.graph.loop_candidates import (
+    FRONT_END,
     Candidate,
     CandidateConfig,
     front_end_candidates,
@@ -17,11 +18,13 @@ from graphslam.graph.loop_candidates import (
     sharing_maps,
 )
 from graphslam.graph.loop_measure import LoopMeasurer
+from graphslam.graph.loop_ties import Entry, TieConfig, tie_candidates
 from graphslam.graph.loops import LoopCloser, LoopConfig
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.place_descriptor import DescriptorConfig, describe, join
 from graphslam.solve.graph_loops import GraphLoops, GraphSolver, chain_of_graph
+from graphslam.solve.loop_judge import settled_loops
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +45,9 @@ class FindConfig:
     """Of the places, for that."""
     front_end: bool = False
     """Also the front end's matches; not where they are factors of the graph already."""
+    ties: TieConfig | None = field(default_factory=TieConfig)
+    """Along submaps, where they were in a map that holds them (with ``front_end``: by its matches that are believed);
+    None: not. They come last, and one is worth as much as the match by which it is in that map."""
     rounds: int = 3
     """Proximity is asked, again after loops were taken, at most so often: the graph knows more by then (0: never)."""
 
@@ -86,7 +92,7 @@ def find_loops(
     if [s.key for s in submaps] != [s.key for s in graph.submaps]:
         raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))
     ours = GraphLoops(graph, solver)
-    closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions)
+    closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions, judge=settled_loops)
     measurer = LoopMeasurer(submaps, ours.places, c.pairs)
     shared = sharing_maps(submaps)
     tried: list[tuple[int, int]] = []
@@ -112,5 +118,24 @@ def find_loops(
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, join(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
+    if c.ties is not None and c.front_end:
+        go(tie_candidates(submaps, ours.places, _believed(closer, submaps), c.ties))
+        _drop_orphans(closer, submaps)
     logger.info("loops: %s", closer.ledger.counts() or "no candidates")
     return closer
+
+
+def _believed(closer: LoopCloser, submaps: Sequence[Submap]) -> set[Entry]:
+    """Entries of the front end that are in the graph, by numbers of submaps."""
+    number = {s.key: k for k, s in enumerate(submaps)}
+    ends = [closer.loops[n].submaps for n in closer.accepted if closer.loops[n].source == FRONT_END]
+    return {(number[a], number[b]) for a, b in ends}
+
+
+def _drop_orphans(closer: LoopCloser, submaps: Sequence[Submap]) -> None:
+    """Ties whose entry was switched off, perhaps by their company, go too."""
+    believed = _believed(closer, submaps)
+    for n in closer.accepted:
+        by = closer.loops[n].gates.get("entries", ())
+        if any((int(a), int(b)) not in believed for a, b in by):
+            closer.undo(n, "the match by which it is in that map is not believed")

@@ -38,6 +38,7 @@ from graphslam.graph.loops import LoopCloser
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.registration.place_descriptor import describe, join, similarity
 from graphslam.sim.wrong_submap_loops import KINDS, inject_wrong_loops
+from graphslam.solve.loop_judge import settled_loops
 from graphslam.solve.loop_network import LoopNetwork
 
 WORLDS = {**segslam_garage.WORLDS, **segslam_mine.WORLDS, **segslam_building.WORLDS}
@@ -106,7 +107,7 @@ def nees(net: LoopNetwork, truth: Array) -> float:
 
 def closed(chain: ChainRelative, loops: list[Loop]) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
-    closer = LoopCloser(net, chain.increments, chain.covariances)
+    closer = LoopCloser(net, chain.increments, chain.covariances, judge=settled_loops)
     closer.propose(loops)
     return net, closer
 

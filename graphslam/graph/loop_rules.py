@@ -1,0 +1,66 @@
+"""What decisions on loops ask of a graph, and when a loop is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.graph.loop_measure import Loop
+from graphslam.graph.loop_places import Ints
+from graphslam.graph.noise import Robust
+
+Judge = Callable[[Array, Array, tuple[Ints, Array, Array]], npt.NDArray[np.bool_]]
+"""See :class:`~graphslam.graph.loops.LoopCloser`."""
+
+
+class LoopGraph(Protocol):
+    """What is asked of a graph that loops are added to."""
+
+    def relative(self, i: Ints, j: Ints) -> tuple[Array, Array]:
+        """``T_ij (k, 7|3)`` and covariances ``(k, d, d)``, right tangents, from the joint marginals."""
+        ...
+
+    def add_loop(self, loop: Loop, robust: Robust) -> int:
+        """Add a between-factor; its id."""
+        ...
+
+    def remove_loop(self, factor_id: int) -> None:
+        """Take it out again."""
+        ...
+
+    def solve(self) -> None:
+        """Bring the values to the optimum."""
+        ...
+
+    def chi2(self) -> dict[int, float]:
+        """``rᵀ P⁻¹ r`` of every factor at the values, without its kernel."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopConfig:
+    """When a loop is believed."""
+
+    level: float = 0.999
+    """A right loop passes the χ² of the graph with this probability."""
+    chain: float = 0.9999
+    """… and that of the chain alone with this: what is wrong with the chain is wrong for all loops at once."""
+    pairwise: float = 0.99
+    """Two right loops agree with this probability."""
+    kernel: float = 0.95
+    """Loops in the graph have a Huber kernel that begins where a right loop lies with this probability."""
+    off: float = 0.9999
+    """A loop is switched off that the graph without it would refuse with this confidence."""
+    earlier: float = 0.9999
+    """… or that raises the χ² of earlier factors by more than this quantile of its own."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not 0.0 < getattr(self, f.name) < 1.0:
+                raise ConfigError(f"loops: {f.name} = {getattr(self, f.name)}; wanted a probability in (0, 1)")
