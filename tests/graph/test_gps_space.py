@@ -157,7 +157,7 @@ def test_a_late_first_fix_moves_nothing(rng):
 def test_multipath_jumps_of_thirty_metres(rng, kind):
     """One fix in five is off by 30 m, in bursts that agree with each other; Cauchy keeps the map.
 
-    Its width is the one of 95 % efficiency: at 1.0 the kernel loses a third of the accuracy, without any jump.
+    Its width is the customary one: at 1.0 the kernel costs accuracy without any jump (docs/segmap-graph.md).
     """
     error = {"clean": [], "spoilt": []}
     for _ in range(3):
