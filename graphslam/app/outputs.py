@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.figures import save_figures
+from graphslam.app.loops import read_events
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.run_maps import draw_run_map, write_run_map
@@ -169,7 +169,7 @@ def open_run(path: str | Path) -> Run:
         map=m,
         metrics=pd.read_json(root / "metrics.json", orient="records"),
         report=report,
-        events=_events(root / "events.jsonl"),
+        events=read_events(root) if (root / "events.jsonl").is_file() else [],
         ledger=pd.read_csv(root / "ledger.csv", keep_default_na=False) if (root / "ledger.csv").is_file() else None,
         folder=root,
         gps={p.stem.removeprefix("gps_"): _gps(p) for p in sorted(root.glob("gps_*.npz"))},
@@ -203,12 +203,3 @@ def _fixes(file: Path) -> Gps | None:
 
 def _path(file: Path, dim: int) -> Trajectory | None:
     return read_tum(file, dim=dim) if file.is_file() else None
-
-
-def _events(file: Path) -> list[dict[str, Any]]:
-    if not file.is_file():
-        return []
-    try:
-        return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
-        raise FormatError(f"a line is not JSON ({error})", where=str(file)) from None

@@ -42,7 +42,7 @@ class RunFolder:
         """
         folder = cls(path)
         text = dump_toml(config)
-        folder._make()
+        make_folder(folder.path)
         old = folder.path / "config.toml"
         if old.is_file():
             if not resume:
@@ -55,7 +55,7 @@ class RunFolder:
         else:
             with atomic_open(old, "w") as stream:
                 stream.write(text)
-        folder._sweep()
+        sweep(folder.path)
         return folder
 
     @classmethod
@@ -68,16 +68,10 @@ class RunFolder:
             The folder holds something already, or cannot be made.
         """
         folder = cls(path)
-        folder._make()
+        make_folder(folder.path)
         if any(folder.path.iterdir()):
             raise RunFolderError(f"{folder.path}: not empty; choose another --out")
         return folder
-
-    def _make(self) -> None:
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RunFolderError(f"{self.path}: cannot be made ({error.strerror})") from None
 
     def _check_same(self, old: Path, config: Mapping[str, Any]) -> None:
         """A resumed run must be the run that was stopped."""
@@ -87,11 +81,6 @@ class RunFolder:
             raise RunFolderError(f"{old}: damaged ({error})") from None
         for key, a, b in _differences(before, tomllib.loads(dump_toml(config))):
             raise RunFolderError(f"{self.path}: cannot resume, {key} was {a!r} and is {b!r} now")
-
-    def _sweep(self) -> None:
-        """Remove the halves of files that a killed process left behind."""
-        for part in self.path.rglob(".*.part"):
-            part.unlink(missing_ok=True)
 
     @property
     def submaps(self) -> SubmapStore:
@@ -124,6 +113,26 @@ class RunFolder:
         """Write a text file atomically."""
         with atomic_open(self.path / name, "w") as stream:
             stream.write(text)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, unless it is there.
+
+    Raises
+    ------
+    RunFolderError
+        It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"{path}: cannot be made ({error.strerror})") from None
+
+
+def sweep(path: Path) -> None:
+    """Remove the halves of files that a killed process left in a folder."""
+    for part in path.rglob(".*.part"):
+        part.unlink(missing_ok=True)
 
 
 def finite(value: Any) -> Any:

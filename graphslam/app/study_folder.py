@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from graphslam.app.run_folder import make_folder, sweep
 from graphslam.core.atomic import atomic_open, read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.evaluate.montecarlo import Measurement
@@ -106,12 +107,8 @@ class StudyFolder:
             Its ``study.json`` is damaged.
         """
         folder = cls(path)
-        try:
-            folder.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RunFolderError(f"{folder.path}: cannot be made ({error.strerror})") from None
-        for part in folder.path.rglob(".*.part"):  # halves of files that a killed process left behind
-            part.unlink(missing_ok=True)
+        make_folder(folder.path)
+        sweep(folder.path)
         if (folder.path / "study.json").is_file():
             folder._check_same(identity)
         elif any(folder.path.iterdir()):
