@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
 from graphslam.graph.attitude import up_turn
-from graphslam.graph.attitude_verbs import AttitudeVerbs
+from graphslam.graph.attitude_verbs import LEVELLED, AttitudeVerbs, without_tilt
 from graphslam.graph.imu_axes import check_imu_axes
 from graphslam.graph.imu_config import ImuConfig, Place, path_of, places_of
 from graphslam.graph.imu_family import GYRO_ROWS, XI, XJ, Ways, way_terms
@@ -26,6 +26,7 @@ from graphslam.graph.imu_records import ForceRecord, GyroRecord, ImuBiasRecord, 
 from graphslam.graph.imu_states import ImuStates, compacted, links_wanted
 from graphslam.graph.noise import whitener
 from graphslam.graph.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
+from graphslam.graph.records import AttitudeRecord, BetweenRecord
 
 logger = logging.getLogger(__name__)
 
@@ -53,9 +54,10 @@ class ImuVerbs(AttitudeVerbs):
 
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
         preintegrated way (:mod:`graphslam.graph.preintegration`, :mod:`graphslam.graph.imu_family`), inner nodes
-        included. It brings in the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise``
-        says, and walks on over pauses. A node without a way sees gravity: the mean specific force about it, as sure as
-        the body was still. The first factor brings in the ``tilt`` (:mod:`graphslam.graph.attitude`).
+        included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
+        the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
+        pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The
+        first factor brings in the ``tilt`` (:mod:`graphslam.graph.attitude`).
 
         It may be called again when there are more submaps, with the readings that follow (or with none): ways that
         are there stay. Everything left out is counted by reason (event ``imu``).
@@ -172,8 +174,12 @@ class ImuVerbs(AttitudeVerbs):
                 way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
                 if way or (isinstance(r, ForceRecord) and r.node in inside):
                     self._take_out(fid, "its submap was removed")
+        alone = self.records.get(factor_id)
         super().remove(factor_id, reason=reason)
         if self.imus:
+            ways = {(r.i, r.j) for r in self.records.values() if isinstance(r, ImuRecord)}
+            if isinstance(alone, ImuRecord) and (alone.i, alone.j) not in ways:
+                self._level_inside([(alone.i, alone.j)], give_up=False)
             for stream in self.imus:
                 self._relink(stream)
             self._compact()
@@ -219,7 +225,30 @@ class ImuVerbs(AttitudeVerbs):
         self._weigh(made, pim)
         for r in made:
             self.ledger.spend(r.factor_id, r.label(), [stream], r.interval)
+        self._level_inside(pairs, give_up=True)
         return [r.factor_id for r in made]
+
+    def _level_inside(self, pairs: Sequence[tuple[int, int]], *, give_up: bool) -> None:
+        """Increments inside levelled submaps give up their relative roll and pitch where a way tells them; or not.
+
+        The path of a levelled submap takes its roll and pitch from gravity at every instant, so their errors do not
+        grow, and marginals cannot say how alike they are at two nodes: increments between inner nodes then claim
+        nearly exact turns (:mod:`graphslam.graph.inner_nodes`), which a gyro contradicts.
+        """
+        levelled = {f for f, r in self.records.items() if isinstance(r, AttitudeRecord) and r.group == LEVELLED}
+        chosen = set(pairs)
+        for k, s in enumerate(self.submaps):
+            if not levelled.intersection(s.factor_ids) or len(s.nodes) < 3:
+                continue
+            covariances = s.covariances.copy()
+            for m, (pair, fid) in enumerate(zip(zip(s.nodes, s.nodes[1:]), s.factor_ids)):
+                old = self.records.get(fid)
+                if pair not in chosen or m == len(covariances) - 1 or not isinstance(old, BetweenRecord):
+                    continue  # the last one has given it up already
+                covariances[m] = without_tilt(s.stated[m]) if give_up else s.stated[m]
+                W = whitener(covariances[m], what=f"covariance of {old.label()}", dim=6)
+                self._insert(replace(old, whitener=W))
+            self.submaps[k] = replace(s, covariances=covariances)
 
     def _start_bias(
         self,

@@ -373,3 +373,28 @@ def test_fixes_take_the_tilt_when_it_comes(rng):
     solver.update()
     solver.solve_to_optimum()
     assert all("tilt" in r.variables() for r in g.records.values() if r.group == "gps")
+
+
+def test_inside_levelled_submaps_the_gyro_says_roll_and_pitch(rng):
+    """Increments between inner nodes give it up where a way is, and take it back when that goes."""
+    made = ring(rng, submaps=2)
+    g = chain(made, level_sigma=0.03)
+    s = g.submaps[0]
+    before = [g.records[f].whitener for f in s.factor_ids[: len(s.nodes) - 1]]
+    ids = g.add_imu(made.imu)
+    s = g.submaps[0]
+    after = [g.records[f].whitener for f in s.factor_ids[: len(s.nodes) - 1]]
+    assert all(c[0, 0] > 1.0 > d[0, 0] for c, d in zip(s.covariances, s.stated))
+    np.testing.assert_array_equal(before[-1], after[-1])
+    for W, V, P in zip(before[:-1], after[:-1], s.stated[:-1]):
+        np.testing.assert_allclose(np.linalg.inv(V.T @ V)[2:, 2:], P[2:, 2:], rtol=1e-6, atol=1e-12)
+        assert not np.allclose(W, V)
+    BatchSolver(g).solve_to_optimum()
+    g.remove(ids[0])
+    np.testing.assert_allclose(g.records[s.factor_ids[0]].whitener, before[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(g.submaps[0].covariances[0], s.stated[0])
+    BatchSolver(g).solve_to_optimum()
+    plain = chain(made)
+    first = plain.records[plain.submaps[0].factor_ids[0]]
+    plain.add_imu(made.imu)
+    assert plain.records[first.factor_id] is first  # a path that did not take them from gravity keeps them
