@@ -30,7 +30,7 @@ from graphslam.core.submap import Match, Submap
 from graphslam.graph.loop_candidates import FRONT_END
 from graphslam.graph.loop_ledger import Decision
 from graphslam.graph.loop_measure import Loop
-from graphslam.graph.loops import LoopConfig
+from graphslam.graph.loop_rules import LoopConfig
 from graphslam.graph.noise import Robust
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.solve.graph_loops import GraphLoops
