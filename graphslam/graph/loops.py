@@ -9,7 +9,9 @@ One wrong loop ruins a map, so a loop passes, in this order,
 4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
    are in, every one is asked what the graph *without* it says of it;
 5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
-   and by what a second opinion says that judges all of them together.
+   and by what a second opinion says that judges all of them together;
+6. of two groups that cannot both be right the one is believed that the rest of the graph bears out, whatever their
+   number; neither, if it cannot tell (:mod:`~graphslam.graph.loop_disputes`).
 
 With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
@@ -30,15 +32,13 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.graph.consistent_set import Chain, ConsistentSet, LoopArrays, chain_chi2, consistent_loops
+from graphslam.graph.loop_disputes import CLASH, SHUTS_OUT, disputes, weigh
 from graphslam.graph.loop_ledger import Decision, LoopLedger, Verdict
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
 from graphslam.graph.loop_rules import Judge, LoopConfig, LoopGraph
 from graphslam.graph.noise import Robust
 from graphslam.registration.submap_pairs import prediction_chi2
-
-SHUTS_OUT = 0.25
-"""A loop that contradicts this share of a group that was shut out is a rival of that group."""
 
 
 class LoopCloser:
@@ -140,6 +140,8 @@ class LoopCloser:
             self._reconsider()
         if self._second_opinion():
             self._reconsider()
+        if self._disputes():
+            self._reconsider()
         self._say_weights()
 
     def _round(self, new: list[int], out: set[int]) -> set[int]:
@@ -189,8 +191,7 @@ class LoopCloser:
         c, d, loop = self.config, self._dof, self.loops[n]
         limit = float(stats.chi2.ppf(c.level, d))
         earlier_limit = float(stats.chi2.ppf(c.earlier, d))
-        T, P = self.graph.relative(np.array([loop.i]), np.array([loop.j]))
-        expected = prediction_chi2(loop.T_ij, loop.covariance, T[0], P[0])
+        expected = float(self._against_graph([n])[0])
         if not expected <= limit:  # NaN is not
             return "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", {"chi2": expected}
         before = self.graph.chi2()
@@ -262,6 +263,47 @@ class LoopCloser:
             self.ledger.write(replace(self.ledger.of(n), factor_id=fid))
         self.graph.solve()
         return False
+
+    def _disputes(self) -> bool:
+        """Groups that cannot both be right: the one that the rest of the graph bears out, or neither."""
+        inside = self.accepted
+        outside = [n for n in self._refused_by_company() if self._bears(n)]
+        if not inside or len(outside) < 2:
+            return False
+        both = [*inside, *outside]
+        ends = self._arrays(both)[0]
+        limit = float(stats.chi2.ppf(CLASH, self._dof))
+        changed = False
+        for rows, columns in disputes(self._consistent(both).chi2, len(inside), ends, limit):
+            a, b = [both[k] for k in rows], [both[k] for k in columns]
+            if not set(a) <= set(self.accepted):
+                continue  # another dispute has changed that
+            for n in a:
+                self.graph.remove_loop(self.ledger.of(n).factor_id)
+            self.graph.solve()
+            other = self._against_graph(b)
+            outcome, why = weigh(self._against_graph(a), other)
+            for n in a:
+                d = self.ledger.of(n)
+                if outcome == "stays":
+                    fid = self.graph.add_loop(self.loops[n], self._kernel())
+                    self.ledger.write(replace(d, factor_id=fid))
+                else:
+                    self.ledger.write(replace(d, verdict="switched-off", why=why, weight=0.0, factor_id=-1))
+            if outcome == "changes":
+                self._one_by_one(b)
+            elif outcome == "ambiguous":
+                for n, value in zip(b, other):
+                    self._refuse(n, why, float(value))
+            self.graph.solve()
+            changed |= outcome != "stays"
+        return changed
+
+    def _against_graph(self, numbers: list[int]) -> Array:
+        """χ² of loops that are not in the graph, each by itself ``(k,)``."""
+        x = [self.loops[n] for n in numbers]
+        T, P = self.graph.relative(np.array([a.i for a in x]), np.array([a.j for a in x]))
+        return np.array([prediction_chi2(a.T_ij, a.covariance, T[k], P[k]) for k, a in enumerate(x)])
 
     def _bears(self, n: int) -> bool:
         """Whether the chain alone bears a loop."""
