@@ -24,7 +24,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.graph.loop_places import Ints, Places, Relative
 
-FRONT_END, PROXIMITY, APPEARANCE = "front-end", "proximity", "appearance"
+FRONT_END, PROXIMITY, APPEARANCE, TIE = "front-end", "proximity", "appearance", "tie"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +73,9 @@ class Candidate:
     i, j : int
         Places, ``i`` before ``j`` on the way: the map of i's submap is the target, what j sees the source.
     source : str
-        ``front-end``, ``proximity``, ``appearance``.
+        ``front-end``, ``proximity``, ``appearance``, ``tie`` (:mod:`~graphslam.graph.loop_ties`).
     T_ij : (7,) or (3,)
-        The prediction; for a front end's match the match itself.
+        The prediction; for a front end's match or a tie the measurement itself.
     covariance : (d, d)
         Of it, right tangent.
     gain : float

@@ -12,7 +12,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
-from graphslam.graph.loop_candidates import FRONT_END, Candidate
+from graphslam.graph.loop_candidates import FRONT_END, TIE, Candidate
 from graphslam.graph.loop_places import Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.submap_pairs import MapGrid, PreparedMap, match_pair
@@ -85,7 +85,7 @@ class LoopMeasurer:
         return self._maps[k]
 
     def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
-        """Loops of candidates, in their order; a front end's match is one already."""
+        """Loops of candidates, in their order; a front end's match or a tie is one already."""
         return [self.one(c) for c in tqdm(candidates, "matching submaps", disable=not progress, leave=False)]
 
     def one(self, c: Candidate) -> Loop:
@@ -93,7 +93,7 @@ class LoopMeasurer:
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])
         keys = (self.submaps[a].key, self.submaps[b].key)
-        if c.source == FRONT_END:
+        if c.source in (FRONT_END, TIE):
             return Loop(
                 i=c.i, j=c.j, T_ij=c.T_ij, covariance=c.covariance, source=c.source, score=c.score, gain=c.gain,
                 gates=dict(c.facts), submaps=keys,

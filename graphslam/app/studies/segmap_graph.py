@@ -1,8 +1,8 @@
 """The study ``segmap-graph``: from the SegMap to one globally consistent map, and what of it can be trusted.
 
 Worlds: two garages, the mine, the building; clutter and every sensor error are drawn anew in each run. Algorithms:
-``rbpf-40``, ``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``loops`` of what SegSLAM
-settled.
+``rbpf-40``, ``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps`` of
+what SegSLAM settled.
 
 Quantities
 ----------
@@ -11,7 +11,8 @@ twenty map samples. ``entropy_min``: entropy of all scans along the path [nat m�
 samples. ``nees_…``: squared error of the body at the nodes, a degree of freedom, mean over a run (``…_last``: at its
 end).
 ``loops_measured``: registrations that passed their gates, ``…_right``: those that are true; ``loops_taken`` and
-``loops_taken_right``: those in the graph. ``chi2_per_dof`` of the graph.
+``loops_taken_right``: those in the graph. ``chi2_per_dof`` of the graph. ``leg_angle``: RMS error of the angles between
+straight pieces of the way on different levels [rad].
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ WORLDS = {
         grid=GridTrialConfig(
             world="building",
             algorithms=("rbpf-40", "segslam-40"),
-            figures=_FIGURES,
+            figures=(*_FIGURES, "legs"),
             samples=20,
             placements=4,
             segslam=BUILDING,
@@ -59,7 +60,8 @@ WORLDS = {
 _COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
 QUICK_WORLDS = {
     "court-quick": GraphTrialConfig(
-        grid=replace(QUICK, algorithms=("rbpf-5", "segslam-5"), figures=_FIGURES, samples=3, drift=_COURT), spacing=1.5
+        grid=replace(QUICK, algorithms=("rbpf-5", "segslam-5"), figures=(*_FIGURES, "legs"), samples=3, drift=_COURT),
+        spacing=1.5,
     )
 }
 BLOCKS = ("position", "heading", "pose", "level")
@@ -71,7 +73,15 @@ class SegMapGraph(GraphStudy):
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
         """``paths``, ``gains`` of the graph over samples, ``nees`` by block, ``loops``, ``seconds``."""
-        quantities = ("ate_aligned", "ate_best_sample", "height_rmse", "final_error", "entropy_min", "chi2_per_dof")
+        quantities = (
+            "ate_aligned",
+            "ate_best_sample",
+            "height_rmse",
+            "final_error",
+            "entropy_min",
+            "leg_angle",
+            "chi2_per_dof",
+        )
         out = {
             "paths": tables.means_table(table, quantities),
             "gains": gain_table(table),

@@ -2,8 +2,8 @@
 
 Beside the filters' own figures (``rbpf-N``, ``segslam-N``: the likeliest map sample) the settled segments become a
 graph, named after what is in it: ``chain``, the exits alone; ``matches``, with the front end's entries into older maps;
-``loops``, with those that were looked for between the submaps too. Every loop is decided on, and the decisions are held
-against the truth.
+``ties``, with those along the segments too; ``loops``, also with those that were looked for between the submaps;
+``gps``, the same with fixes. Every loop is decided on, and the decisions are held against the truth.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
+from graphslam.core.random import SeedTree
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
@@ -36,6 +38,25 @@ RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
 """A loop is right if it is off by less [m], [rad]: three σ of a good registration, and half a pillar's breadth."""
 
 
+GRAPHS = ("chain", "matches", "ties", "loops", "gps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixConfig:
+    """Fixes of the graph ``gps``, drawn from the true path: white, in a frame of their own."""
+
+    period: float = 2.0
+    """[s]"""
+    sigma: float = 1.0
+    """Of every coordinate [m]."""
+    lever: tuple[float, float, float] = (0.3, 0.0, 0.6)
+    """Antenna in the base frame [m]."""
+    heading: float = 0.7
+    """Of the first base in the frame of the fixes [rad]."""
+    start: tuple[float, float, float] = (250.0, -40.0, 12.0)
+    """Its position there [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class GraphTrialConfig:
     """A world with its filters, and how the graph is made."""
@@ -48,6 +69,7 @@ class GraphTrialConfig:
     """Of a levelled base, as the exits assume it [rad]."""
     find: FindConfig = field(default_factory=lambda: FindConfig(front_end=True))
     """How loops are looked for and decided on."""
+    fixes: FixConfig = field(default_factory=FixConfig)
 
 
 def run_graph_trial(config: GraphTrialConfig, seed: int) -> list[Measurement]:
@@ -88,7 +110,7 @@ class GraphTrial(GridTrial):
         yield Measurement(name, "ate_best_sample", min(errors))
         yield Measurement(name, "ate_mean_sample", float(np.mean(errors)))
         submaps = self.submaps(result)
-        for kind in ("chain", "matches", "loops"):
+        for kind in GRAPHS:
             built = self.build(submaps, kind)
             yield from self.graph_figures(kind, result, built)
             yield Measurement(kind, "failed", 0.0)
@@ -102,7 +124,7 @@ class GraphTrial(GridTrial):
         return settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift))
 
     def build(self, submaps: Sequence[Submap], kind: str) -> BuiltGraph:
-        """The graph of settled segments: ``chain``, ``matches`` or ``loops``."""
+        """The graph of settled segments, one of :data:`GRAPHS`."""
         c, begin = self.graph, perf_counter()
         graph = PoseGraph(submaps[0].dim)
         for s in submaps:
@@ -110,10 +132,29 @@ class GraphTrial(GridTrial):
         solver = BatchSolver(graph)
         solver.solve_to_optimum()
         closer = None
+        if kind == "gps":  # what fixes say is known when loops are looked for
+            graph.add_gps(self.fixes(submaps[0].dim))
+            graph.finish_gps()
+            solver.solve_to_optimum()
         if kind != "chain":
-            find = c.find if kind == "loops" else replace(c.find, rounds=0, appearance=None)
+            few = replace(c.find, rounds=0, appearance=None)
+            find = {"matches": replace(few, ties=None), "ties": few}.get(kind, c.find)
             closer = find_loops(graph, solver, submaps, find)
         return BuiltGraph(graph, solver.solution(), closer, perf_counter() - begin)
+
+    def fixes(self, dim: int) -> Gps:
+        """Fixes along the true path."""
+        c, t = self.graph.fixes, self.steps.times
+        times = np.arange(t[0] + c.period, t[-1], c.period)
+        body = self._truth_at(times)
+        lever, start = np.array(c.lever[:dim]), np.array(c.start[:dim])
+        antenna = group_of(body).transform(body, np.broadcast_to(lever, (len(body), dim)))
+        first = antenna[0].copy()
+        cos, sin = np.cos(c.heading), np.sin(c.heading)
+        z = antenna - first
+        z[:, :2] = z[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+        noise = SeedTree(self.seed).child("fixes").generator().standard_normal(z.shape)
+        return Gps(times=times, positions=start + z + c.sigma * noise, sigma=np.full(len(z), c.sigma), lever=lever)
 
     def graph_figures(self, kind: str, result: SegSlamResult, built: BuiltGraph) -> Iterator[Measurement]:
         """Errors and honesty of the full-rate path, entropy of the scans along it, decisions against the truth."""
@@ -131,7 +172,9 @@ class GraphTrial(GridTrial):
         for block, values in nees.items():
             yield Measurement(kind, f"nees_{block}", float(values.mean()))
             yield Measurement(kind, f"nees_{block}_last", float(values[-1]))
-        if "entropy" in self.config.figures:
+        if "legs" in self.config.figures:
+            yield Measurement(kind, "leg_angle", self.leg_angle(path.interpolate(self.steps.times)))
+        if "entropy" in self.config.figures and kind in ("chain", "matches", "loops"):
             at = path.interpolate(self.steps.times)
             found = judge.clarity(
                 self.steps, at, voxel_size=0.2, model=self.config.filter.beam_model(), count=self.config.placements

@@ -205,8 +205,7 @@ class GridTrial:
             yield Measurement(name, "effective_median", float(np.median(effective)))
             yield Measurement(name, "maps_megabytes", result.used_bytes / 1e6)
         if "legs" in wanted:
-            pieces = judge.legs(self.world.route(), self.arc, 10.0 if self.config.world != "court" else 4.0)
-            yield Measurement(name, "leg_angle", judge.leg_angle_error(outcome.path.poses, self.truth, pieces))
+            yield Measurement(name, "leg_angle", self.leg_angle(outcome.path.poses))
         if "entropy" in wanted:
             yield from self._entropy(name, outcome)
         if "loops" in wanted:
@@ -220,6 +219,11 @@ class GridTrial:
                 yield from self._matches(name, result)
             if "exits" in wanted:
                 yield from self._exits(name, result)
+
+    def leg_angle(self, poses: Array) -> float:
+        """How far straight pieces of the way on different levels are from parallel, along poses at the steps [rad]."""
+        pieces = judge.legs(self.world.route(), self.arc, 10.0 if self.config.world != "court" else 4.0)
+        return judge.leg_angle_error(poses, self.truth, pieces)
 
     def _matches(self, name: str, result: SegSlamResult) -> Iterator[Measurement]:
         m = judge.match_errors(result.segmap, self.truth)
