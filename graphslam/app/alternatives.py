@@ -25,6 +25,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
 from graphslam.io.g2o import write_g2o
 from graphslam.io.tum import write_tum
 from graphslam.maps.entropy import Clarity
@@ -38,9 +39,9 @@ TIES = ("match", "loop")
 CONTRADICTION = 1e-4
 """A graph whose χ² is greater than an honest one's with this probability contradicts itself."""
 MANY = 5
-"""With so many ties in a graph the noise of the chain can be told from a wrong tie …"""
+"""With so many pairs of submaps tied the noise of the chain can be told from a wrong tie …"""
 KEPT = 0.75
-"""… by the alternatives that keep this share of them: most ties are taken to be right."""
+"""… by the alternatives that keep this share of them: most are taken to be right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +64,11 @@ class Alternative:
 
     @property
     def ties(self) -> int:
-        """Matches and loops in the graph."""
-        return sum(r.group in TIES for r in self.graph.records.values())
+        """Pairs of submaps that matches and loops tie: ties of one pair stand and fall together."""
+        submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
+        tied = [r for r in self.graph.records.values() if r.group in TIES and isinstance(r, BetweenRecord)]
+        last = len(self.graph.submaps) - 1  # whose exit is a node of its own
+        return len({frozenset((submap.get(r.i, last), submap.get(r.j, last))) for r in tied})
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +248,7 @@ def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float
     Parameters
     ----------
     ties : sequence of int
-        Of each alternative.
+        Pairs of submaps that are tied, of each alternative.
     fits : sequence of (float, int)
         χ² and degrees of freedom.
 

@@ -152,6 +152,21 @@ def test_most_ties_say_how_good_the_chain_is() -> None:
     assert noise_scale([16, 5], [(160.0, 48), (15.0, 15)]) == pytest.approx(160 / 48)
 
 
+def test_ties_of_one_pair_of_submaps_count_once(run: tuple) -> None:
+    submaps, _, loops, divided = run
+    assert len({(d.submap_i, d.submap_j) for d in loops}) < len(loops)
+    again = alternative("as the run", solve_choice(submaps, _all(loops), OPTIONS, loops=loops), divided)
+    assert again.ties == len({(d.submap_i, d.submap_j) for d in loops})
+    folded = solve_choice(submaps, _all(loops), OPTIONS, loops=loops)
+    fold(folded, Robust())  # within the first submap, and from it to the second
+    assert alternative("folded", folded, divided).ties == again.ties + 2
+    assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).ties == 0
+
+
+def _all(loops: list[Decision]) -> frozenset[tuple[int, int]]:
+    return frozenset((LOOP, d.loop) for d in loops)
+
+
 def test_fixes_of_a_run_are_in_every_choice(run: tuple) -> None:
     submaps = run[0]
     times = np.concatenate([s.trajectory.times[::2] for s in submaps if s.trajectory is not None])
