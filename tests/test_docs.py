@@ -20,6 +20,7 @@ PAGES = [
     "concepts.md",
     "evidence-grids.md",
     "how-to.md",
+    "imu.md",
     "limits.md",
     "loops.md",
     "maps.md",

@@ -12,6 +12,7 @@ from graphslam.app.metrics import Metrics
 from graphslam.core.errors import MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.evaluate.without_truth import class_consistency, two_sided
 from graphslam.graph.imu_config import ImuConfig as ImuFactorConfig
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
@@ -132,3 +133,19 @@ def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
             out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
             out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
         graph.note("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
+    _contradiction(graph)
+
+
+def _contradiction(graph: PoseGraph) -> None:
+    """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
+    ways = class_consistency(graph).get("imu") if graph.imus else None
+    if ways is None or not np.isfinite(ways.ratio):
+        return
+    high = two_sided(ways.ratio, ways.dof, 0.999)[1]
+    if ways.ratio > high:
+        graph.note("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
+        logger.warning(
+            "submaps and IMU contradict each other (χ²/dof %.1f, at most %.1f): one of them states too little noise",
+            ways.ratio,
+            high,
+        )

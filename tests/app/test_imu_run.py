@@ -62,6 +62,7 @@ def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     kinds = [e["event"] for e in events]
     assert {"imu", "imu-axes", "imu-bias"} <= set(kinds)
+    assert "imu-contradicted" not in kinds
     counts = next(e for e in events if e["event"] == "imu")["dropped"]
     assert counts == {"before the first reading": 1, "gravity outside the readings": 1}
     assert "imu" in set(r.ledger["stream"])
@@ -88,6 +89,23 @@ def test_wrong_axes_are_named_while_the_run_goes_on(monkeypatch):
     assert [e["words"] for e in warned.events if e["event"] == "imu-axes"] == ["x reads −y, y reads x"]
     quiet = solved(wrong, submaps, monkeypatch, config={"imu": {"axes": "ignore"}})
     assert not [e for e in quiet.events if e["event"] == "imu-axes"]
+
+
+def test_a_contradiction_is_said(monkeypatch, caplog):
+    """Submaps that say to be a hundred times as sure as they are."""
+    log, submaps = made()
+    sure = [
+        replace(
+            s,
+            exit_covariance=1e-4 * s.exit_covariance,
+            trajectory=replace(s.trajectory, covariances=1e-4 * s.trajectory.covariances),
+        )
+        for s in submaps
+    ]
+    r = solved(log, sure, monkeypatch, config={"imu": {"use": "auto"}})
+    (said,) = [e for e in r.events if e["event"] == "imu-contradicted"]
+    assert said["chi2_per_dof"] > said["high"] > 1
+    assert "contradict each other" in caplog.text
 
 
 def test_in_the_plane_it_is_left_out(monkeypatch):

@@ -56,6 +56,14 @@ def level_from(force: np.ndarray) -> np.ndarray:
     return se3.so3_exp(axis / max(s, 1e-12) * np.arctan2(s, c))
 
 
+def turned_on(start: np.ndarray, imu: Imu, at: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """Attitudes ``(n, 4)`` at ``at`` ``(n,)`` by the gyro alone, from that at the first."""
+    q = [start]
+    for R in preintegrate(imu, at[:-1], at[1:], bias).R:
+        q.append(se3.quat_multiply(q[-1], se3.matrix_to_quat(R)))
+    return np.array(q)
+
+
 def flown(
     imu: Imu, at: np.ndarray, points: np.ndarray, body: np.ndarray, heading: float, sigma: float
 ) -> PoseGraph | None:
@@ -73,16 +81,17 @@ def flown(
     path = np.concatenate([se3.quat_rotate(se3.so3_exp([0.0, 0.0, heading]), points - points[0]), body], axis=1)
     path[:, :3] -= se3.quat_rotate(body, np.tile(PRISM, (len(body), 1)))
     g = PoseGraph(3)
+    frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # the first base is level, the others stand as the body does
     for k in range(len(at) - 1):
-        T = SE3.between(path[k], path[k + 1])
+        local = SE3.between(np.stack([frame, frame]), path[k : k + 2])
         P = np.diag(np.repeat([0.5, 3.0], 3) ** 2)  # a stretch of which nothing is known
-        rows = Trajectory(at[k : k + 2], np.stack([SE3.identity, T]), np.stack([1e-12 * np.eye(6), P]))
+        rows = Trajectory(at[k : k + 2], local, np.stack([1e-12 * np.eye(6), P]))
         g.add_submap(
-            Submap(key=k, interval=(at[k], at[k + 1]), exit_pose=T, exit_covariance=P, trajectory=rows,
+            Submap(key=k, interval=(at[k], at[k + 1]), exit_pose=local[1], exit_covariance=P, trajectory=rows,
                    uses=frozenset({"nothing"}))
         )  # fmt: skip
-    down = -se3.quat_rotate(path[0, 3:] * CONJUGATE, [0.0, 0.0, 1.0])
-    g.add_attitude(0, down, 0.2, evidence="prior")
+        frame = path[k + 1]
+    g.add_attitude(0, [0.0, 0.0, -1.0], 0.2, evidence="prior")
     fixes = Gps(times=at, positions=points, sigma=np.full(len(at), sigma), lever=PRISM)
     g.add_gps(fixes, config=GpsConfig(baseline=0.3))
     g.finish_gps()
@@ -131,19 +140,19 @@ def euroc(
     # a start: attitudes by the gyro alone from the force of the first second, as if it stood still then
     first = imu.times < 1.0
     bias = np.concatenate([imu.angular_rate[first].mean(axis=0), np.zeros(3)])
-    q = [level_from(imu.specific_force[first].mean(axis=0))]
-    for R in preintegrate(imu, np.append(1.0, at[:-1]), at, bias).R:
-        q.append(se3.quat_multiply(q[-1], se3.matrix_to_quat(R)))
-    body = np.array(q[1:])
+    body = turned_on(level_from(imu.specific_force[first].mean(axis=0)), imu, np.append(1.0, at), bias)[1:]
     # how the frame of the positions lies is not known: the best of some headings over the first stretch
-    n = int(np.searchsorted(at, 40.0))
+    n = int(np.searchsorted(at, 60.0))
     tried = []
     for heading in np.deg2rad(np.arange(0, 360, 60)):
         short = flown(imu, at[:n], points[:n], body[:n], heading, sigma)
         if short is not None:
-            tried.append((short.objective().total, heading, short.values.datum[3]))
-    heading = min(tried)[2] if tried else 0.0  # points turned back by it start where the short solution ended
-    g = flown(imu, at, points, body, -heading, sigma) or flown(imu, at, points, body, min(tried)[1], sigma)
+            tried.append((short.objective().total, short.values.datum[3], short.values.imu_biases[-1]))
+    if not tried:
+        return f"every {every:g} s: no start leads anywhere"
+    _, heading, bias = min(tried, key=lambda row: row[0])
+    body = turned_on(body[0], imu, at, bias)  # by the bias that the short solution found
+    g = flown(imu, at, points, body, -heading, sigma)
     if g is None:
         return f"every {every:g} s: no start leads anywhere"
     withheld = np.array([k for k in keep if k not in set(nodes) and at[0] < tz[k] < at[-1]])
@@ -154,7 +163,10 @@ def euroc(
     v = g.values.velocities[[states.velocity[n] for n in node_at[which]]]
     b = g.values.imu_biases[[states.bias[n] for n in node_at[which]]]
     pim = preintegrate(imu, at[which], tz[withheld], b)
-    X, T = g.values.poses[node_at[which]], pim.seconds[:, None]
+    first_body = np.concatenate([np.zeros(3), body[0]])
+    poses = g.values.poses.copy()
+    poses[0] = SE3.compose(poses[0], first_body)  # the body on the level first base
+    X, T = poses[node_at[which]], pim.seconds[:, None]
     up = se3.quat_rotate(T_gps[3:] * CONJUGATE, [0.0, 0.0, 1.0])
     p = X[:, :3] + v * T - 0.5 * GRAVITY * T**2 * up + se3.quat_rotate(X[:, 3:], pim.p)
     turned = se3.quat_multiply(X[:, 3:], se3.matrix_to_quat(pim.R))
