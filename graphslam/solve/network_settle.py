@@ -54,10 +54,12 @@ Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 # Loops are neighbours if their ends are so many nodes apart, both together; larger groups are not judged as groups.
 NEAR, LARGEST = 4, 40
-# Refused loops that are looked at, those of least cost; columns that are solved for at a time.
+# Refused loops that are looked at in every round, those of least cost; columns that are solved for at a time.
 TESTED, COLUMNS = 300, 400
 # Rounds of accepting and refusing; steps of a solve between two of them.
 ROUNDS, STEPS = 15, 20
+# Refused ones are tried whose first-order χ² is within so many times the limit.
+NEARLY = 10.0
 # In a round only what is within this factor of the worst is taken out: one wrong loop makes its neighbours look bad.
 WORST = 0.25
 # The tail is told by this share of the accepted loops, with the weight of so many more of a tail index in between that
@@ -298,11 +300,14 @@ def settle(
     limit, scale, rounds = limit.copy(), 0.0, 0
     dull = float(stats.chi2.ppf(DULL, d))
     seen: set[bytes] = set()
+    back, tried = False, np.zeros(m, dtype=np.bool_)
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
     for rounds in range(1, ROUNDS + 1):
         problem = BatchProblem(network, inliers)
         end = polish(problem, values, max_iterations=STEPS)
         values, arrays = end.values, problem.arrays(end.values)
+        if back:
+            break
         seen.add(inliers.tobytes())
         fresh = inliers.copy()
         fresh[m:] = observation_costs(network, *arrays) <= limit[m:]
@@ -324,11 +329,24 @@ def settle(
         partial = ~judged & np.isfinite(limit[:m])
         fresh[:m][partial] = costs[partial] <= limit[:m][partial]
         outside = np.flatnonzero(judged & ~inliers[:m])
-        outside = outside[np.argsort(costs[outside], kind="stable")][:TESTED]
-        if len(outside):
-            alone, group, _ = loop_evidence(network, inliers, outside, arrays, accepted=False)
-            fresh[outside[np.maximum(alone, group) <= limit[outside]]] = True
-        if (fresh == inliers).all() or fresh.tobytes() in seen or rounds == ROUNDS:
+        outside = outside[np.argsort(costs[outside], kind="stable")]
+        against = np.full(m, np.inf)
+        for first, last in ((0, TESTED), (TESTED, len(outside))):
+            # the dear ones only where nothing else changes: what the accepted do not hold may lie far off
+            some = outside[first:last]
+            if len(some) and (first == 0 or (fresh == inliers).all()):
+                against[some] = loop_evidence(network, inliers, some, arrays, accepted=False)[0]
+        # the group of a right loop is that of those that could be right: wrong ones may lie beside it
+        good = outside[against[outside] <= limit[outside]]
+        if len(good):
+            alone, group, _ = loop_evidence(network, inliers, good, arrays, accepted=False)
+            fresh[good[np.maximum(alone, group) <= limit[good]]] = True
+        if (fresh == inliers).all():
+            # … and its χ² is only of first order there: what comes near is tried, and judged from inside
+            near = outside[(against[outside] <= NEARLY * limit[outside]) & ~tried[outside]]
+            fresh[near] = tried[near] = True
+        if (fresh == inliers).all() or rounds == ROUNDS:
             break
+        back = fresh.tobytes() in seen
         inliers = fresh
     return Settled(inliers, problem, end, limit, scale, rounds)

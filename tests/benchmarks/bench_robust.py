@@ -1,7 +1,7 @@
 """Wrong loops in recorded pose networks: what GNC leaves of them, and what it does to the right ones.
 
     GRAPHSLAM_DATA=... python tests/benchmarks/bench_robust.py [--files M3500,sphere] [--kinds random,aliased]
-        [--shares 0.3,0.5] [--seeds 2] [--gtsam] [--quick]
+        [--shares 0.3,0.5] [--seeds 2] [--first 100] [--gtsam] [--quick]
 
 A row says: the objective over the true inliers at the answer, divided by their optimum (the clean file's); precision
 and recall of "this edge is wrong"; CPU seconds. ``--gtsam`` adds GTSAM's own GNC from dead reckoning, odometry known
@@ -65,6 +65,7 @@ def main() -> int:
     parser.add_argument("--kinds", default="random,aliased")
     parser.add_argument("--shares", default="0.3")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--gtsam", action="store_true")
     parser.add_argument("--quick", action="store_true", help="one draw in M3500")
     args = parser.parse_args()
@@ -82,7 +83,7 @@ def main() -> int:
         solved = solve_network(clean, starts=("chordal",))
         for kind in args.kinds.split(","):
             for share in map(float, args.shares.split(",")):
-                for seed in range(args.seeds):
+                for seed in range(args.first, args.first + args.seeds):
                     rng = SeedTree(seed).child("wrong loops", kind).generator()
                     mixed = add_wrong_loops(clean, share, rng, kind=kind, reference=solved.poses)
                     label = f"{name} {kind} {share:.0%} seed {seed}"
