@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from graphslam.app.config import BackEndConfig, GpsConfig
 from graphslam.app.imu_use import ImuPart, recentred
-from graphslam.app.loops import ledger_of_events, same_loop
+from graphslam.app.loops import DECIDED, ledger_of_events, same_loop
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -24,8 +24,10 @@ from graphslam.graph.landmark_merging import euclidean_merges, mahalanobis_merge
 from graphslam.graph.loop_appearance import AppearanceConfig
 from graphslam.graph.loop_candidates import FRONT_END, CandidateConfig
 from graphslam.graph.loop_ledger import Decision, LoopLedger
+from graphslam.graph.loop_ties import TieConfig, ties_entries
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
 from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
@@ -182,11 +184,21 @@ class BackEnd:
         return solution
 
     def find_loops(self) -> LoopLedger:
-        """Look for loops between the submaps, take those that are believed, and note every decision."""
+        """Look for loops between the submaps, take those that are believed, and note every decision.
+
+        The front end's matches are among them: until now each had a factor by its support alone.
+        """
         start, c = time.perf_counter(), self.config
+        for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
+            self.graph.remove(fid, reason=DECIDED)
+        self.solver.solve_to_optimum()
         config = FindConfig(
-            candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height),
+            candidates=CandidateConfig(
+                overlap=c.loop_overlap, height=c.loop_height, least_support=max(c.match_support, 1e-9)
+            ),
             appearance=AppearanceConfig() if c.loop_appearance else None,
+            front_end=True,
+            ties=TieConfig() if c.loop_ties else None,
         )
         ledger = find_loops(self.graph, self.solver, self.submaps, config).ledger
         for event in ledger.events():
@@ -195,20 +207,29 @@ class BackEnd:
         return ledger
 
     def undo_loop(self, loop: int) -> None:
-        """Take a loop, or a front end's match, out of the graph; what was found with it in stays.
+        """Take a loop, or a front end's match with its ties, out of the graph; what was found with it in stays.
 
         Raises
         ------
         DataError
             It is not in the graph.
         """
-        d = ledger_of_events(self.graph.events).of(loop)
+        ledger = ledger_of_events(self.graph.events)
+        d = ledger.of(loop)
         if d.verdict != "accepted" or d.factor_id not in self.graph.records:
             raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
-        self.graph.remove(d.factor_id, reason="undone")
-        if d.source != FRONT_END:
-            event = replace(d, verdict="undone", why="asked for", weight=0.0, factor_id=-1).event()
-            self.graph.note(event.pop("event"), **event)
+        why = {d.loop: "asked for"}
+        if d.source == FRONT_END:
+            entry = (d.submap_i, d.submap_j)
+            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in ties_entries(x.gates))
+            why |= {x.loop: f"by loop {loop}, which was undone" for x in ties}
+        for number, reason in why.items():
+            x = ledger.of(number)
+            matched = self.graph.records[x.factor_id]
+            self.graph.remove(x.factor_id, reason="undone")
+            if isinstance(matched, BetweenRecord) and matched.group != "match":  # of a match the removal says it
+                event = replace(x, verdict="undone", why=reason, weight=0.0, factor_id=-1).event()
+                self.graph.note(event.pop("event"), **event)
         self.solver.solve_to_optimum()
 
     def _stay_undone(self, before: Decision) -> None:

@@ -98,11 +98,14 @@ class BackEndConfig:
     match_width: float = 2.385
     """Width of that kernel in standard deviations."""
     loops: bool = False
-    """At the end, look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``)."""
+    """At the end, look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
+    The front end's matches are decided on with them; without, each that has the support is a factor."""
     loop_overlap: float = 8.0
     """Maps of two places are matched if the places may be nearer than this [m] …"""
     loop_height: float = 1.0
     """… and not farther above each other than this [m]."""
+    loop_ties: bool = True
+    """With loops: also along submaps, where their bodies were in a map that held them."""
     loop_appearance: bool = False
     """Also try places that look alike, wherever they are."""
 

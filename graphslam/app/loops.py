@@ -12,6 +12,9 @@ from graphslam.app.config import read_toml
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.graph.loop_ledger import Decision, LoopLedger
 
+DECIDED = "decided on with all loops"
+"""Why a factor of a front end's match is taken out where it is a loop among others from then on."""
+
 
 def read_events(folder: str | Path) -> list[dict[str, Any]]:
     """``events.jsonl`` of a run folder.
@@ -39,7 +42,7 @@ def read_events(folder: str | Path) -> list[dict[str, Any]]:
 
 
 def loops_of_run(folder: str | Path) -> LoopLedger:
-    """Ledger of all loops of a run: those that were looked for, then the front end's matches.
+    """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not.
 
     Raises
     ------
@@ -73,6 +76,8 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
 
     fid = int(e.get("factor_id", -1))
     gone = taken and fid in removed
+    if gone and removed[fid] == DECIDED:
+        return None  # it is among the loops
     support = figure("support")
     why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
     return Decision(

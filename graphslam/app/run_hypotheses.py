@@ -27,10 +27,11 @@ from graphslam.app.run_maps import RunMap, folder_options, solved_poses
 from graphslam.core.errors import MissingDataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.loop_candidates import FRONT_END
+from graphslam.graph.loop_candidates import FRONT_END, TIE
 from graphslam.graph.loop_ledger import Decision
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_rules import LoopConfig
+from graphslam.graph.loop_ties import ties_entries
 from graphslam.graph.noise import Robust
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.solve.graph_loops import GraphLoops
@@ -91,7 +92,8 @@ def choices_of_matches(
     loops : sequence of Decision
         Loops of the run's ledger that are in its graph and no matches of the front end.
     undone : frozenset of (int, int)
-        Matches that were taken out of the run by hand: keys of the submap and of the one it entered.
+        Matches that are not in the run's graph, refused or taken out by hand: keys of the submap and of the one it
+        entered.
     """
     every = {(s.key, i): m for s in submaps for i, m in enumerate(s.matches)}
     found_loops: Chosen = frozenset((LOOP, d.loop) for d in loops)
@@ -104,12 +106,16 @@ def choices_of_matches(
         found[f"support ≥ {least:.2g}"] = at_least | found_loops
     for key, i in sorted(taken):
         found[f"without {key} → {every[key, i].target}"] = own - {(key, i)}
-    for d in sorted(loops, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
+    alone = [d for d in loops if d.source != TIE]
+    for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
         found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
+    needs = {(LOOP, d.loop): ties_entries(d.gates) for d in loops}
     out: dict[str, Chosen] = {}
     for name, chosen in found.items():
-        if chosen not in out.values():
-            out[name] = chosen
+        entries = {(every[k].target, k[0]) for k in chosen if k in every}
+        kept = frozenset(k for k in chosen if needs.get(k, set()) <= entries)  # a tie goes with its match
+        if kept not in out.values():
+            out[name] = kept
     return out
 
 
@@ -183,7 +189,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
-    undone = frozenset((d.submap_j, d.submap_i) for d in ledger if d.verdict == "undone" and d.source == FRONT_END)
+    undone = frozenset((d.submap_j, d.submap_i) for d in ledger if d.verdict != "accepted" and d.source == FRONT_END)
     every = choices_of_matches(run.submaps, config.match_support, loops=loops, undone=undone)
     choices = dict(list(every.items())[:MOST])
     if len(every) > MOST:

@@ -16,8 +16,9 @@ as those of :mod:`frontends.filter_drift` do, may be given them.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from graphslam.graph.loop_candidates import TIE, Candidate
 from graphslam.graph.loop_places import Places
 
 Entry = tuple[int, int]
-"""Numbers of the submap that was entered and of the one that entered it."""
+"""Keys of the submap that was entered and of the one that entered it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +78,7 @@ def tie_candidates(
     places : Places
         Of these.
     entries : collection of (int, int)
-        Re-entries that are believed: numbers of target and submap. The submap is one that went on in the target's map
+        Re-entries that are believed: keys of target and submap. The submap is one that went on in the target's map
         (its ``report["holds"]`` names the target).
     config : TieConfig, optional
 
@@ -112,6 +113,11 @@ def tie_candidates(
     return out
 
 
+def ties_entries(gates: Mapping[str, Any]) -> set[Entry]:
+    """The entries that a tie needs, from the figures of its loop; of another loop none."""
+    return {(int(a), int(b)) for a, b in gates.get("entries", ())}
+
+
 _Seen = dict[int, tuple[Array, tuple[Entry, ...]]]
 
 
@@ -121,12 +127,11 @@ def _frames(submaps: Sequence[Submap], number: dict[int, int], entries: set[Entr
     for k, s in enumerate(submaps):
         mine: _Seen = {k: (group_of(s.exit_pose).identity, ())}
         for m in s.matches:  # the most supported first
-            t = number.get(m.target, -1)
-            if not _went_on(s, m.target) or (t, k) not in entries or len(mine) > 1:
+            if not _went_on(s, m.target) or (m.target, s.key) not in entries or len(mine) > 1:
                 continue
             g = group_of(m.T_target_here)
-            for u, (T_u_target, by) in out[t].items():
-                mine[u] = (g.compose(T_u_target, m.T_target_here), (*by, (t, k)))
+            for u, (T_u_target, by) in out[number[m.target]].items():
+                mine[u] = (g.compose(T_u_target, m.T_target_here), (*by, (m.target, s.key)))
         out.append(mine)
     return out
 

@@ -18,7 +18,7 @@ from graphslam.graph.loop_candidates import (
     sharing_maps,
 )
 from graphslam.graph.loop_measure import LoopMeasurer
-from graphslam.graph.loop_ties import Entry, TieConfig, tie_candidates
+from graphslam.graph.loop_ties import Entry, TieConfig, tie_candidates, ties_entries
 from graphslam.graph.loops import LoopCloser, LoopConfig
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.registration.pair_config import PairConfig
@@ -119,23 +119,21 @@ def find_loops(
         alike = appearance_candidates(p, join(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
     if c.ties is not None and c.front_end:
-        go(tie_candidates(submaps, ours.places, _believed(closer, submaps), c.ties))
-        _drop_orphans(closer, submaps)
+        go(tie_candidates(submaps, ours.places, _believed(closer), c.ties))
+        _drop_orphans(closer)
     logger.info("loops: %s", closer.ledger.counts() or "no candidates")
     return closer
 
 
-def _believed(closer: LoopCloser, submaps: Sequence[Submap]) -> set[Entry]:
-    """Entries of the front end that are in the graph, by numbers of submaps."""
-    number = {s.key: k for k, s in enumerate(submaps)}
-    ends = [closer.loops[n].submaps for n in closer.accepted if closer.loops[n].source == FRONT_END]
-    return {(number[a], number[b]) for a, b in ends}
+def _believed(closer: LoopCloser) -> set[Entry]:
+    """Entries of the front end that are in the graph, by keys of submaps."""
+    inside = (closer.loops[n] for n in closer.accepted)
+    return {x.submaps for x in inside if x.source == FRONT_END}
 
 
-def _drop_orphans(closer: LoopCloser, submaps: Sequence[Submap]) -> None:
+def _drop_orphans(closer: LoopCloser) -> None:
     """Ties whose entry was switched off, perhaps by their company, go too."""
-    believed = _believed(closer, submaps)
+    believed = _believed(closer)
     for n in closer.accepted:
-        by = closer.loops[n].gates.get("entries", ())
-        if any((int(a), int(b)) not in believed for a, b in by):
+        if not ties_entries(closer.loops[n].gates) <= believed:
             closer.undo(n, "the match by which it is in that map is not believed")
