@@ -10,7 +10,9 @@ from typing import Any
 
 from graphslam.app.config import read_toml
 from graphslam.core.errors import DataError, FormatError, RunFolderError
+from graphslam.graph.loop_candidates import FRONT_END
 from graphslam.graph.loop_ledger import Decision, LoopLedger
+from graphslam.graph.loop_ties import ties_entries
 
 DECIDED = "decided on with all loops"
 """Why a factor of a front end's match is taken out where it is a loop among others from then on."""
@@ -88,7 +90,7 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
         j=int(e.get("j", -1)),
         submap_i=int(e.get("target", -1)),
         submap_j=int(e.get("submap", -1)),
-        source="front-end",
+        source=FRONT_END,
         score=support,
         gates={"fitness": figure("fitness")},
         weight=math.nan if taken and not gone else 0.0,
@@ -154,7 +156,7 @@ def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None
 
 
 def redo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
-    """Take in again a loop that :func:`undo_loop` took out; others that were undone stay so.
+    """Take in again a loop that :func:`undo_loop` took out, a match with its ties; others that were undone stay so.
 
     Parameters and errors are those of :func:`undo_loop`.
     """
@@ -162,7 +164,11 @@ def redo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None
     d = before.of(loop)
     if d.verdict != "undone":
         raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
-    return _without(folder, [x for x in undone_of_run(folder) if x.loop != loop], source, progress)
+    entry = (d.submap_i, d.submap_j)
+    gone = [x for x in undone_of_run(folder) if x.loop != loop]
+    if d.source == FRONT_END:
+        gone = [x for x in gone if entry not in ties_entries(x.gates)]
+    return _without(folder, gone, source, progress)
 
 
 def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path | None, progress: bool) -> LoopLedger:
