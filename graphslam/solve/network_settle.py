@@ -58,8 +58,6 @@ NEAR, LARGEST = 4, 40
 TESTED, COLUMNS = 300, 400
 # Rounds of accepting and refusing; steps of a solve between two of them.
 ROUNDS, STEPS = 15, 20
-# Refused ones are tried whose first-order χ² is within so many times the limit.
-NEARLY = 10.0
 # In a round only what is within this factor of the worst is taken out: one wrong loop makes its neighbours look bad.
 WORST = 0.25
 # The tail is told by this share of the accepted loops, with the weight of so many more of a tail index in between that
@@ -300,7 +298,7 @@ def settle(
     limit, scale, rounds = limit.copy(), 0.0, 0
     dull = float(stats.chi2.ppf(DULL, d))
     seen: set[bytes] = set()
-    back, tried = False, np.zeros(m, dtype=np.bool_)
+    back = False
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
     for rounds in range(1, ROUNDS + 1):
         problem = BatchProblem(network, inliers)
@@ -341,10 +339,6 @@ def settle(
         if len(good):
             alone, group, _ = loop_evidence(network, inliers, good, arrays, accepted=False)
             fresh[good[np.maximum(alone, group) <= limit[good]]] = True
-        if (fresh == inliers).all():
-            # … and its χ² is only of first order there: what comes near is tried, and judged from inside
-            near = outside[(against[outside] <= NEARLY * limit[outside]) & ~tried[outside]]
-            fresh[near] = tried[near] = True
         if (fresh == inliers).all() or rounds == ROUNDS:
             break
         back = fresh.tobytes() in seen
