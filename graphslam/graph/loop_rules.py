@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
 from graphslam.graph.noise import Robust
@@ -41,6 +42,30 @@ class LoopGraph(Protocol):
     def chi2(self) -> dict[int, float]:
         """``rᵀ P⁻¹ r`` of every factor at the values, without its kernel."""
         ...
+
+
+def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
+    """χ² of a loop that is in a graph against the graph without it: ``rᵀ (R - P)⁻¹ r``.
+
+    Parameters
+    ----------
+    loop : Loop
+    T_ij : (7,) or (3,)
+        Relative pose at the solution with the loop.
+    P : (d, d)
+        Its posterior covariance, right tangent.
+    """
+    g = group_of(loop.T_ij)
+    D = g.between(T_ij, loop.T_ij)
+    A = g.adjoint(D)
+    R = A @ loop.covariance @ A.T
+    e = g.log(D)
+    # in units of R: what of it the graph had to learn from the loop is no test of it
+    L = np.linalg.cholesky(R)
+    y, S = np.linalg.solve(L, e), np.linalg.solve(L, np.linalg.solve(L, P).T)
+    w, V = np.linalg.eigh(0.5 * (S + S.T))
+    left = np.maximum(1.0 - w, 1e-9)
+    return float(np.sum((V.T @ y) ** 2 / left))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,7 +36,7 @@ from graphslam.graph.loop_disputes import CLASH, SHUTS_OUT, disputes, weigh
 from graphslam.graph.loop_ledger import Decision, LoopLedger, Verdict
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
-from graphslam.graph.loop_rules import Judge, LoopConfig, LoopGraph
+from graphslam.graph.loop_rules import Judge, LoopConfig, LoopGraph, chi2_without
 from graphslam.graph.noise import Robust
 from graphslam.registration.submap_pairs import prediction_chi2
 
@@ -167,7 +167,7 @@ class LoopCloser:
                 if n not in inside:
                     left.append((chain[n], n))
             elif n in inside:
-                self._switch_off(n, f"pairwise: {found.reasons[k]}")
+                self.switch_off(n, f"pairwise: {found.reasons[k]}")
             else:
                 self._refuse(n, f"pairwise: {found.reasons[k]}", chain[n])
         tried = [n for _, n in sorted(left)]
@@ -181,8 +181,7 @@ class LoopCloser:
             self._write(n, "rejected", why, chi2=chi2)
 
     def _one_by_one(self, numbers: list[int]) -> None:
-        """Add loops in this order, each against the graph as it is by then."""
-        for n in numbers:
+        for n in numbers:  # each against the graph as it is by then
             verdict, why, facts = self._try(n)
             self._write(n, verdict, why, **facts)
 
@@ -319,7 +318,7 @@ class LoopCloser:
             if not alone[worst] > limit:
                 break
             n = inside[worst]
-            self._switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
+            self.switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
             gone.add(n)
         return gone
 
@@ -340,24 +339,12 @@ class LoopCloser:
         """
         loops = [self.loops[n] for n in numbers]
         T, P = self.graph.relative(np.array([x.i for x in loops]), np.array([x.j for x in loops]))
-        out = np.empty(len(loops))
-        for k, x in enumerate(loops):
-            g = group_of(x.T_ij)
-            D = g.between(T[k], x.T_ij)
-            A = g.adjoint(D)
-            R = A @ x.covariance @ A.T
-            e = g.log(D)
-            # in units of R: what of it the graph had to learn from the loop is no test of it
-            L = np.linalg.cholesky(R)
-            y, S = np.linalg.solve(L, e), np.linalg.solve(L, np.linalg.solve(L, P[k]).T)
-            w, V = np.linalg.eigh(0.5 * (S + S.T))
-            left = np.maximum(1.0 - w, 1e-9)
-            out[k] = float(np.sum((V.T @ y) ** 2 / left))
-        return out
+        return np.array([chi2_without(x, T[k], P[k]) for k, x in enumerate(loops)])
 
     # ---------------------------------------------------------------- writing
 
-    def _switch_off(self, n: int, why: str, chi2: float = math.nan) -> None:
+    def switch_off(self, n: int, why: str, chi2: float = math.nan) -> None:
+        """Take a loop that is in the graph out of it, since something contradicts it, and solve without it."""
         d = self.ledger.of(n)
         before = sum(self.graph.chi2().values())
         self.graph.remove_loop(d.factor_id)

@@ -136,4 +136,4 @@ def _drop_orphans(closer: LoopCloser) -> None:
     believed = _believed(closer)
     for n in closer.accepted:
         if not ties_entries(closer.loops[n].gates) <= believed:
-            closer.undo(n, "the match by which it is in that map is not believed")
+            closer.switch_off(n, "the match by which it is in that map is not believed")

@@ -27,7 +27,7 @@ from graphslam.solve.network_batch import BatchProblem, Polished, polish
 from graphslam.solve.network_consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network_diagnose import check_determined
 from graphslam.solve.network_model import edge_costs, observation_costs, subnetwork
-from graphslam.solve.network_settle import Settled, settle
+from graphslam.solve.network_settle import FEW, Settled, settle
 from graphslam.solve.network_start import chordal_start, landmarks_from, odometry_start
 
 log = logging.getLogger(__name__)
@@ -206,7 +206,8 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
 def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
     """True over stated variance of the loops, at most 1, from the median cost of those believed, after least squares.
 
-    More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then.
+    More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then,
+    and where loops are few.
 
     A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
     left of ``rows``.
@@ -216,7 +217,7 @@ def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believ
     left = max(rows - network.states, 1) / rows
     costs = edge_costs(network, arrays[0])[believed]
     costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
-    if not len(costs):
+    if len(costs) < FEW:
         return 1.0
     return min(1.0, float(np.median(costs)) / (left * float(stats.chi2.median(network.tangent_dim))))
 

@@ -65,6 +65,8 @@ WORST = 0.25
 TAIL, PRIOR, INDEX, BEYOND = 0.05, 5.0, 0.5, 0.5
 # … found by following the tail from the bulk's quantile, in so many steps.
 FOLLOWED, QUANTILE = 50, 0.9999
+# Fewer loops tell neither tail nor scale: the stated noise stands.
+FEW = 30
 # With more loops than this a right one is refused by chance as seldom as with so many, not more often.
 FAMILY = 100
 # After the first round, loops and groups below this quantile, in the scale of the bulk, are not looked at again.
@@ -318,7 +320,8 @@ def settle(
             quantile = family_quantile(probability, len(inside))
             most, scale = tail_limit(single[inside], d, quantile)
             if own_tail:
-                most = min(most, float(stats.chi2.ppf(quantile, d)))
+                stated = float(stats.chi2.ppf(quantile, d))
+                most = min(most, stated) if len(inside) >= FEW else stated
                 limit[:m] = np.where(np.isinf(limit[:m]), np.inf, most)
             bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())
             fresh[inside[bad]] = False

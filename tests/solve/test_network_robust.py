@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import ConfigError
+from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
 from graphslam.io.network_file import read_network
 from graphslam.sim.wrong_loops import add_wrong_loops, is_odometry
@@ -60,6 +61,32 @@ def test_noise_scale_is_found_and_makes_the_choice_independent_of_it(overstated:
     given = solve_network(network, "gnc", noise_scale=1.0 / overstated)
     assert given.inliers is not None
     assert (given.inliers == answer.inliers).all()
+
+
+def test_few_loops_that_agree_too_well_say_nothing_of_the_noise() -> None:
+    """Loops of one entry share their error: the chain fits three of them almost exactly, and a fourth as it states."""
+    net = ring_drive(2)
+    loops = np.flatnonzero(~is_odometry(net.edges))
+    keep = np.zeros(len(net.edges), dtype=bool)
+    keep[~np.isin(np.arange(len(keep)), loops)] = True
+    few = loops[:4]
+    keep[few] = True
+    measurements = net.measurements.copy()
+    poses = solve_network(replace(net, edges=net.edges[keep], measurements=net.measurements[keep],
+                                  information=net.information[keep])).poses  # fmt: skip
+    ends = poses[net.edges[few, 0]], poses[net.edges[few, 1]]
+    measurements[few] = SE2.between(*ends)
+    sigma = np.linalg.inv(net.information[few[-1]])
+    measurements[few[-1]] = SE2.compose(measurements[few[-1]], SE2.exp(1.5 * np.sqrt(np.diag(sigma))))
+    part = replace(net, edges=net.edges[keep], measurements=measurements[keep], information=net.information[keep])
+    answer = solve_network(part, "gnc")
+    assert answer.inliers is not None
+    assert answer.inliers.all()
+    # with as few, one that is wrong is still refused
+    measurements[few[-1]] = SE2.compose(measurements[few[-1]], SE2.exp(60.0 * np.sqrt(np.diag(sigma))))
+    answer = solve_network(replace(part, measurements=measurements[keep]), "gnc")
+    assert answer.inliers is not None
+    assert np.flatnonzero(~answer.inliers[: keep.sum()]).tolist() == [int(np.flatnonzero(keep).tolist().index(few[-1]))]
 
 
 def test_votes_part_right_from_wrong_loops() -> None:
