@@ -7,8 +7,8 @@ covariance does not: that is what drift alone leaves. So places of a path that l
 map become loops of their own: the relative pose of the two in the frame of that map, with the covariance with which a
 map places a body.
 
-In simulated buildings such pairs were off by 0.07 m along, 0.03 to 0.05 m across, 0.02 to 0.03 m in height, and 0.01 rad
-(RMS of 92 within segments and 87 between them), whatever the way between the two. Ties are evidence that was in
+In simulated buildings such pairs were off by 0.07 m along, 0.03 to 0.05 m across, 0.02 to 0.03 m in height, and 0.01
+rad (RMS of 92 within segments and 87 between them), whatever the way between the two. Ties are evidence that was in
 the path already (declared ``shared-scan``): only submaps whose exits state drift as if no ground had been seen twice,
 as those of :mod:`frontends.filter_drift` do, may be given them.
 """
