@@ -17,7 +17,7 @@ import numpy.typing as npt
 from frontends.filter_drift import FilterDrift
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import exit_covariance
-from frontends.segslam.sampling import nearest_step
+from frontends.segslam.sampling import MapSample, nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 from graphslam.core import se3
 from graphslam.core.errors import DataError
@@ -88,6 +88,21 @@ def settled_chain(segmap: SegMap, last: int) -> Ints:
                 return np.array(chain[::-1], np.int64)
             before = int(fits[np.argmax(t.weight[fits])])
         chain.append(before)
+
+
+def sampled_chain(segmap: SegMap, sample: MapSample) -> Ints:
+    """Segments of a full map sample as they follow each other, of whichever particles.
+
+    Raises
+    ------
+    DataError
+        The sample is not full: it has an open segment.
+    """
+    if (sample.segments < 0).any():
+        raise DataError(
+            "a map sample with an open segment is no chain", wanted="a sample from a segment that is closed"
+        )
+    return np.asarray(sample.segments[np.argsort(segmap.table.start[sample.segments])], np.int64)
 
 
 def settle(

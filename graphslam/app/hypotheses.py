@@ -23,7 +23,7 @@ from frontends.filter_drift import FilterDrift
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segmap import KINDS, MATCH, SegMap
-from frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.app.alternatives import CONTRADICTION, Alternative, Choice, built, choose
 from graphslam.app.config import BackEndConfig
 from graphslam.core.errors import ConfigError
@@ -54,6 +54,8 @@ class HypothesesConfig:
 
     most: int = 5
     """Hypotheses that are looked at: topologies by weight, then those that withdraw an entry."""
+    samples: int = 0
+    """Beside them so many map samples, whose segments come from different particles."""
     least_support: float = 0.02
     """Share of the particles' weight below which one is left out."""
     spacing: float = 3.0
@@ -72,7 +74,7 @@ class HypothesesConfig:
     """A graph whose χ² is greater than an honest one's with this probability is no choice while others are."""
 
     def __post_init__(self) -> None:
-        if self.most < 1 or self.placements < 1:
+        if self.most < 1 or self.placements < 1 or self.samples < 0:
             raise ConfigError(f"hypotheses: most = {self.most}, placements = {self.placements}; wanted at least 1")
         if not 0.0 <= self.least_support <= 1.0 or not 0.0 < self.contradiction < 1.0:
             raise ConfigError("hypotheses: least_support and contradiction are probabilities")
@@ -87,10 +89,10 @@ class Hypothesis:
     number : int
         By weight: 0 has most.
     particle : int
-        Whose chain speaks for it: the heaviest.
+        Whose chain speaks for it: the heaviest; -1 of a map sample.
     support : float
         Share of the particles' weight that tells this topology; of one that withdraws an entry, the share that did not
-        make it when it was made.
+        make it when it was made; of a map sample the share that tells the same.
     withdrawn : (int, int) or None
         Keys of the submaps whose entry is withdrawn.
     chain : (m,) int64
@@ -257,8 +259,12 @@ def find_hypotheses(
     for particle, support, chain in kept:
         submaps = settle(result.segmap, chain, drift_by_path(result.segmap, chain, drift), handover)
         told.append(_Told(particle, support, None, chain, submaps, own_evidence_of(result.segmap, chain, submaps)))
+    for chain in _sampled(result, c.samples, [h.chain for h in told]):
+        support = sum(w for _, w, other in found if topology(result.segmap, other) == topology(result.segmap, chain))
+        submaps = settle(result.segmap, chain, drift_by_path(result.segmap, chain, drift), handover)
+        told.append(_Told(-1, support, None, chain, submaps, own_evidence_of(result.segmap, chain, submaps)))
     if c.withdraw:
-        told += _withdrawn(told[0])[: c.most - len(told)]
+        told += _withdrawn(told[0])[: c.most - len(kept)]
     alternatives, ledgers = [], []
     pieces: dict[int, DividedSubmaps] = {}
     for number, h in enumerate(tqdm(told, "hypotheses", disable=not progress, leave=False)):
@@ -284,6 +290,18 @@ def find_hypotheses(
             )
         )  # fmt: skip
     return Hypotheses(tuple(order), choice, len(found) - len(kept))
+
+
+def _sampled(result: SegSlamResult, count: int, known: Sequence[Ints]) -> list[Ints]:
+    """Chains of map samples that are different, and not known yet."""
+    seen = {c.tobytes() for c in known}
+    out = []
+    for number in range(count):
+        chain = sampled_chain(result.segmap, result.sample(number))
+        if chain.tobytes() not in seen:
+            seen.add(chain.tobytes())
+            out.append(chain)
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ from frontends.filter_drift import FilterDrift
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segmap import MATCH, NEW
 from frontends.segslam.segslam import run_segslam
-from frontends.segslam.submaps import settled_chain
+from frontends.segslam.submaps import sampled_chain, settled_chain
 from graphslam.app.hypotheses import HypothesesConfig, Hypothesis, find_hypotheses, topologies, topology
 from graphslam.app.studies.segslam_trial import QUICK, GridTrial
-from graphslam.core.errors import ConfigError
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
@@ -104,6 +104,30 @@ def test_what_is_said_of_them(result: SegSlamResult) -> None:
     assert "one topology" in one.why()
     again = find_hypotheses(result, COURT, CONFIG)
     np.testing.assert_array_equal(again.best.solution.poses, found.best.solution.poses)
+
+
+def test_map_samples_become_graphs_too(trial: GridTrial, result: SegSlamResult) -> None:
+    """Chains of segments of several particles, each different, all solved before they are compared."""
+    few = find_hypotheses(result, COURT, replace(CONFIG, withdraw=False))
+    found = find_hypotheses(result, COURT, replace(CONFIG, withdraw=False, samples=6))
+    sampled = [h for h in found.order if h.particle == -1]
+    assert 1 <= len(sampled) <= 6
+    assert len(found.order) == len(few.order) + len(sampled)
+    assert len({h.chain.tobytes() for h in found.order}) == len(found.order)
+    segmap = result.segmap
+    for h in sampled:
+        bounds = [segmap[int(i)].interval for i in h.chain]
+        assert all(a[1] == b[0] for a, b in pairwise(bounds))
+        assert (bounds[0][0], bounds[-1][1]) == (0, max(b for _, b in bounds))
+        # what a sample stands for is the share of the particles that tell the same
+        assert h.support == pytest.approx(few.order[0].support)
+        path = h.solution.trajectory()
+        assert path.times[-1] == few.best.solution.trajectory().times[-1]
+    assert found.best.clarity.entropy <= few.best.clarity.entropy
+    sample = result.sample(0)
+    assert sorted(sample.segments.tolist()) == sorted(sampled_chain(segmap, sample).tolist())
+    with pytest.raises(DataError, match="open"):
+        sampled_chain(segmap, replace(sample, segments=np.array([*sample.segments[:-1], -1])))
 
 
 def test_impossible_settings() -> None:

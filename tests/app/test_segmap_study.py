@@ -41,13 +41,14 @@ def test_it_is_a_study() -> None:
 
 def test_nothing_fails_and_the_graph_is_better_than_its_chain(table: pd.DataFrame) -> None:
     failed = table[table["quantity"] == "failed"]
-    assert set(failed["algorithm"]) == {"rbpf-5", "segslam-5", "chain", "matches", "ties", "loops", "gps"}
+    assert set(failed["algorithm"]) == {"rbpf-5", "segslam-5", "chain", "matches", "ties", "loops", "gps", "clearest"}
     assert not failed["value"].any()
     closed = [run for run in range(2) if value(table, run, "loops", "loops_taken") > 0]
     assert closed  # in one of them at least the loop of the court is found
     for run in closed:
         assert value(table, run, "loops", "ate_aligned") < 0.7 * value(table, run, "chain", "ate_aligned")
         assert value(table, run, "loops", "entropy_min") < value(table, run, "chain", "entropy_min")
+        assert value(table, run, "clearest", "entropy_min") <= value(table, run, "loops", "entropy_min")
     for run in range(2):
         assert value(table, run, "chain", "chi2_per_dof") < 1e-6  # nothing contradicts a chain
         assert value(table, run, "loops", "loops_taken_right") == value(table, run, "loops", "loops_taken")

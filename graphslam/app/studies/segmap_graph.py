@@ -1,8 +1,8 @@
 """The study ``segmap-graph``: from the SegMap to one globally consistent map, and what of it can be trusted.
 
 Worlds: two garages, the mine, the building; clutter and every sensor error are drawn anew in each run. Algorithms:
-``rbpf-40``, ``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps`` of
-what SegSLAM settled.
+``rbpf-40``, ``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps``,
+``clearest`` of what SegSLAM settled.
 
 Quantities
 ----------
@@ -112,7 +112,7 @@ def gain_table(table: pd.DataFrame) -> pd.DataFrame:
         row["best_sample"] = float(best.mean())
         row["ratio_to_best"] = float(ours.mean() / best.mean())
         row["below_half"] = float(np.mean(ours <= 0.5 * best))
-        clear = tables.values(table, world, "loops", "entropy_min")
+        clear = tables.values(table, world, "clearest", "entropy_min")
         for name in (filters[-1], *rivals):
             other = tables.values(table, world, name, "entropy_min")
             if len(other) == len(clear) > 0:

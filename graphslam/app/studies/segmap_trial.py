@@ -3,7 +3,8 @@
 Beside the filters' own figures (``rbpf-N``, ``segslam-N``: the likeliest map sample) the settled segments become a
 graph, named after what is in it: ``chain``, the exits alone; ``matches``, with the front end's entries into older maps;
 ``ties``, with those along the segments too; ``loops``, also with those that were looked for between the submaps;
-``gps``, the same with fixes. Every loop is decided on, and the decisions are held against the truth.
+``gps``, the same with fixes; ``clearest``, of such graphs of the settled chain and of map samples the one along whose
+path all scans are clearest. Every loop is decided on, and the decisions are held against the truth.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from frontends.segslam.result import SegSlamResult
-from frontends.segslam.submaps import base_of, drift_by_path, settle, settled_chain
+from frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 from graphslam.app.studies.worlds_study import WorldsStudy
@@ -30,6 +31,7 @@ from graphslam.evaluate.montecarlo import Measurement
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loops import LoopCloser
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.maps.entropy import Clarity
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.solution import Solution
@@ -38,7 +40,7 @@ RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
 """A loop is right if it is off by less [m], [rad]: three σ of a good registration, and half a pillar's breadth."""
 
 
-GRAPHS = ("chain", "matches", "ties", "loops", "gps")
+GRAPHS = ("chain", "matches", "ties", "loops", "gps", "clearest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +71,8 @@ class GraphTrialConfig:
     """Of a levelled base, as the exits assume it [rad]."""
     find: FindConfig = field(default_factory=lambda: FindConfig(front_end=True))
     """How loops are looked for and decided on."""
+    samples: int = 8
+    """Map samples that become graphs beside the settled chain."""
     fixes: FixConfig = field(default_factory=FixConfig)
 
 
@@ -111,7 +115,7 @@ class GraphTrial(GridTrial):
         yield Measurement(name, "ate_mean_sample", float(np.mean(errors)))
         submaps = self.submaps(result)
         for kind in GRAPHS:
-            built = self.build(submaps, kind)
+            built = self.build(submaps, kind) if kind != "clearest" else self.clearest(result, submaps)
             yield from self.graph_figures(kind, result, built)
             yield Measurement(kind, "failed", 0.0)
 
@@ -141,6 +145,28 @@ class GraphTrial(GridTrial):
             find = {"matches": replace(few, ties=None), "ties": few}.get(kind, c.find)
             closer = find_loops(graph, solver, submaps, find)
         return BuiltGraph(graph, solver.solution(), closer, perf_counter() - begin)
+
+    def clearest(self, result: SegSlamResult, submaps: Sequence[Submap]) -> BuiltGraph:
+        """Of graphs with all loops, of the settled chain and of map samples, that of least entropy."""
+        segmap = result.segmap
+        found = [self.build(submaps, "loops")]
+        chains = {tuple(int(s.report["segment"]) for s in submaps)}
+        for number in range(self.graph.samples):
+            chain = sampled_chain(segmap, result.sample(number))
+            if tuple(chain.tolist()) not in chains:
+                chains.add(tuple(chain.tolist()))
+                found.append(
+                    self.build(settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift)), "loops")
+                )
+        seconds = sum(b.seconds for b in found)
+        best = min(found, key=lambda b: self.clarity(b).entropy)
+        return replace(best, seconds=seconds)
+
+    def clarity(self, built: BuiltGraph) -> Clarity:
+        """Of all scans along the path of a graph."""
+        at = built.solution.trajectory().interpolate(self.steps.times)
+        model = self.config.filter.beam_model()
+        return judge.clarity(self.steps, at, voxel_size=0.2, model=model, count=self.config.placements)
 
     def fixes(self, dim: int) -> Gps:
         """Fixes along the true path."""
@@ -174,11 +200,8 @@ class GraphTrial(GridTrial):
             yield Measurement(kind, f"nees_{block}_last", float(values[-1]))
         if "legs" in self.config.figures:
             yield Measurement(kind, "leg_angle", self.leg_angle(path.interpolate(self.steps.times)))
-        if "entropy" in self.config.figures and kind in ("chain", "matches", "loops"):
-            at = path.interpolate(self.steps.times)
-            found = judge.clarity(
-                self.steps, at, voxel_size=0.2, model=self.config.filter.beam_model(), count=self.config.placements
-            )
+        if "entropy" in self.config.figures and kind in ("chain", "matches", "loops", "clearest"):
+            found = self.clarity(built)
             yield Measurement(kind, "entropy_min", found.entropy)
             yield Measurement(kind, "known_volume", found.volume)
         if built.closer is not None:
