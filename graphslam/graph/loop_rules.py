@@ -20,6 +20,10 @@ Judge = Callable[[Array, Array, tuple[Ints, Array, Array]], npt.NDArray[np.bool_
 """See :class:`~graphslam.graph.loops.LoopCloser`."""
 
 
+LEARNT = 0.01
+"""Least share of a loop's variance that the graph is taken not to have learnt from it."""
+
+
 class LoopGraph(Protocol):
     """What is asked of a graph that loops are added to."""
 
@@ -54,6 +58,12 @@ def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
         Relative pose at the solution with the loop.
     P : (d, d)
         Its posterior covariance, right tangent.
+
+    Notes
+    -----
+    Where the graph learnt nearly all from the loop, R and P are the same but for what bending the graph changed of P, a
+    few thousandths: their difference says nothing there, and could even be negative. It is taken to be at least
+    ``LEARNT`` of R, which makes the test milder along such directions, never harsher.
     """
     g = group_of(loop.T_ij)
     D = g.between(T_ij, loop.T_ij)
@@ -64,7 +74,7 @@ def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
     L = np.linalg.cholesky(R)
     y, S = np.linalg.solve(L, e), np.linalg.solve(L, np.linalg.solve(L, P).T)
     w, V = np.linalg.eigh(0.5 * (S + S.T))
-    left = np.maximum(1.0 - w, 1e-9)
+    left = np.maximum(1.0 - w, LEARNT)
     return float(np.sum((V.T @ y) ** 2 / left))
 
 

@@ -334,8 +334,8 @@ class LoopCloser:
     def without(self, numbers: Sequence[int]) -> Array:
         """χ² of loops that are in the graph against the graph without them ``(k,)``, each by itself.
 
-        ``rᵀ (R - P)⁻¹ r`` with the residual r and the posterior P of the relative pose. Infinite where nothing but the
-        loop holds the two together and yet it does not fit.
+        ``rᵀ (R - P)⁻¹ r`` with the residual r and the posterior P of the relative pose
+        (:func:`~graphslam.graph.loop_rules.chi2_without`).
         """
         loops = [self.loops[n] for n in numbers]
         T, P = self.graph.relative(np.array([x.i for x in loops]), np.array([x.j for x in loops]))
