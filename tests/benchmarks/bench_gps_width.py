@@ -1,6 +1,6 @@
 """What the width of the kernel on GPS fixes costs and saves: simulated rings in the plane and in space.
 
-    python tests/benchmarks/bench_gps_width.py [--rings 8]
+    python tests/benchmarks/bench_gps_width.py [--rings 8] [--quick]
 
 Ten submaps of twenty steps, a fix of σ = 0.5 m at every step. Clean, or with a fifth of the fixes off by 30 m or 2 m in
 bursts of five that agree with each other. Error at the ends of the submaps, against no kernel and clean fixes.
@@ -75,11 +75,13 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rings", type=int, default=8)
+    parser.add_argument("--quick", action="store_true", help="one ring")
     args = parser.parse_args()
+    rings = 1 if args.quick else args.rings
     for dim in (2, 3):
         rng = np.random.default_rng(4 + dim)
         found: dict[tuple[str, Robust], list[float]] = {}
-        for _ in range(args.rings):
+        for _ in range(rings):
             chain = dense_chain(rng, dim, m=10, steps=20, noise=1.0)
             clean = fixes(chain, rng, dim)
             for name, jump in JUMPS.items():

@@ -1,11 +1,11 @@
 """NEES by block and errors of graphs with and without an IMU, on simulated rings in space.
 
-``python -m tests.benchmarks.bench_imu [RUNS]`` prints the table of the page on the IMU.
+``python -m tests.benchmarks.bench_imu [RUNS] [--quick]`` prints the table of the page on the IMU.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 
@@ -45,5 +45,14 @@ def main(runs: int) -> None:
         print(f"bounds of the mean over {runs} runs, {n} dof: {np.array(chi2_mean_bounds(n, runs, 0.99)) / n}")
 
 
+def command() -> argparse.Namespace:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="?", type=int, default=20)
+    parser.add_argument("--quick", action="store_true", help="one run")
+    return parser.parse_args()
+
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    args = command()
+    main(1 if args.quick else args.runs)

@@ -1,6 +1,6 @@
 """SegSLAM on odometry and scans in the simulated court; an IMU that it did not use in the graph, or not.
 
-``python -m tests.benchmarks.bench_imu_segslam [SEEDS]``
+``python -m tests.benchmarks.bench_imu_segslam [SEEDS] [--quick]``
 
 ``level``: odometry whose roll and pitch follow gravity within 3 mrad; ``walk``: they walk, and nothing tells the drift
 model of the front end so.
@@ -8,7 +8,7 @@ model of the front end so.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from typing import Any
 
@@ -72,5 +72,14 @@ def main(seeds: int) -> None:
                 print(f"{kind} {seed} imu {use}: {len(r.submaps)} submaps, {words}", flush=True)
 
 
+def command() -> argparse.Namespace:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seeds", nargs="?", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="one seed")
+    return parser.parse_args()
+
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
+    args = command()
+    main(1 if args.quick else args.seeds)
