@@ -125,6 +125,7 @@ def solve_choice(
     config: cfg.BackEndConfig,
     *,
     loops: Sequence[Decision] = (),
+    decided: Sequence[Decision] = (),
     fixes: Gps | None = None,
     gps: cfg.GpsConfig | None = None,
 ) -> BackEnd:
@@ -138,16 +139,22 @@ def solve_choice(
         The run's.
     loops : sequence of Decision
         With their measurements; those that are chosen become factors as they were in the run.
+    decided : sequence of Decision
+        Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
     fixes, gps
         See :func:`graphslam.app.alternatives.built`.
     """
     bare = []
+    # two matches of one pair of submaps are told apart by their support
+    as_loops = {(d.submap_j, d.submap_i, round(d.score, 9)): d for d in decided}
+    taken = [d for d in loops if (LOOP, d.loop) in chosen]
     for s in submaps:
-        kept: tuple[Match, ...] = tuple(m for i, m in enumerate(s.matches) if (s.key, i) in chosen)
+        wanted = {(s.key, m.target, round(m.support, 9)): m for i, m in enumerate(s.matches) if (s.key, i) in chosen}
+        taken += [as_loops[k] for k in wanted if k in as_loops]
+        kept: tuple[Match, ...] = tuple(m for k, m in wanted.items() if k not in as_loops)
         bare.append(replace(s, matches=kept, grid=None))
     back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps)
     back.solver.solve_to_optimum()
-    taken = [d for d in loops if (LOOP, d.loop) in chosen]
     if taken:
         graph = GraphLoops(back.graph, back.solver)
         for d in taken:
@@ -189,6 +196,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
+    decided = [d for d in ledger if d.verdict == "accepted" and d.source == FRONT_END and d.T_ij]
     undone = frozenset((d.submap_j, d.submap_i) for d in ledger if d.verdict != "accepted" and d.source == FRONT_END)
     every = choices_of_matches(run.submaps, config.match_support, loops=loops, undone=undone)
     choices = dict(list(every.items())[:MOST])
@@ -196,7 +204,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
         logger.warning("%d of %d choices of matches and loops are solved", MOST, len(every))
     alternatives = []
     for name, chosen in tqdm(choices.items(), desc="choices", unit="graph", disable=not progress):
-        back = solve_choice(run.submaps, chosen, config, loops=loops, fixes=run.fixes, gps=gps)
+        back = solve_choice(run.submaps, chosen, config, loops=loops, decided=decided, fixes=run.fixes, gps=gps)
         solution = back.finish()
         poses = solved_poses(made.divided, _nodes(run, solution))
         alternatives.append(Alternative(name, back.graph, solution, Candidate(made.divided.pieces, poses, name)))
