@@ -193,9 +193,7 @@ class BackEnd:
             self.graph.remove(fid, reason=DECIDED)
         self.solver.solve_to_optimum()
         config = FindConfig(
-            candidates=CandidateConfig(
-                overlap=c.loop_overlap, height=c.loop_height, least_support=max(c.match_support, 1e-9)
-            ),
+            candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
             appearance=AppearanceConfig() if c.loop_appearance else None,
             front_end=True,
             ties=TieConfig() if c.loop_ties else None,

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 from tqdm import tqdm
 
 from graphslam.app import config as cfg
@@ -32,7 +31,6 @@ from graphslam.graph.loop_ledger import Decision
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_rules import LoopConfig
 from graphslam.graph.loop_ties import ties_entries
-from graphslam.graph.noise import Robust
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.solve.graph_loops import GraphLoops
 from graphslam.solve.solution import Solution
@@ -149,18 +147,22 @@ def solve_choice(
     as_loops = {(d.submap_j, d.submap_i, round(d.score, 9)): d for d in decided}
     taken = [d for d in loops if (LOOP, d.loop) in chosen]
     for s in submaps:
-        wanted = {(s.key, m.target, round(m.support, 9)): m for i, m in enumerate(s.matches) if (s.key, i) in chosen}
-        taken += [as_loops[k] for k in wanted if k in as_loops]
-        kept: tuple[Match, ...] = tuple(m for k, m in wanted.items() if k not in as_loops)
-        bare.append(replace(s, matches=kept, grid=None))
+        kept: list[Match] = []
+        for m in (m for i, m in enumerate(s.matches) if (s.key, i) in chosen):
+            loop = as_loops.get((s.key, m.target, round(m.support, 9)))
+            if loop is None:
+                kept.append(m)
+            else:
+                taken.append(loop)
+        bare.append(replace(s, matches=tuple(kept), grid=None))
     back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps)
     back.solver.solve_to_optimum()
     if taken:
         graph = GraphLoops(back.graph, back.solver)
         for d in taken:
             C = np.array(d.covariance)
-            kernel = Robust("huber", math.sqrt(float(stats.chi2.ppf(LoopConfig().kernel, len(C)))))
-            graph.add_loop(Loop(i=d.i, j=d.j, T_ij=np.array(d.T_ij), covariance=C, source=d.source), kernel)
+            measured = Loop(i=d.i, j=d.j, T_ij=np.array(d.T_ij), covariance=C, source=d.source)
+            graph.add_loop(measured, LoopConfig().robust(len(C)))
     return back
 
 

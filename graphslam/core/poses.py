@@ -167,3 +167,12 @@ def pose_scatter(poses: ArrayLike, about: ArrayLike, weights: ArrayLike | None =
     w = normalised(weights, len(p))
     e = group.log(group.between(np.broadcast_to(about, p.shape), p))
     return np.asarray((w[:, None] * e).T @ e)
+
+
+def chained(increments: Array) -> Array:
+    """Poses of nodes in the frame of the first ``(n + 1, 7|3)``; given, that of each in the one before ``(n, 7|3)``."""
+    g = group_of(increments)
+    poses = [g.identity]
+    for T in increments:
+        poses.append(g.compose(poses[-1], T))
+    return np.stack(poses)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
@@ -94,6 +96,10 @@ class LoopConfig:
     """A loop is switched off that the graph without it would refuse with this confidence."""
     earlier: float = 0.9999
     """… or that raises the χ² of earlier factors by more than this quantile of its own."""
+
+    def robust(self, dof: int) -> Robust:
+        """The kernel of loops in the graph."""
+        return Robust("huber", math.sqrt(float(stats.chi2.ppf(self.kernel, dof))))
 
     def __post_init__(self) -> None:
         for f in fields(self):

@@ -392,7 +392,7 @@ class LoopCloser:
         )
 
     def _kernel(self) -> Robust:
-        return Robust("huber", math.sqrt(float(stats.chi2.ppf(self.config.kernel, self._dof))))
+        return self.config.robust(self._dof)
 
 
 def found_why(chi2: float, dof: int) -> str:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import group_of
+from graphslam.core.poses import chained, group_of
 from graphslam.solve.network_batch import BatchProblem
 from graphslam.solve.network_robust import truncated_least_squares
 
@@ -49,15 +49,13 @@ def settled_loops(
     out = np.ones(len(ends), dtype=np.bool_)
     if not asked.any():
         return out
-    poses = [g.identity]
-    for T in increments:
-        poses.append(g.compose(poses[-1], T))
+    poses = chained(increments)
     n = len(poses)
     steps = np.arange(n - 1)
     network = PoseNetwork(
         dim=g.dim,
         ids=np.arange(n),
-        poses=np.stack(poses),
+        poses=poses,
         has_initial=np.ones(n, dtype=np.bool_),
         edges=np.concatenate([np.stack([steps, steps + 1], 1), ends[asked]]).astype(np.intp),
         measurements=np.concatenate([increments, loops[1][asked]]),

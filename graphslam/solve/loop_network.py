@@ -16,7 +16,7 @@ from graphslam.core.errors import DataError, IndeterminateError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import group_of
+from graphslam.core.poses import chained, group_of
 from graphslam.graph.loop_measure import Loop
 from graphslam.graph.loop_places import Ints
 from graphslam.graph.noise import Robust
@@ -49,10 +49,7 @@ class LoopNetwork:
         g = group_of(increments)
         for k, P in enumerate(covariances):
             check_covariance(P, what=f"covariance of increment {k}", dim=g.dof)
-        poses = [g.identity]
-        for T in increments:
-            poses.append(g.compose(poses[-1], T))
-        self._poses = np.stack(poses)
+        self._poses = chained(increments)
         n = len(increments)
         self._ends = [(k, k + 1) for k in range(n)]
         self._measured = [T.copy() for T in increments]

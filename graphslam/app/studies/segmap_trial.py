@@ -114,8 +114,10 @@ class GraphTrial(GridTrial):
         yield Measurement(name, "ate_best_sample", min(errors))
         yield Measurement(name, "ate_mean_sample", float(np.mean(errors)))
         submaps = self.submaps(result)
+        made: dict[str, BuiltGraph] = {}
         for kind in GRAPHS:
-            built = self.build(submaps, kind) if kind != "clearest" else self.clearest(result, submaps)
+            built = self.clearest(result, submaps, made["loops"]) if kind == "clearest" else self.build(submaps, kind)
+            made[kind] = built
             yield from self.graph_figures(kind, result, built)
             yield Measurement(kind, "failed", 0.0)
 
@@ -146,10 +148,10 @@ class GraphTrial(GridTrial):
             closer = find_loops(graph, solver, submaps, find)
         return BuiltGraph(graph, solver.solution(), closer, perf_counter() - begin)
 
-    def clearest(self, result: SegSlamResult, submaps: Sequence[Submap]) -> BuiltGraph:
-        """Of graphs with all loops, of the settled chain and of map samples, that of least entropy."""
+    def clearest(self, result: SegSlamResult, submaps: Sequence[Submap], loops: BuiltGraph) -> BuiltGraph:
+        """Of graphs with all loops, that of the settled chain and those of map samples, the one of least entropy."""
         segmap = result.segmap
-        found = [self.build(submaps, "loops")]
+        found = [loops]
         chains = {tuple(int(s.report["segment"]) for s in submaps)}
         for number in range(self.graph.samples):
             chain = sampled_chain(segmap, result.sample(number))
