@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from graphslam.app import config as cfg
-from graphslam.app.terminal import emit, table
+from graphslam.app.terminal import emit, table, verdict_text
 
 JSON = typer.Option(False, "--json", help="One JSON object on stdout, nothing else there.")
 
@@ -49,7 +49,8 @@ def run(
         progress=not as_json,
     )
     rows = result.metrics.to_dict("records")
-    value, text = {"out": str(out), "metrics": rows, "report": result.report}, _summary(result, out)
+    value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
+    text = _summary(result, out)
     if saved:
         from graphslam.app.continue_run import continue_runs
 
@@ -76,6 +77,7 @@ def _summary(result: Any, out: Path) -> str:
     if chi2 is not None and not 0.7 < chi2 < 1.4:
         scale = result.report["covariance_scale"] * chi2
         lines.append(f"note: join χ²/dof is {chi2:.2f}, not 1: try --set backend.covariance_scale={scale:.2g}")
+    lines += ["", *verdict_text(result.verdict), ""]
     lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
     return "\n".join(lines)
 
@@ -93,11 +95,13 @@ def demo(
     rows = result.metrics.to_dict("records")
     text = (
         f"{table(rows, ['key', 'value', 'unit'])}"
+        f"\n\n{chr(10).join(verdict_text(result.verdict))}"
         f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
         f"\nreport: {out / 'report.html'}"
         f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"
     )
-    emit({"out": str(out), "metrics": rows, "report": result.report}, text, as_json=as_json)
+    value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
+    emit(value, text, as_json=as_json)
 
 
 def simulate(

@@ -167,6 +167,7 @@ nav a { margin-right: 0.9rem; white-space: nowrap; }
 table { border-collapse: collapse; font-size: 0.86rem; } .wide { overflow-x: auto; margin: 0.4rem 0; }
 th, td { text-align: left; vertical-align: top; padding: 0.15rem 0.7rem 0.15rem 0; border-bottom: 1px solid #e3e3e3; }
 th { font-weight: 600; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
+.headline { font-size: 1.1rem; font-weight: 600; } .headline.bad { color: #b04a00; }
 .verdict { list-style: none; padding: 0; } .verdict li { padding: 0.25rem 0.6rem; border-left: 5px solid #6b6b6b;
   margin: 0.25rem 0; background: #f6f6f6; }
 .verdict li.good { border-color: #009e73; } .verdict li.look { border-color: #e69f00; }

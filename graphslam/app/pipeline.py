@@ -39,10 +39,13 @@ from graphslam.app.reckoning import dead_reckoning
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.run_maps import RunMap, has_grids, make_run_map, sensor_reach
+from graphslam.app.stream_use import stream_use
 from graphslam.app.threads import one_blas_thread
+from graphslam.app.verdict import Figures, observed, verdict
 from graphslam.app.versions import versions
 from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.findings import verdict_json
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -309,11 +312,17 @@ def _judge(
     }
     if why_not:
         report["map_left_out"] = why_not
+    used = frozenset().union(*(s.uses for s in submaps))
+    streams = stream_use(log, back.graph, settings, {**log.dropped, **drops.counts}, used)
+    report["streams"] = [s.as_row() for s in streams]
+    metrics = out.table()
+    figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
+    report["verdict"] = verdict_json([*observed(streams, settings), *verdict(figures)])
     return Run(
         name=log.name,
         submaps=identified,
         map=global_map,
-        metrics=out.table(),
+        metrics=metrics,
         report=report,
         events=list(back.graph.events),
         ledger=back.graph.ledger.table(),

@@ -12,7 +12,7 @@ from graphslam.app.report_figures import figures
 from graphslam.app.report_folder import Kind, read_folder
 from graphslam.app.report_loops import hypotheses, loops
 from graphslam.app.report_sections import events, evidence, graph, metrics, problems, records, times, what_was_run
-from graphslam.app.report_verdict import verdict
+from graphslam.app.report_verdict import verdict_lines
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
 
@@ -69,7 +69,7 @@ def make_report(folder: str | Path) -> Report:
     """
     found = read_folder(folder)
     title = f"{_TITLES[found.kind]}: {found.name}"
-    head = [element("h1", title), verdict(found)]
+    head = [element("h1", title), verdict_lines(found)]
     links = element("nav", *(element("a", name, href=f"#{name}") for name in _PARTS))
     made = [part(found) for part in _PARTS.values()]
     foot = note(

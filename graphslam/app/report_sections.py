@@ -27,7 +27,8 @@ from graphslam.app.markup import (
     table,
 )
 from graphslam.app.report_folder import ReportFolder
-from graphslam.app.report_verdict import CONFIDENCE, class_rows, stopped
+from graphslam.app.report_verdict import figures_of, stopped
+from graphslam.app.verdict import CONFIDENCE, class_rows
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.ledger import EXCLUSIVE
 
@@ -181,7 +182,7 @@ def graph(folder: ReportFolder) -> Markup:
     parts: list[Any] = [pairs(facts)]
     if not g:
         parts.append(missing("numbers of nodes and factors; the folder does not say them."))
-    rows = class_rows(folder)
+    rows = class_rows(figures_of(folder))
     if not rows:
         return section("graph", "Graph", *parts, missing("χ² by kind of factor."))
     columns = {

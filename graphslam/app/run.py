@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from graphslam.core.findings import Finding, findings_of_json
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
@@ -137,6 +138,11 @@ class Run:
         KeyError
         """
         return metric_value(self.metrics, key)
+
+    @property
+    def verdict(self) -> list[Finding]:
+        """What the run says of itself: is it solved, honest, whole, and was everything used that was asked for."""
+        return findings_of_json(self.report.get("verdict"))
 
     def plot(self, ax: Any = None) -> Any:
         """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""

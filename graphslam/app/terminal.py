@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from graphslam.app.run_folder import finite
+from graphslam.core.findings import Finding, headline
 
 
 def emit(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:
@@ -26,6 +27,11 @@ def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = Non
     cells = [names] + [[_cell(r.get(n)) for n in names] for r in rows]
     widths = [max(len(c[k]) for c in cells) for k in range(len(names))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths)).rstrip() for line in cells)
+
+
+def verdict_text(findings: Sequence[Finding]) -> list[str]:
+    """Lines of a verdict: the headline, then each finding behind its level."""
+    return [f"verdict: {headline(findings).text}", *(f"  {f.level or '-':4}  {f.text}" for f in findings)]
 
 
 def _cell(value: Any) -> str:

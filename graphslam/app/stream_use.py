@@ -1,0 +1,100 @@
+"""What became of every stream of a log in a run: records offered, records used, and why the others were not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from graphslam.app.config import RunConfig
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Gps
+from graphslam.graph.pose_graph import PoseGraph
+
+Role = Literal["input", "gps", "imu", "unused"]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamUse:
+    """What became of one stream.
+
+    Parameters
+    ----------
+    name : str
+    role : {"input", "gps", "imu", "unused"}
+        What it was there for: ``input`` of the front end; GPS or IMU of the graph; or nothing in this run.
+    offered : int
+        Records that the log holds.
+    used : int
+        Records whose time and stream a factor spends (the ledger).
+    asked : bool
+        The configuration asks for it by a setting of its own.
+    why : str
+        Why records were not used; empty where all were.
+    """
+
+    name: str
+    role: Role
+    offered: int
+    used: int
+    asked: bool
+    why: str = ""
+
+    def in_words(self) -> str:
+        """``laser 7249 of 7249``."""
+        return f"{self.name} {self.used} of {self.offered}"
+
+    def as_row(self) -> dict[str, Any]:
+        """JSON object for ``run.json``."""
+        return {k: getattr(self, k) for k in ("name", "role", "offered", "used", "asked", "why")}
+
+
+def stream_use(
+    log: SensorLog, graph: PoseGraph, settings: RunConfig, dropped: Mapping[str, int], streams_used: frozenset[str]
+) -> list[StreamUse]:
+    """Use of every stream of a log.
+
+    Parameters
+    ----------
+    log : SensorLog
+    graph : PoseGraph
+        Finished; its ledger says what was spent.
+    settings : RunConfig
+    dropped : mapping of str to int
+        Records dropped by the front end and the graph, per ``"stream: reason"``.
+    streams_used : frozenset of str
+        Streams that the submaps say they used.
+    """
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for e in graph.ledger.entries():
+        spans.setdefault(e.stream, []).append((e.t_start, e.t_end))
+    out = []
+    for name, stream in log.streams.items():
+        times = np.asarray(stream.times, dtype=np.float64)
+        lost = {k.partition(": ")[2]: n for k, n in dropped.items() if k.startswith(f"{name}: ")}
+        spent = np.zeros(len(times), dtype=np.bool_)
+        for a, b in spans.get(name, []):
+            i, j = np.searchsorted(times, a, "left"), np.searchsorted(times, b, "right")
+            spent[i:j] = True
+        used = int(spent.sum())
+        role: Role = "unused"
+        asked, why = False, ""
+        if name in streams_used:
+            role = "input"
+        elif isinstance(stream, Gps):
+            asked = settings.gps.use != "none"
+            role, why = "gps", "" if asked else "gps.use is none"
+        elif isinstance(stream, Imu):
+            asked = settings.imu.use == name or settings.imu.use == "auto"
+            role, why = "imu", "" if asked else "imu.use is none"
+        if used < len(times) and not why:
+            reasons = [f"{n} {k}" for k, n in lost.items()]
+            outside = len(times) - used
+            if outside and role != "unused":
+                reasons.append(f"{outside} at times that no factor spends")
+            why = ", ".join(reasons) or ("nothing in this run reads it" if role == "unused" else "")
+        out.append(StreamUse(name, role, len(times), used, asked, why))
+    return out

@@ -1,0 +1,245 @@
+"""The verdict of a run: is it solved, is it honest, is it whole, and was everything used that was asked for.
+
+"Reported" means: a line here. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
+shows them. What follows from the stored figures is worked out anew wherever it is shown (:func:`stated`); what only the
+run itself saw (:func:`observed`) is read from ``run.json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from graphslam.app.config import RunConfig
+from graphslam.app.stream_use import StreamUse
+from graphslam.core.findings import Finding, Level, findings_of_json
+from graphslam.evaluate.without_truth import two_sided
+
+CONFIDENCE = 0.95
+CERTAIN = 0.999
+"""A test that an honest run fails less often than once in a thousand runs is no accident."""
+IN_WORDS = {
+    "consistent": "inside them: the errors are as large as the covariances say",
+    "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
+    "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
+}
+SMALL_GAP = 1e-6
+"""Of the objective: an objective above the optimum by less is at it."""
+MOSTLY = 0.95
+"""Share of the records of a stream below which the verdict asks to look at what became of the others."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the figures of a finished run are read from, in memory or from its folder.
+
+    Parameters
+    ----------
+    report : mapping
+        ``run.json`` or ``merge.json``.
+    metrics : mapping of str to float
+    events : sequence of mapping
+    sessions : sequence of mapping
+        Of a merge.
+    """
+
+    report: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    events: Sequence[Mapping[str, Any]] = ()
+    sessions: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+
+    def part(self, name: str) -> Mapping[str, Any]:
+        """A mapping inside the report; empty where it is none."""
+        found = self.report.get(name)
+        return found if isinstance(found, Mapping) else {}
+
+
+def verdict(figures: Figures) -> list[Finding]:
+    """All lines of a finished run.
+
+    Lines that the run saw itself are those of ``report["verdict"]`` that do not follow from the figures.
+    """
+    return stated(figures) + [f for f in findings_of_json(figures.report.get("verdict")) if f.code not in _STATED]
+
+
+def stated(figures: Figures) -> list[Finding]:
+    """Lines that follow from the stored figures."""
+    return [
+        _state(figures),
+        _chi2(figures),
+        *_nees(figures),
+        *_tests(figures),
+        _certificate(figures),
+        *_left_out(figures),
+    ]
+
+
+_STATED = frozenset(
+    {"state", "chi2", "nees", "consistency-test", "certificate", "map-left-out", "flagged", "imu-axes"}
+    | {"imu-contradicted", "session"}
+)
+
+
+def observed(streams: Sequence[StreamUse], settings: RunConfig) -> list[Finding]:
+    """Lines on what became of every stream.
+
+    Parameters
+    ----------
+    streams : sequence of StreamUse
+    settings : RunConfig
+        Says which streams were asked for.
+    """
+    counts = "; ".join(s.in_words() for s in streams)
+    out = [Finding("", "streams", f"Records used of those offered: {counts}.")] if streams else []
+    for s in streams:
+        if s.used == 0 and s.asked:
+            out.append(Finding("bad", f"{s.role}-not-used", f"{s.name} was asked for and not used: {s.why}."))
+        elif s.used == 0 and s.role == "input":
+            text = f"Nothing of {s.name} was used ({s.offered} records): {s.why}."
+            out.append(Finding("look", "stream-not-used", text))
+        elif s.role == "input" and s.used < MOSTLY * s.offered:
+            out.append(Finding("look", "stream-part-used", f"Only {s.in_words()}: {s.why}."))
+    return out
+
+
+def class_rows(figures: Figures) -> list[dict[str, Any]]:
+    """χ² of each class of factors with its bounds: from the report, or as far as metrics of older runs hold it."""
+    found = figures.part("graph").get("classes")
+    if isinstance(found, list):
+        return [r for r in found if isinstance(r, dict)]
+    m = figures.metrics
+    out = []
+    for key, ratio in m.items():
+        if not (key.startswith("honesty_") and key.endswith("_chi2_per_dof")):
+            continue
+        stem = key.removesuffix("_chi2_per_dof")
+        dof = m.get(f"{stem}_dof", math.nan)
+        row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
+        if dof > 0:
+            row["low"], row["high"], row["verdict"] = two_sided(ratio, dof, CONFIDENCE)
+        out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
+    return out
+
+
+def whole_chi2(figures: Figures) -> tuple[float, float] | None:
+    """χ² and degrees of freedom of all classes that have any; None where that is not known."""
+    rows = [r for r in class_rows(figures) if number(r.get("dof")) and number(r.get("chi2_per_dof"))]
+    dof = sum(float(r["dof"]) for r in rows)
+    return (sum(float(r["chi2"]) for r in rows if number(r.get("chi2"))), dof) if dof > 0 else None
+
+
+def bounded(ratio: float, dof: float) -> tuple[str, Level]:
+    """A ratio with its bounds in words, and the level of its line."""
+    low, high, said = two_sided(ratio, dof, CONFIDENCE)
+    text = f"{ratio:.3g}, {CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({dof:.4g} degrees of freedom); "
+    return text + IN_WORDS[said], "good" if said == "consistent" else "bad" if said == "over-confident" else "look"
+
+
+def number(value: Any) -> bool:
+    """Is it a finite number?"""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _state(figures: Figures) -> Finding:
+    m = figures.metrics
+    converged = figures.report.get("converged", m.get("converged"))
+    if converged is None:
+        return Finding("bad", "state", "Whether it is solved is not known: the folder does not say.")
+    if not converged:
+        return Finding("bad", "state", "Not solved: the graph is not at its optimum.")
+    objective, gap = m.get("objective", m.get("join_chi2")), m.get("gap")
+    value = "" if objective is None else f", objective {objective:.6g} (Σ rᵀ P⁻¹ r)"
+    if gap is None:
+        text = f"Solved: at the optimum by the solver's own test{value}; no gap to a batch solution was measured."
+        return Finding("good", "state", text)
+    scale = max(abs(objective or 0.0), 1.0)
+    small = gap <= SMALL_GAP * scale
+    text = "no higher than" if small else f"{gap:.3g} above"
+    return Finding(
+        "good" if small else "look",
+        "state",
+        f"Solved: at the optimum{value}, {text} what a batch solution reaches from there.",
+    )
+
+
+def _chi2(figures: Figures) -> Finding:
+    found = whole_chi2(figures)
+    if found is None:
+        text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
+        return Finding("", "chi2", text)
+    chi2, dof = found
+    text, level = bounded(chi2 / dof, dof)
+    return Finding(level, "chi2", f"χ²/dof of the whole graph: {text}.")
+
+
+def _nees(figures: Figures) -> list[Finding]:
+    m = dict(figures.metrics)
+    judged = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
+    bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
+    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
+        m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
+        judged += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
+    out: list[Finding] = []
+    for key, gauge in judged:
+        if number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0:
+            text, level = bounded(m[f"{key}_per_dof"], m[f"{key}_dof"])
+            line = f"NEES/dof against the truth ({gauge}): {text}. One run: a sample, not a proof."
+            out.append(Finding(level, "nees", line))
+    none = "No truth was known, or none to compare with: nothing is said of the true error."
+    return out or [Finding("", "nees", none)]
+
+
+def _tests(figures: Figures) -> list[Finding]:
+    """Tests without truth that an honest run hardly ever fails; those that it passes are in the metrics."""
+    out: list[Finding] = []
+
+    def judge(what: str, value: Any, dof: Any, cause: str) -> None:
+        if not (number(value) and number(dof) and dof > 0):
+            return
+        high = two_sided(float(value), float(dof), CERTAIN)[1]
+        if value > high:
+            limit = f"an honest run exceeds {high:.3g} less than once in a thousand runs"
+            out.append(Finding("bad", "consistency-test", f"{what} is {value:.3g}, and {limit}: {cause}"))
+
+    for row in class_rows(figures):
+        cause = "these measurements contradict the others, or state too little noise."
+        judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), row.get("dof"), cause)
+    m = figures.metrics
+    cause = (
+        "submaps that saw the same landmarks disagree by more than they say; noise, mounting or association is wrong."
+    )
+    judge("Disagreement of loops over its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
+    return out
+
+
+def _certificate(figures: Figures) -> Finding:
+    found = figures.report.get("certificate")
+    if found is None:
+        text = "Whether the optimum is the global one is not known: no certificate was asked for."
+        return Finding("", "certificate", text)
+    text = str(found.get("verdict", found) if isinstance(found, Mapping) else found)
+    return Finding("good" if text.startswith("certified") else "look", "certificate", f"Global optimum: {text}")
+
+
+def _left_out(figures: Figures) -> list[Finding]:
+    out: list[Finding] = []
+    if figures.report.get("map_left_out"):
+        out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
+    flagged = figures.part("flagged_submaps").get("any", 0)
+    if number(flagged) and flagged:
+        out.append(Finding("look", "flagged", f"{flagged:g} of the submaps were flagged by the front end."))
+    for e in figures.events:
+        if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
+            out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))
+        if e.get("event") == "imu-contradicted":
+            text = f"IMU {e.get('stream', '')}".strip()
+            line = f"{text} and submaps contradict each other: one of them states too little noise."
+            out.append(Finding("bad", "imu-contradicted", line))
+    for s in figures.sessions:
+        common, rejected = s.get("common_landmarks"), s.get("rejected")
+        if isinstance(common, int) and isinstance(rejected, int) and rejected > common:
+            text = f"{common} common landmarks agree, {rejected} do not: it may not be the same place."
+            out.append(Finding("bad", "session", f"Session {s.get('name')}: {text}"))
+    return out
