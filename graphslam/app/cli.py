@@ -5,6 +5,7 @@ Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 
@@ -71,15 +72,44 @@ def main() -> None:
     """Entry point ``graphslam``."""
     try:
         app()
-    except GraphSlamError as error:
-        typer.echo(f"graphslam: {' '.join(str(error).split())}", err=True)
-        sys.exit(1)
     except BrokenPipeError:  # `graphslam … | head`
         sys.stderr.close()
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("graphslam: interrupted", err=True)
+    except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
+        typer.echo(f"graphslam: {one_line(error)}", err=True)
+        _drop_output()
         sys.exit(1)
+
+
+def one_line(error: BaseException) -> str:
+    """What a user reads of an error: ours as they are, those of the machine with what can be done."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, MemoryError):  # NumPy says how much was asked for
+        return f"not enough memory; use a smaller part of the data, or another machine. {error}".strip()
+    if isinstance(error, RecursionError):
+        return "something is nested too deeply to be followed; look for a damaged file among those given"
+    if isinstance(error, OSError):
+        files = [str(f) for f in (error.filename, error.filename2) if f is not None]
+        advice = _ADVICE.get(error.errno or 0, "")
+        return f"{': '.join([*files, error.strerror or str(error)])}{advice}"
+    return " ".join(str(error).split())
+
+
+def _drop_output() -> None:
+    """Have nothing left that the interpreter would write, and fail to write, at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:  # for example a full disk behind `graphslam … > file`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+_ADVICE = {
+    errno.ENOSPC: "; make room and run the same command again: what is finished is kept",
+    errno.EDQUOT: "; make room and run the same command again: what is finished is kept",
+    errno.EFBIG: "; the limit on the size of files is too low (ulimit -f)",
+    errno.EMFILE: "; the limit on open files is too low (ulimit -n)",
+}
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from graphslam.app.run import GlobalMap, Run, metric_value
 from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.core.markup import element, frame, join
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
 from graphslam.graph.identity import doubtful_identities
 from graphslam.graph.landmark_merging import mahalanobis_merges
@@ -113,10 +114,7 @@ class MergedMap:
         return f"MergedMap({len(self.sessions)} sessions, {len(self.landmarks)} landmarks, {shared} of them shared)"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{r.key}</td><td>{r.value:.6g}</td><td>{r.unit}</td></tr>" for r in self.metrics.itertuples()
-        )
-        return f"<b>{self!r}</b><table><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
+        return join([element("b", repr(self)), frame(self.metrics[["key", "value", "unit"]])])
 
 
 def merge(

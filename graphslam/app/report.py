@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from graphslam.app.markup import element, join, note, page
+from graphslam.app.markup import note, page
 from graphslam.app.report_figures import figures
 from graphslam.app.report_folder import Kind, read_folder
 from graphslam.app.report_loops import hypotheses, loops
@@ -15,6 +15,7 @@ from graphslam.app.report_sections import events, evidence, graph, metrics, prob
 from graphslam.app.report_verdict import verdict_lines
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
+from graphslam.core.markup import element, join
 
 logger = logging.getLogger(__name__)
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.dense_ties import SESSION
-from graphslam.app.markup import Markup, join, missing, note, picture, section
+from graphslam.app.markup import missing, note, picture, section
 from graphslam.app.outputs import MAP_FORMAT
 from graphslam.app.report_folder import ReportFolder
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import DataError, GraphSlamError
+from graphslam.core.markup import Markup, join
 from graphslam.evaluate.consistency import Consistency, nees, pose_error
 from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum

@@ -6,8 +6,9 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from graphslam.app.markup import Markup, Row, element, folded, join, missing, note, section, table
+from graphslam.app.markup import folded, missing, note, section
 from graphslam.app.report_folder import ReportFolder
+from graphslam.core.markup import Markup, Row, element, join, table
 
 ORDER = ("accepted", "switched-off", "undone", "rejected")
 COLUMNS = {

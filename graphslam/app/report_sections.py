@@ -10,25 +10,11 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app.config import dump_toml
-from graphslam.app.markup import (
-    Markup,
-    Row,
-    compact,
-    element,
-    figure_text,
-    folded,
-    is_figure,
-    items,
-    join,
-    missing,
-    note,
-    pairs,
-    section,
-    table,
-)
+from graphslam.app.markup import compact, folded, missing, note, section
 from graphslam.app.report_folder import ReportFolder
 from graphslam.app.report_verdict import figures_of, stopped
 from graphslam.app.verdict import CONFIDENCE, class_rows
+from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.ledger import EXCLUSIVE
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from graphslam.app.markup import Markup, element, join
 from graphslam.app.report_folder import ReportFolder
 from graphslam.app.verdict import Figures, verdict
 from graphslam.core.findings import Finding, headline
+from graphslam.core.markup import Markup, element, join
 
 
 def figures_of(folder: ReportFolder) -> Figures:

@@ -15,6 +15,7 @@ from graphslam.core.findings import Finding, findings_of_json
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.markup import element, frame, join
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -154,14 +155,9 @@ class Run:
         return f"Run({self.name!r}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks)"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{r.key}</td><td>{r.value:.6g}</td><td>{r.unit}</td></tr>" for r in self.metrics.itertuples()
-        )
         where = f" in {self.folder.name}" if self.folder else ""
-        return (
-            f"<b>Run of {self.name}</b>{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
-            f"<table><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
-        )
+        said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
+        return join([element("b", f"Run of {self.name}"), said, frame(self.metrics[["key", "value", "unit"]])])
 
 
 def metric_value(metrics: pd.DataFrame, key: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import logging
 from collections.abc import Sequence
 from contextlib import closing
@@ -19,6 +18,7 @@ from graphslam.app.threads import hold_one_thread, one_blas_thread
 from graphslam.app.versions import versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import heeded_interrupts
+from graphslam.core.markup import element, frame, join, table
 from graphslam.evaluate.executors import Executor, Job, execute
 from graphslam.evaluate.montecarlo import check_measurements, trial_seed
 
@@ -124,18 +124,20 @@ class Study:
         return f"Study({self.definition.name!r}: runs {runs or 'none'}; {len(self.failures)} failed)"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{html.escape(w)}</td><td>{n}</td><td>{int((self.failures['world'] == w).sum())}</td></tr>"
-            for w, n in self.runs.items()
-        )
+        runs = [
+            {"world": w, "runs": n, "failed": int((self.failures["world"] == w).sum())} for w, n in self.runs.items()
+        ]
+        parts: list[str] = [
+            element("b", f"Study {self.definition.name}"),
+            f": {self.definition.description}",
+            table(runs, ["world", "runs", "failed"]),
+        ]
         try:
-            tables = "".join(f"<h4>{html.escape(k)}</h4>{v.to_html(index=False)}" for k, v in self.report().items())
+            for title, rows in self.report().items():
+                parts += [element("h4", title), frame(rows)]
         except GraphSlamError as error:
-            tables = f"<p>no report: {html.escape(str(error))}</p>"
-        return (
-            f"<b>Study {html.escape(self.definition.name)}</b>: {html.escape(self.definition.description)}"
-            f"<table><tr><th>world</th><th>runs</th><th>failed</th></tr>{rows}</table>{tables}"
-        )
+            parts.append(element("p", f"no report: {error}"))
+        return join(parts)
 
 
 def study(
@@ -309,8 +311,8 @@ def _report(result: Study, tables: dict[str, pd.DataFrame], figures: list[Path],
     ]
     if len(result.failures):
         parts += [f"## Failed trials: {len(result.failures)}", markdown_table(result.failures)]
-    for title, frame in tables.items():
-        parts += [f"## {title}", markdown_table(frame)]
+    for title, found in tables.items():
+        parts += [f"## {title}", markdown_table(found)]
     if figures:
         parts += ["## Figures", *[f"![{p.stem}]({p.relative_to(result.folder.path).as_posix()})" for p in figures]]
     return "\n\n".join(parts) + "\n"

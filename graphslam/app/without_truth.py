@@ -13,6 +13,7 @@ from graphslam.app.gps_use import split
 from graphslam.app.metrics import Metrics
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.markup import frame
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
@@ -55,7 +56,7 @@ class WithoutTruth:
         return pd.DataFrame(rows, columns=columns)
 
     def _repr_html_(self) -> str:
-        return str(self.table().to_html(index=False, float_format=lambda v: f"{v:.3f}"))
+        return frame(self.table())
 
 
 def check_without_truth(

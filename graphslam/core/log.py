@@ -11,6 +11,7 @@ import numpy as np
 
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
+from graphslam.core.markup import element, items, join, table
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
 
@@ -118,15 +119,17 @@ class SensorLog:
         return f"SensorLog({self.name!r}: {streams}; truth {'known' if self.truth else 'unknown'})"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{n}</td><td>{type(s).__name__}</td><td>{len(s.times)}</td>"
-            f"<td>{(s.times[0] if len(s.times) else float('nan')):.2f}</td>"
-            f"<td>{(s.times[-1] if len(s.times) else float('nan')):.2f}</td></tr>"
-            for n, s in self.streams.items()
-        )
-        drops = "".join(f"<li>{k}: {v}</li>" for k, v in self.dropped.items())
-        return (
-            f"<b>SensorLog {self.name}</b>, {self.duration:.1f} s, truth {'known' if self.truth else 'unknown'}"
-            f"<table><tr><th>stream</th><th>kind</th><th>records</th><th>from s</th><th>to s</th></tr>{rows}</table>"
-            + (f"dropped:<ul>{drops}</ul>" if drops else "")
-        )
+        rows = []
+        for name, s in self.streams.items():
+            first, last = (f"{s.times[0]:.2f}", f"{s.times[-1]:.2f}") if len(s.times) else (None, None)
+            kind, n = type(s).__name__, len(s.times)
+            rows.append({"stream": name, "kind": kind, "records": n, "from s": first, "to s": last})
+        span = f"{self.duration:.1f} s" if any(len(s.times) for s in self.streams.values()) else "empty"
+        parts: list[str] = [
+            element("b", f"SensorLog {self.name}"),
+            f", {span}, truth {'known' if self.truth else 'unknown'}",
+            table(rows, ["stream", "kind", "records", "from s", "to s"]),
+        ]
+        if self.dropped:
+            parts += ["dropped:", items(f"{k}: {v}" for k, v in self.dropped.items())]
+        return join(parts)

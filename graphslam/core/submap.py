@@ -17,6 +17,7 @@ import scipy.sparse as sp
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.markup import element, join, pairs
 from graphslam.core.trajectory import Trajectory
 
 
@@ -248,16 +249,8 @@ class Submap:
     def _repr_html_(self) -> str:
         s = np.sqrt(np.diag(self.exit_covariance))
         n = 0 if self.landmarks is None else len(self.landmarks)
-        facts = "".join(f"<tr><td>{k}</td><td>{_short(v)}</td></tr>" for k, v in self.report.items())
-        return (
-            f"<b>Submap {self.key}</b> [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
+        said = (
+            f" [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
             f"exit {np.array2string(self.exit_pose, precision=3)} σ {np.array2string(s, precision=4)}"
-            f"<table>{facts}</table>"
         )
-
-
-def _short(value: Any) -> str:
-    """A figure of a report with as many digits as a reader needs."""
-    if isinstance(value, (list, tuple)):
-        return ", ".join(_short(v) for v in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+        return join([element("b", f"Submap {self.key}"), said, pairs(self.report)])

@@ -22,6 +22,7 @@ from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.gaussian import check_covariance, chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_log, wrap_angle
+from graphslam.core.markup import pairs
 
 Unit = Literal["run", "value"]
 Verdict = Literal["consistent", "over-confident", "pessimistic"]
@@ -245,8 +246,4 @@ class Consistency:
         }
 
     def _repr_html_(self) -> str:
-        cells = "".join(
-            f"<tr><td>{k}</td><td>{f'{v:.4g}' if isinstance(v, float) else v}</td></tr>"
-            for k, v in self.as_row().items()
-        )
-        return f"<table>{cells}</table>"
+        return pairs(self.as_row())

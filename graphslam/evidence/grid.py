@@ -16,6 +16,7 @@ import numpy.typing as npt
 from graphslam.core.errors import GridError, GridLockedError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.markup import element, join, pairs
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
@@ -346,12 +347,13 @@ class EvidenceGrid:
     def _repr_html_(self) -> str:
         counts, box, m = self.voxel_counts(), self.bounding_box(), self.memory()
         extent = "empty" if box is None else " × ".join(f"{d:.1f}" for d in box[1] - box[0]) + " m"
-        return (
-            f"<b>EvidenceGrid</b> {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
-            f"<table><tr><td>extent of what is known</td><td>{extent}</td></tr>"
-            f"<tr><td>voxels occupied / free</td><td>{counts.occupied:,} / {counts.free:,}</td></tr>"
-            f"<tr><td>memory, own / shared</td><td>{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB</td></tr></table>"
-        )
+        facts = {
+            "extent of what is known": extent,
+            "voxels occupied / free": f"{counts.occupied:,} / {counts.free:,}",
+            "memory, own / shared": f"{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB",
+        }
+        said = f" {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
+        return join([element("b", "EvidenceGrid"), said, pairs(facts)])
 
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
 from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.markup import Markup, element, join
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.flat import FlatGraph
@@ -231,10 +232,8 @@ class GraphRecord:
         return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
 
     def _repr_html_(self) -> str:
-        return (
-            f"<b>PoseGraph</b> {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, "
-            f"{len(self.records)} factors{self.objective()._repr_html_()}"
-        )
+        said = f" {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, {len(self.records)} factors"
+        return join([element("b", "PoseGraph"), said, Markup(self.objective()._repr_html_())])
 
     # ---------------------------------------------------------------- inside
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from graphslam.core.geometry import Array
+from graphslam.core.markup import table
 from graphslam.graph.flat import FlatGraph
 
 
@@ -62,11 +63,11 @@ class Score:
         return sum(c.dof for c in self.classes.values())
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{n}</td><td>{c.factors}</td><td>{c.chi2:.2f}</td><td>{c.dof}</td><td>{c.chi2_per_dof:.3f}</td></tr>"
+        rows = [
+            {"class": n, "factors": c.factors, "χ²": c.chi2, "dof": c.dof, "χ²/dof": c.chi2_per_dof}
             for n, c in self.classes.items()
-        )
-        return f"<table><tr><th>class</th><th>factors</th><th>χ²</th><th>dof</th><th>χ²/dof</th></tr>{rows}</table>"
+        ]
+        return table(rows, ["class", "factors", "χ²", "dof", "χ²/dof"])
 
 
 def score(flat: FlatGraph, chi2: Array) -> Score:

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
+from graphslam.core.markup import element, join
 from graphslam.core.submap import Submap
 from graphslam.graph.submap_blocks import SubmapProblem
 from graphslam.graph.symmetric_factor import SymmetricFactor
@@ -134,10 +135,11 @@ class SubmapEstimate:
 
     def _repr_html_(self) -> str:
         polished = "" if self.objective_polished is None else f", polished {self.objective_polished:.4f}"
-        return (
-            f"<b>Joined map</b>: {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
+        said = (
+            f": {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
             f"objective {self.objective:.4f}{polished}, {self.iterations} iterations, {self.seconds:.3f} s"
         )
+        return join([element("b", "Joined map"), said])
 
 
 # A step is halved no further than this before its direction is given up and damped.

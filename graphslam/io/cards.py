@@ -11,12 +11,12 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
-from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import graphslam
 from graphslam.core.errors import FormatError, MissingDataError, UnknownNameError
+from graphslam.core.markup import element, items, join, pairs
 
 CARD_FORMAT = "graphslam.card/1"
 KINDS = ("sensor-log", "submaps", "detections", "pose-graph", "point-clouds", "octree")
@@ -132,9 +132,7 @@ class Card:
             "licence": f"{self.licence}. {self.terms}",
             "files": f"{len(self.files)}, {self.bytes / 1e6:.1f} MB",
         }
-        body = "".join(f"<tr><td>{k}</td><td>{escape(v)}</td></tr>" for k, v in rows.items())
-        notes = "".join(f"<li>{escape(c)}</li>" for c in self.caveats)
-        return f"<b>{escape(self.name)}</b>: {escape(self.title)}<table>{body}</table><ul>{notes}</ul>"
+        return join([element("b", self.name), f": {self.title}", pairs(rows), items(self.caveats)])
 
 
 def cards_folder() -> Path:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError, MissingDataError
 from graphslam.core.geometry import Array
+from graphslam.core.markup import Markup, element, join
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
@@ -234,11 +235,11 @@ class Solution:
     def _repr_html_(self) -> str:
         verdict = "at the optimum" if self.converged else f"not at its optimum (may still fall by {self.decrement:.3g})"
         gap = "" if self.gap is None else f", gap {self.gap:.3g}"
-        return (
-            f"<b>Solution</b> ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
+        said = (
+            f" ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
             f"{self.objective:.4f}, {verdict}{gap}, {self.iterations} iterations, {self.seconds:.2f} s"
-            f"{self.score._repr_html_()}"
         )
+        return join([element("b", "Solution"), said, Markup(self.score._repr_html_())])
 
 
 # The decrement at which a solution counts as the optimum, relative to max(1, objective): far below what any figure

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graphslam.app.markup import Markup, element, escape, figure_text, is_figure, join, pairs, table
+from graphslam.core.markup import Markup, element, escape, figure_text, is_figure, join, pairs, table
 from tests.reference.page import Page
 
 HOSTILE = "<script>alert(1)</script>\"' onload=x &amp; </td></table>"

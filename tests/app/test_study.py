@@ -330,7 +330,7 @@ def test_a_study_is_read_back_shows_itself_and_draws(serial: Study, tmp_path: Pa
     assert repr(opened) == "Study('small': runs near: 4, fine: 4; 0 failed)"
     page = opened._repr_html_()
     assert "World near" in page
-    assert "<td>near</td><td>4</td>" in page
+    assert '<td>near</td><td class="n">4</td>' in page
     with pytest.raises(UnknownNameError, match="finished world 'far'"):
         opened.plot_consistency(world="far")
     assert opened.plot_consistency(world="fine").get_ylabel()

@@ -1,0 +1,104 @@
+"""What goes wrong in the machine, and not in the data, is one line and exit code 1, too."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from graphslam.app import cli
+from graphslam.core.errors import FormatError
+
+
+def too_deep() -> None:
+    too_deep()
+
+
+def too_much() -> None:
+    raise MemoryError("Unable to allocate 7.28 PiB for an array with shape (1000000000000000,)")
+
+
+def no_room() -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/map.npz")
+
+
+def no_files_left() -> None:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), "run/map.npz")
+
+
+def forbidden() -> None:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "run/map.npz")
+
+
+def a_folder() -> None:
+    open("/")  # noqa: SIM115
+
+
+def in_the_data() -> None:
+    raise FormatError("not JSON\nat all", where="a.json")
+
+
+@pytest.mark.parametrize(
+    ("verb", "said"),
+    [
+        (
+            too_deep,
+            "graphslam: something is nested too deeply to be followed; look for a damaged file among those given",
+        ),
+        (too_much, "graphslam: not enough memory; .* Unable to allocate 7.28 PiB .*"),
+        (no_room, "graphslam: run/map.npz: No space left on device; make room and run the same command again: .*"),
+        (no_files_left, "graphslam: run/map.npz: Too many open files; the limit on open files is too low .*"),
+        (forbidden, "graphslam: run/map.npz: Permission denied"),
+        (a_folder, "graphslam: /: Is a directory"),
+        (in_the_data, "graphslam: a.json: not JSON at all"),
+    ],
+)
+def test_one_line_and_exit_code_1(
+    verb: Callable[[], None], said: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "app", verb)
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    assert caught.value.code == 1
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert re.fullmatch(said, err.strip()), err
+
+
+def verb(*args: str, stdout: int | None = subprocess.PIPE, file_size: int | None = None) -> tuple[int, str]:
+    """Exit code and stderr of the real command line."""
+
+    def limits() -> None:
+        if file_size is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+
+    command = [sys.executable, "-m", "graphslam.app.cli", *args]
+    done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, preexec_fn=limits, check=False)
+    return done.returncode, done.stderr
+
+
+def test_a_full_file_system_behind_the_output_is_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        code, err = verb("data", "list", stdout=full.fileno())
+    assert (code, err) == (
+        1,
+        "graphslam: No space left on device; make room and run the same command again: what is finished is kept\n",
+    )
+
+
+def test_a_file_that_cannot_grow_is_one_line_and_no_half_file(tmp_path: Path) -> None:
+    out = tmp_path / "log"
+    code, err = verb("simulate", "landmark-field", "--preset", "quick", "--out", str(out), "--json", file_size=4096)
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "File too large" in err
+    assert not list(out.glob(".*"))  # no temporary file is left
+    assert not (out / "log.json").exists()

@@ -1,0 +1,212 @@
+"""Names from files are text in every HTML that a notebook or a page shows: none of them becomes markup.
+
+Every class of the package with ``_repr_html_`` is found by walking it; one that has no maker here fails the test.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+import pkgutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import frontends
+import graphslam
+from graphslam.app.merge import MergedMap
+from graphslam.app.run import GlobalMap, Run
+from graphslam.app.study import Study
+from graphslam.app.study_folder import StudyFolder
+from graphslam.app.without_truth import WithoutTruth
+from graphslam.core.log import SensorLog, Truth
+from graphslam.core.records import VelocityControls
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.consistency import Consistency
+from graphslam.evaluate.without_truth import ClassConsistency
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.ledger import Ledger
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.score import ClassScore, Score
+from graphslam.graph.submap_solver import SubmapEstimate
+from graphslam.io.cards import list_cards
+from graphslam.solve.batch import BatchSolver
+
+EVIL = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&"
+NOTHING = np.zeros(0, dtype=np.int64)
+
+
+def classes() -> dict[str, type]:
+    """Every class of the package that says how it looks in a notebook."""
+    found = {}
+    for package in (graphslam, frontends):
+        for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if m.name.endswith("__main__"):
+                continue
+            for c in vars(importlib.import_module(m.name)).values():
+                if isinstance(c, type) and c.__module__ == m.name and "_repr_html_" in vars(c):
+                    found[f"{m.name}.{c.__qualname__}"] = c
+    return found
+
+
+def evil(value: Any, depth: int = 0) -> Any:
+    """The value with every text in it, names of mappings too, made into markup that must not be taken as such."""
+    if isinstance(value, str):
+        return EVIL
+    if isinstance(value, dict):
+        return {evil(k, depth): evil(v, depth) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(evil(v, depth) for v in value)
+    if isinstance(value, pd.DataFrame):
+        texts = [c for c in value if not pd.api.types.is_numeric_dtype(value[c])]
+        return value.assign(**dict.fromkeys(texts, EVIL))
+    if isinstance(value, Study):
+        return value  # made with evil names: its table and its definition must agree on them
+    if dataclasses.is_dataclass(value) and not isinstance(value, type) and depth < 6:
+        for f in dataclasses.fields(value):
+            object.__setattr__(value, f.name, evil(getattr(value, f.name), depth + 1))
+    return value
+
+
+def metrics() -> pd.DataFrame:
+    return pd.DataFrame([{"key": "k", "value": 1.0, "unit": "m", "direction": "none"}])
+
+
+def graph() -> PoseGraph:
+    g = PoseGraph()
+    g.add_submap(submap())
+    return g
+
+
+def submap() -> Submap:
+    report: dict[str, Any] = {"note": "text", "list": ["text", 1.0], "map": {"key": "text"}}
+    return Submap(
+        key=0, interval=(0.0, 1.0), exit_pose=np.array([1.0, 0, 0]), exit_covariance=0.01 * np.eye(3), report=report
+    )
+
+
+def a_log(_: Path) -> SensorLog:
+    t = np.arange(3.0)
+    controls = VelocityControls(times=t, speed=t, yaw_rate=t)
+    return SensorLog(name="log", streams={"wheel": controls}, dropped={"wheel: bad": 1}, meta={"a": "b"})
+
+
+def a_run(tmp_path: Path) -> Run:
+    path = Trajectory(np.arange(2.0), np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    m = GlobalMap(
+        path, path.times, path.poses, path.covariances, NOTHING, np.zeros((0, 2)), np.zeros((0, 2, 2)), NOTHING
+    )  # type: ignore[arg-type]
+    return Run(name="run", submaps=[], map=m, metrics=metrics(), report={}, folder=tmp_path / EVIL.replace("/", "|"))
+
+
+def a_study(tmp_path: Path) -> Study:
+    definition = SimpleNamespace(
+        name=EVIL,
+        description=EVIL,
+        worlds=lambda quick: (EVIL,),
+        report=lambda table, timings: {EVIL: pd.DataFrame({EVIL: [EVIL, 1.0]})},
+    )
+    table = pd.DataFrame(
+        [(EVIL, 0, "a", 0, "q", 1.0)], columns=["world", "run", "algorithm", "submap", "quantity", "value"]
+    )
+    failures = pd.DataFrame(columns=["world", "run", "seed", "error"])
+    return Study(definition, StudyFolder(tmp_path), {"quick": False}, table, table, failures)  # type: ignore[arg-type]
+
+
+def a_ledger(_: Path) -> Ledger:
+    ledger = Ledger()
+    ledger.spend(0, EVIL, [EVIL], (0.0, 1.0))
+    return ledger
+
+
+def a_solution(_: Path) -> Any:
+    solver = BatchSolver(graph())
+    solver.update()
+    found = solver.solution()
+    object.__setattr__(found, "solver", EVIL)
+    object.__setattr__(found, "score", Score({EVIL: ClassScore(1.0, 1, 1, 1)}))
+    return found
+
+
+def a_merge(_: Path) -> MergedMap:
+    nothing: Any = None
+    return MergedMap(
+        sessions=[],
+        landmark_ids=NOTHING,
+        landmarks=np.zeros((0, 2)),
+        landmark_covariances=np.zeros((0, 2, 2)),
+        landmark_sessions=NOTHING,
+        solution=nothing,
+        graph=nothing,
+        metrics=metrics(),
+    )
+
+
+def a_graph(_: Path) -> PoseGraph:
+    return graph()  # the names of its classes of factors are those of the code
+
+
+CLASS: dict[str, Any] = {
+    "name": "c",
+    "factors": 2,
+    "rows": 4,
+    "leverage": 1.0,
+    "dof": 3.0,
+    "chi2": 3.0,
+    "mean_weight": 1.0,
+    "least_weight": 1.0,
+}
+MAKERS: dict[str, Callable[[Path], Any]] = {
+    "graphslam.core.log.SensorLog": a_log,
+    "graphslam.core.submap.Submap": lambda _: submap(),
+    "graphslam.io.cards.Card": lambda _: copy.deepcopy(list_cards()[0]),
+    "graphslam.evaluate.consistency.Consistency": lambda _: Consistency(
+        quantity="x", nees=[[1.0]], dof=1, gauge="g", unit="value"
+    ),
+    "graphslam.graph.ledger.Ledger": a_ledger,
+    "graphslam.graph.score.Score": lambda _: Score({"class": ClassScore(1.0, 1, 1, 1)}),
+    "graphslam.graph.graph_record.GraphRecord": a_graph,
+    "graphslam.graph.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
+        np.zeros((1, 3)), NOTHING, np.zeros((0, 2)), None, 0.0, None, 1, True, 0.0, np.zeros((0, 0))
+    ),
+    "graphslam.solve.solution.Solution": a_solution,
+    "graphslam.evidence.grid.EvidenceGrid": lambda _: EvidenceGrid(0.1),
+    "graphslam.app.without_truth.WithoutTruth": lambda _: WithoutTruth({"c": ClassConsistency(**CLASS)}, None, None),
+    "graphslam.app.study.Study": a_study,
+    "graphslam.app.merge.MergedMap": a_merge,
+    "graphslam.app.run.Run": a_run,
+}
+# texts of these stand in the code, not in a file: their HTML has no place for a foreign one
+OWN_WORDS = {
+    "graphslam.graph.graph_record.GraphRecord",
+    "graphslam.graph.submap_solver.SubmapEstimate",
+    "graphslam.evidence.grid.EvidenceGrid",
+}
+FOUND = classes()
+
+
+def test_every_class_that_shows_itself_is_tested() -> None:
+    assert FOUND.keys() - MAKERS.keys() == set()
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_names_are_text_and_never_markup(name: str, tmp_path: Path) -> None:
+    shown = evil(MAKERS[name](tmp_path))._repr_html_()
+    assert "<script" not in shown
+    assert "<img" not in shown
+    if name not in OWN_WORDS:
+        assert "&lt;script&gt;alert(1)" in shown  # it is there, as text
+
+
+def test_an_empty_log_shows_itself() -> None:
+    assert (
+        "empty"
+        in SensorLog(name="nothing", streams={}, truth=Truth(Trajectory(NOTHING, np.zeros((0, 3)))))._repr_html_()
+    )
