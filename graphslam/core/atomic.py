@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.errors import FormatError
 from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.json_file import check_json, parse_json
+from graphslam.core.npz import Field, check_arrays, read_arrays
+from graphslam.core.reading import read_text
 
 
 @contextmanager
@@ -48,52 +50,29 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})  # type: ignore[arg-type]
 
 
-def read_npz(path: str | os.PathLike[str], *, fmt: str) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
+def read_npz(
+    path: str | os.PathLike[str], *, fmt: str, fields: Mapping[str, Field] | None = None
+) -> dict[str, npt.NDArray[Any]]:
+    """Read the arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
+
+    Parameters
+    ----------
+    path : path
+    fmt : str
+    fields : mapping of str to Field, optional
+        What the arrays must be; only these are returned, and checked. Without: all, for a caller that checks them.
 
     Raises
     ------
     MissingDataError
         No such file.
     FormatError
-        Truncated, corrupt, holding pickled objects, or of another format.
+        Truncated, corrupt, holding pickled objects, of another format, or with arrays that are not as declared.
     """
     where = str(path)
-    if not Path(path).is_file():
-        raise MissingDataError("no such file", where=where)
-    try:
-        _check_sizes(where)
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError, NotImplementedError) as error:
-        raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None
-    except (AttributeError, TypeError):  # np.load gives a bare array for a .npy, and that is no archive
-        raise FormatError("not an npz archive", where=where) from None
+    arrays = read_arrays(path)
     check_format(str(arrays.get("format", "none")), fmt, where=where)
-    return arrays
-
-
-def _check_sizes(path: str) -> None:
-    """Refuse an archive whose headers claim more than its bytes can hold, before anything is allocated for it.
-
-    zlib packs a byte into no less than 1/1032 byte (zlib.net, Technical Details); a header is free to lie.
-    """
-    with open(path, "rb") as stream:
-        if stream.read(2) != b"PK":
-            return  # np.load says what it is instead
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            if member.file_size > 1032 * member.compress_size + 1024:
-                raise ValueError(f"{member.filename} claims {member.file_size} bytes in {member.compress_size}")
-            with archive.open(member) as data:
-                version = np.lib.format.read_magic(data)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(data)
-                claimed = dtype.itemsize
-                for n in shape:
-                    claimed *= n
-                if not dtype.hasobject and claimed != member.file_size - data.tell():
-                    raise ValueError(f"{member.filename} has the shape {shape} in {member.file_size} bytes")
+    return arrays if fields is None else check_arrays(arrays, fields, where)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
@@ -106,27 +85,22 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         stream.write(text + "\n")
 
 
-def read_json(path: str | os.PathLike[str], *, fmt: str) -> dict[str, Any]:
-    """Read a JSON object whose key ``format`` says ``fmt``.
+def read_json(path: str | os.PathLike[str], *, fmt: str, shape: Any = None) -> dict[str, Any]:
+    """Read a JSON object whose key ``format`` says ``fmt``, and check its shape (:func:`reading.check_json`).
 
     Raises
     ------
     MissingDataError, FormatError
     """
     where = str(path)
-    try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", where=where) from None
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"not JSON, or truncated ({error})", where=where) from None
+    value: Any = parse_json(read_text(path), where)
     if not isinstance(value, dict):
         raise FormatError("not a JSON object", where=where, got=type(value).__name__)
     check_format(str(value.get("format", "none")), fmt, where=where)
-    return value
+    return value if shape is None else check_json(value, shape, where)  # type: ignore[no-any-return]
 
 
 def check_format(got: str, wanted: str, *, where: str) -> None:
     """Refuse a file of another format or version."""
     if got != wanted:
-        raise FormatError("unknown format", where=where, got=repr(got), wanted=repr(wanted))
+        raise FormatError("unknown format", where=where, got=repr(got[:80]), wanted=repr(wanted))

@@ -17,6 +17,7 @@ from scipy import stats
 
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array, ArrayLike, circular_mean, wrap_angle
+from graphslam.core.reading import usable
 
 
 def check_covariance(
@@ -35,8 +36,8 @@ def check_covariance(
     if P.ndim != 2 or P.shape[0] != P.shape[1] or (dim is not None and P.shape[0] != dim):
         wanted = f"({dim}, {dim})" if dim is not None else "a square matrix"
         raise CovarianceError(f"{what} has the wrong shape", where=where, got=P.shape, wanted=wanted)
-    if not np.all(np.isfinite(P)):
-        i, j = np.argwhere(~np.isfinite(P))[0]
+    if not np.all(usable(P)):
+        i, j = np.argwhere(~usable(P))[0]
         raise CovarianceError(
             f"{what} is not finite", where=where, got=f"{P[i, j]} at ({i}, {j})", wanted="finite numbers"
         )

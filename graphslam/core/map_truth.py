@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.reading import usable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +45,7 @@ class MapTruth:
         points = points.reshape(-1, dim) if points.size == 0 else points
         if points.shape != (len(ids), dim):
             raise GeometryError("true landmarks have the wrong shape", got=points.shape, wanted=(len(ids), dim))
-        if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(points))):
+        if not (np.all(usable(poses)) and np.all(usable(points))):
             raise GeometryError("truth is not finite", wanted="finite poses and landmarks")
         for name, values in (("keys", keys), ("landmark_ids", ids)):
             if len(np.unique(values)) != len(values):

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.reading import usable
 
 Triangles = npt.NDArray[np.int32]
 
@@ -31,8 +32,8 @@ def check_mesh(vertices: Any, triangles: Any, *, where: str | None = None) -> tu
             got=f"{t.dtype} {t.shape}",
             wanted="integers (t, 3)",
         )
-    if not np.all(np.isfinite(v)):
-        k = int(np.argwhere(~np.isfinite(v))[0][0])
+    if not np.all(usable(v)):
+        k = int(np.argwhere(~usable(v))[0][0])
         raise GeometryError(f"vertex {k} of a mesh is not finite", where=where, got=v[k], wanted="finite numbers")
     bad = np.flatnonzero(np.any((t < 0) | (t >= len(v)), axis=1))
     if len(bad):

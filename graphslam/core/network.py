@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.reading import usable
 
 Index = npt.NDArray[np.intp]
 Ids = npt.NDArray[np.int64]
@@ -59,7 +60,7 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
     info = np.array(information, dtype=np.float64)
     if len(info) == 0:
         return info
-    bad = np.flatnonzero(~np.isfinite(info).all(axis=(1, 2)))
+    bad = np.flatnonzero(~usable(info).all(axis=(1, 2)))
     if len(bad):
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are not finite: {_names(labels, bad)}", where=where, wanted="finite"
@@ -112,8 +113,8 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
     info = np.array(information, dtype=np.float64)
     if len(info) == 0:
         return info, np.zeros(0, dtype=np.intp)
-    if not np.isfinite(info).all():
-        bad = np.flatnonzero(~np.isfinite(info).all(axis=(1, 2)))
+    if not usable(info).all():
+        bad = np.flatnonzero(~usable(info).all(axis=(1, 2)))
         raise CovarianceError(
             f"{len(bad)} information matrices are not finite and cannot be repaired", got=f"first: number {bad[0]}"
         )
@@ -256,7 +257,7 @@ class PoseNetwork:
             ("landmark", self.landmarks, lambda k: f"landmark {self.landmark_ids[k]}"),
             ("observation", self.observation_values, self.observation_name),
         ):
-            bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+            bad = np.flatnonzero(~usable(values).all(axis=1))
             if len(bad):
                 raise GeometryError(f"{name} is not finite: {label(int(bad[0]))}", where=self.source)
         if self.dim == 3:

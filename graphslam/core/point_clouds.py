@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.reading import usable
 from graphslam.core.records import check_times
 
 
@@ -56,8 +57,8 @@ class ArrayClouds:
         points = np.ascontiguousarray(self.points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise GeometryError("points have the wrong shape", got=points.shape, wanted="(q, 3)")
-        if not np.all(np.isfinite(points)):
-            k = int(np.argwhere(~np.isfinite(points))[0][0])
+        if not np.all(usable(points)):
+            k = int(np.argwhere(~usable(points))[0][0])
             raise DataError(f"point {k} is not finite", got=points[k], wanted="finite numbers")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "offsets", check_offsets(self.offsets, len(points)))
@@ -126,7 +127,7 @@ class PointClouds:
         object.__setattr__(self, "times", check_times(self.times, len(index)))
         for name, n in (("origin", 3), ("T_base_sensor", 7)):
             a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if a.shape != (n,) or not np.all(np.isfinite(a)):
+            if a.shape != (n,) or not np.all(usable(a)):
                 raise GeometryError(f"{name} is impossible", got=a, wanted=f"{n} finite numbers")
             object.__setattr__(self, name, a)
 

@@ -14,6 +14,7 @@ import numpy as np
 from graphslam.core import geometry, se3
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.reading import usable
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +128,7 @@ def normalised(weights: ArrayLike | None, n: int) -> Array:
     if weights is None:
         return np.full(n, 1.0 / n)
     w = np.asarray(weights, dtype=np.float64)
-    if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or not w.sum() > 0:
+    if w.shape != (n,) or not np.all(usable(w)) or np.any(w < 0) or not w.sum() > 0:
         raise GeometryError("impossible weights", got=w, wanted=f"{n} finite numbers ≥ 0, not all zero")
     return np.asarray(w / w.sum())
 

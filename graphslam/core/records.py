@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.reading import usable
 
 IDENTITY2 = np.zeros(3)
 
@@ -42,8 +43,8 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
     t = np.ascontiguousarray(times, dtype=np.float64)
     if t.ndim != 1 or (n is not None and len(t) != n):
         raise DataError("stamps have the wrong shape", where=where, got=t.shape, wanted=f"({n},)" if n else "(n,)")
-    if not np.all(np.isfinite(t)):
-        k = int(np.flatnonzero(~np.isfinite(t))[0])
+    if not np.all(usable(t)):
+        k = int(np.flatnonzero(~usable(t))[0])
         raise DataError(f"stamp of record {k} is not finite", where=where, got=t[k], wanted="seconds")
     bad = np.flatnonzero(np.diff(t) <= 0)
     if len(bad):
@@ -65,8 +66,8 @@ def _array(x: Any, shape: tuple[int, ...], name: str) -> Array:
 
 
 def _finite(a: Array, name: str) -> Array:
-    if not np.all(np.isfinite(a)):
-        k = int(np.argwhere(~np.isfinite(a))[0][0])
+    if not np.all(usable(a)):
+        k = int(np.argwhere(~usable(a))[0][0])
         raise DataError(f"{name} of record {k} is not finite", got=a[k], wanted="finite numbers")
     return a
 
@@ -124,9 +125,9 @@ class AckermannGeometry:
     model: str = "rear-axle"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.wheelbase) and self.wheelbase > 0):
+        if not (usable(self.wheelbase) and self.wheelbase > 0):
             raise GeometryError("wheelbase is impossible", got=self.wheelbase, wanted="> 0 m")
-        if not np.isfinite(self.encoder_offset):
+        if not usable(self.encoder_offset):
             raise GeometryError("encoder offset is not finite", got=self.encoder_offset)
         if self.model not in ("rear-axle", "front-steer"):
             raise GeometryError("unknown steering model", got=self.model, wanted="rear-axle or front-steer")

@@ -18,6 +18,7 @@ from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.markup import element, join, pairs
+from graphslam.core.reading import usable
 from graphslam.core.trajectory import Trajectory
 
 
@@ -66,7 +67,7 @@ class LandmarkMap:
         positions = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(-1, dim)
         if len(positions) != len(ids):
             raise GeometryError("landmark ids and positions differ in number", got=len(positions), wanted=len(ids))
-        if not (np.all(np.isfinite(pose)) and np.all(np.isfinite(positions))):
+        if not (np.all(usable(pose)) and np.all(usable(positions))):
             raise GeometryError("landmark map is not finite", got=pose, wanted="finite poses and positions")
         n = (3 if dim == 2 else 6) + positions.size
         if (self.covariance is None) == (self.information is None):
@@ -80,7 +81,7 @@ class LandmarkMap:
             info = sp.csc_matrix(self.information)
             if info.shape != (n, n):
                 raise CovarianceError("submap information has the wrong shape", got=info.shape, wanted=(n, n))
-            if not np.all(np.isfinite(info.data)):
+            if not np.all(usable(info.data)):
                 raise CovarianceError("submap information is not finite", wanted="finite numbers")
             object.__setattr__(self, "information", info)
         if self.sightings is not None:

@@ -19,10 +19,10 @@ from scipy.optimize import isotonic_regression
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_inverse
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.reading import read_text
 from graphslam.core.records import LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
-from graphslam.io.text_records import read_text
 
 _TAIL = 9  # numbers after the ranges: two poses, stamp, host, stamp
 _SPACING = 1e-3  # least time between mended stamps [s]

@@ -9,9 +9,7 @@ from __future__ import annotations
 import bz2
 import gzip
 import lzma
-import math
 import os
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,43 +18,9 @@ import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array
+from graphslam.core.reading import LARGEST, read_text
 
-_MAGIC: tuple[tuple[bytes, Callable[[bytes], bytes]], ...] = (
-    (b"\xfd7zXZ\x00", lzma.decompress),
-    (b"\x1f\x8b", gzip.decompress),
-    (b"BZh", bz2.decompress),
-)
 _WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gzip.compress, ".bz2": bz2.compress}
-
-
-def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a file, decompressed if it begins like xz, gzip or bzip2.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Truncated or corrupt compression, or bytes that are not text.
-    """
-    p = Path(path)
-    try:
-        raw = p.read_bytes()
-    except FileNotFoundError:
-        raise MissingDataError("no such file", where=str(p)) from None
-    except OSError as error:
-        raise MissingDataError(f"cannot be read ({error.strerror})", where=str(p)) from None
-    for magic, decompress in _MAGIC:
-        if raw.startswith(magic):
-            try:
-                raw = decompress(raw)
-            except (OSError, EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
-                raise FormatError(f"compressed data is truncated or corrupt ({error})", where=str(p)) from None
-            break
-    try:
-        return raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise FormatError(f"not a text file (byte {error.start})", where=str(p)) from None
 
 
 def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
@@ -89,7 +53,8 @@ def read_table(
     Returns
     -------
     values : (n, columns)
-        Numbers may be NaN or infinite: the caller decides what to drop.
+        Numbers may be NaN or infinite (also what is larger than :data:`~graphslam.core.reading.LARGEST`): the caller
+        decides what to drop.
     lines : (n,) int64
         Line of every row, counted from 1, for messages.
 
@@ -120,6 +85,7 @@ def read_table(
     except ValueError:
         k, word = next((k, w) for k, words in enumerate(rows) for w in words if not _is_number(w))
         raise FormatError("not a number", where=f"{path}, line {lines[k]}", got=repr(word[:40])) from None
+    values[np.abs(values) > LARGEST] = np.inf  # as useless, and dropped or refused as such
     return values, np.array(lines, dtype=np.int64)
 
 
@@ -198,9 +164,11 @@ class Records:
         except ValueError as error:
             raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
         for value in real:
-            if not math.isfinite(value):
+            if not abs(value) <= LARGEST:
                 raise FormatError(
-                    f"{tokens[0]} record holds {value}", where=self.where(number), wanted="finite numbers"
+                    f"{tokens[0]} record holds {value}",
+                    where=self.where(number),
+                    wanted=f"finite numbers, at most {LARGEST:g}",
                 )
         for value in whole:
             if not 0 <= value < 2**62:

@@ -17,8 +17,9 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDa
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
+from graphslam.core.reading import read_text
 from graphslam.graph.consistent_set import Chain
-from graphslam.io.text_records import find_text_file, read_text
+from graphslam.io.text_records import find_text_file
 
 INPUT, TRUTH = "Lecture_Hall_Input.txt", "Lecture_Hall_GT.txt"
 PLACE_SIGMA = 1.0

@@ -28,10 +28,10 @@ import numpy as np
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.reading import read_text
 from graphslam.core.records import AckermannGeometry, Gps, LaserScans, SteeringControls
 from graphslam.io.clock import usable_records
 from graphslam.io.mat import read_mat
-from graphslam.io.text_records import read_text
 
 LASER_POSITION = (3.78, 0.50)
 """Laser in the base frame [m]."""

@@ -1,0 +1,214 @@
+"""What every reader of files is made of: bounded bytes, checked numbers, and names that stay in their folder.
+
+A file is not trusted. Its bytes are read up to a limit that the user can change, its numbers must be finite, its
+arrays (:mod:`graphslam.core.npz`) and its JSON (:mod:`graphslam.core.json_file`) must have the shapes that the reader
+declares. What does not fit is a :class:`~graphslam.core.errors.FormatError` that names the file, the place in it, what
+was found and what was wanted.
+"""
+
+from __future__ import annotations
+
+import bz2
+import lzma
+import os
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, FormatError, MissingDataError
+
+LARGEST = 1e30
+"""No number of a file may be larger: squares, products and 6×6 determinants of such numbers are still finite."""
+
+MAX_SIZE = 2_000_000_000
+"""Bytes that are read of one file, after decompression, where no other limit is asked for."""
+
+_CHUNK = 1 << 20
+_XZ_MEMORY = 1 << 28  # of the dictionary, which a header may claim to be of 4 GB
+_limit: ContextVar[int] = ContextVar("size_limit", default=MAX_SIZE)
+
+
+# --- how much is read ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def size_limit(max_size: int | None) -> Iterator[None]:
+    """Read at most ``max_size`` bytes of each file, counted after decompression; None leaves the limit as it is.
+
+    Raises
+    ------
+    ConfigError
+        The limit is not positive.
+    """
+    if max_size is not None and max_size <= 0:
+        raise ConfigError(f"max_size = {max_size}; wanted a number of bytes above 0")
+    token = None if max_size is None else _limit.set(int(max_size))
+    try:
+        yield
+    finally:
+        if token is not None:
+            _limit.reset(token)
+
+
+def set_size_limit(max_size: int) -> None:
+    """The same for the rest of this process, as the command line does."""
+    _limit.set(int(max_size))
+
+
+def check_size(size: int, where: str) -> None:
+    """Refuse more bytes than the limit.
+
+    Raises
+    ------
+    FormatError
+    """
+    limit = _limit.get()
+    if size > limit:
+        raise FormatError(
+            "more data than is read of one file",
+            where=where,
+            got=f"more than {limit:,} bytes after decompression",
+            wanted="a smaller file, or a higher limit: --max-size on the command line, max_size in Python",
+        )
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Bytes of a file, decompressed if it begins like xz, gzip or bzip2; no more than the limit is ever held.
+
+    Raises
+    ------
+    MissingDataError
+        No such file, or it cannot be read.
+    FormatError
+        Truncated or corrupt compression, or more data than the limit.
+    """
+    where = str(path)
+    try:
+        with open(path, "rb") as stream:
+            first = stream.read(6)
+            stream.seek(0)
+            opened = next((make for magic, make in _MAGIC if first.startswith(magic)), None)
+            parts, size = [], 0
+            for part in _plain(stream) if opened is None else _unpacked(stream, opened, where):
+                size += len(part)
+                check_size(size, where)
+                parts.append(part)
+            return b"".join(parts)
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingDataError("no such file", where=where) from None
+    except OSError as error:
+        raise MissingDataError(f"cannot be read ({error.strerror})", where=where) from None
+
+
+def _plain(stream: IO[bytes]) -> Iterator[bytes]:
+    while part := stream.read(_CHUNK):
+        yield part
+
+
+class _Gunzip:
+    """A gzip stream with the interface of the decompressors of bz2 and lzma."""
+
+    def __init__(self) -> None:
+        self._inner = zlib.decompressobj(wbits=31)
+
+    @property
+    def eof(self) -> bool:
+        return self._inner.eof
+
+    @property
+    def unused_data(self) -> bytes:
+        return self._inner.unused_data
+
+    @property
+    def needs_input(self) -> bool:
+        return not self._inner.unconsumed_tail
+
+    def decompress(self, data: bytes, max_length: int) -> bytes:
+        return self._inner.decompress(self._inner.unconsumed_tail or data, max_length)
+
+
+_MAGIC: tuple[tuple[bytes, Callable[[], Any]], ...] = (
+    (b"\xfd7zXZ\x00", lambda: lzma.LZMADecompressor(memlimit=_XZ_MEMORY)),
+    (b"\x1f\x8b", _Gunzip),
+    (b"BZh", bz2.BZ2Decompressor),
+)
+
+
+def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str) -> Iterator[bytes]:
+    """Parts of the content of a compressed file, which may be several streams after each other."""
+    try:
+        data = stream.read(_CHUNK)
+        while data:
+            inner = make()
+            while not inner.eof:
+                part = inner.decompress(data, _CHUNK)
+                if part:
+                    yield part
+                data = b""
+                if inner.needs_input and not inner.eof:
+                    data = stream.read(_CHUNK)
+                    if not data:
+                        raise EOFError("it ends too early")
+            data = inner.unused_data.lstrip(b"\0") or stream.read(_CHUNK).lstrip(b"\0")
+    except (OSError, EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
+        raise FormatError(f"compressed data is truncated or corrupt ({error})", where=where) from None
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    raw = read_bytes(path)
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise FormatError(
+            f"not a text file (line {line}, byte {error.start})", where=str(path), wanted="text in UTF-8"
+        ) from None
+
+
+# --- numbers ------------------------------------------------------------------------------------------------------
+
+
+def usable(values: npt.ArrayLike) -> Any:
+    """Which numbers are finite and no larger than :data:`LARGEST`: an array of the same shape, or one truth value."""
+    return np.abs(np.asarray(values, dtype=np.float64)) <= LARGEST
+
+
+# --- names of files ---
+
+
+def safe_name(name: str, where: str) -> str:
+    """The name, if it is a plain file name: a file that a folder names lies in that folder.
+
+    Raises
+    ------
+    FormatError
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,200}", name):
+        raise FormatError("names a file outside its folder", where=where, got=repr(name[:80]), wanted="a file name")
+    return name
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """Path of the file ``name`` in ``folder``; a symbolic link that leads out of the folder is refused.
+
+    Raises
+    ------
+    FormatError
+    """
+    path = folder / safe_name(name, where)
+    if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+        raise FormatError("names a file outside its folder", where=where, got=f"{name} → {path.resolve()}")
+    return path
