@@ -16,6 +16,7 @@ from frontends.landmarks.prepare import Prepared, known_slots, prepare
 from frontends.landmarks.snapshot import Snapshot
 from frontends.landmarks.stopping import Stopping
 from frontends.landmarks.summarise import Smoothed, smooth
+from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
@@ -112,6 +113,8 @@ class _Run:
         mean, P = self.map.joint(slots)
         rows, landmark = self.sightings(slots)
         path = np.array(self.poses)
+        places = mean[3:].reshape(-1, 2)
+        report |= {"systematic": systematic(self.data, self.first, self.next, rows, landmark, path, places)}
         return self._hand_over(
             key,
             Gaussian(mean, P, (2,)),
@@ -142,6 +145,8 @@ class _Run:
         )
         index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
         used = int(s.kept.sum())
+        places = s.gaussian.mean[3:].reshape(-1, 2)
+        report |= {"systematic": systematic(data, self.first, self.next, rows[s.kept], index, s.poses, places)}
         counts = self.report(used) | {"not_associated": self.map.observations - len(rows)}
         return self._hand_over(
             key,

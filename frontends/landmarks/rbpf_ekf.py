@@ -16,6 +16,7 @@ from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, 
 from frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from frontends.landmarks.stopping import Stopping
 from frontends.landmarks.summarise import Smoothed, winning_association
+from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
@@ -177,12 +178,15 @@ class RbpfEkf:
         by_slot = {s: i for i, s in slots.items()}
         ids = np.array([by_slot.get(int(s), -1) for s in slot_of], dtype=np.int64)
         lm_index = (np.cumsum(smoothed.landmark_kept) - 1)[association.landmark[smoothed.kept]]
+        places = smoothed.gaussian.mean[3:].reshape(-1, 2)
+        used = rows[smoothed.kept]
+        report["systematic"] = systematic(data, first, last, used, lm_index, smoothed.poses, places)
         landmarks = LandmarkMap(
             ids=ids,
             exit_pose=handed.mean[:3],
             positions=handed.mean[3:].reshape(-1, 2),
             covariance=handed.covariance,
-            sightings=np.column_stack([data.original[rows[smoothed.kept]], lm_index]),
+            sightings=np.column_stack([data.original[used], lm_index]),
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
         if c.handover != "smoothed":  # the path's end is the Gaussian's

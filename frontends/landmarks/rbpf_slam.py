@@ -18,6 +18,7 @@ from frontends.landmarks.lineage import WholeMapParticles
 from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
 from frontends.landmarks.snapshot import Snapshot
 from frontends.landmarks.summarise import REGULARISER, Moments
+from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, circular_mean, vector_to_tangent_covariance, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
@@ -45,14 +46,15 @@ class WholeMapFilter:
         self.data, self.config = data, config
         miss_range = 0.9 * min(config.max_range, obs.max_range)
         self.particles = WholeMapParticles(config, obs.T_base_sensor, obs.field_of_view, miss_range, rng)
-        self._slot_of: dict[int, int] = {}
+        self.slot_of: dict[int, int] = {}
+        """Slot of every identity, where they are known."""
 
     def advance(self) -> None:
         """Take in the next scan."""
         k, obs = self.particles.scans, self.data.observations
         rows = obs.scan(k)
         if self.config.association == "known":
-            known = known_slots(obs, rows, self._slot_of)
+            known = known_slots(obs, rows, self.slot_of)
         else:
             known = np.full(rows.stop - rows.start, -1, dtype=np.int64)
         odometry = self.data.odometry
@@ -60,7 +62,7 @@ class WholeMapFilter:
 
     def ids(self, slots: Ints) -> Ints:
         """Identities of the landmarks in ``slots`` of the standard particle; -1 where the filter found them itself."""
-        by_slot = {s: i for i, s in self._slot_of.items()}
+        by_slot = {s: i for i, s in self.slot_of.items()}
         return np.array([by_slot.get(int(s), -1) for s in slots], dtype=np.int64)
 
     def snapshot(self, *, joint: bool) -> tuple[Snapshot, int, Ints]:
@@ -178,32 +180,42 @@ class RbpfSlam:
                 "beacons_without_landmark": len(p.waiting.slots),
                 "ranges_unspent": len(p.waiting) + p.waiting.unspent,
             }
+        used, landmark = self._associated(filter, slots)
+        report |= {"used": len(used), "not_associated": p.observations - len(used)}
+        path = _trajectory(filter)
+        poses = path.poses[len(path) - len(times) :]
+        report["systematic"] = systematic(data, 0, len(times), used, landmark, poses, end.landmarks)
+        sightings = np.column_stack([data.original[used], landmark])
         landmarks = LandmarkMap(
             ids=end.landmark_ids,
             exit_pose=end.pose,
             positions=end.landmarks,
             covariance=end.gaussian.covariance,
-            sightings=self._sightings(filter, slots),
+            sightings=None if self.config.association == "known" else sightings,
         )
         return Submap.from_landmarks(
             0,
             landmarks,
             interval=(data.t_start, float(times[-1])),
-            trajectory=_trajectory(filter),
+            trajectory=path,
             uses=data.uses,
             report=report,
         )
 
-    def _sightings(self, filter: WholeMapFilter, slots: Ints) -> Ints | None:
-        """Observations of the landmarks handed over, as the standard particle has them; None with known identities."""
-        if self.config.association == "known":
-            return None
+    def _associated(self, filter: WholeMapFilter, slots: Ints) -> tuple[Ints, Ints]:
+        """Observations of the landmarks handed over, as the standard particle has them, and the landmark of each."""
         p = filter.particles
         rank = np.full(p.hits.shape[1] + 1, -1, dtype=np.int64)  # its last entry serves slot -1
         rank[slots] = np.arange(len(slots))
-        landmark = rank[p.associations()[:, p.best]]
+        if self.config.association == "known":  # one association for all particles, which they do not record
+            ids = filter.data.observations.ids
+            assert ids is not None
+            seen = np.array([filter.slot_of.get(int(i), -1) for i in ids], dtype=np.int64)
+        else:
+            seen = p.associations()[:, p.best]
+        landmark = rank[seen]
         used = np.flatnonzero(landmark >= 0)
-        return np.column_stack([filter.data.original[used], landmark[used]])
+        return used, landmark[used]
 
 
 def _trajectory(filter: WholeMapFilter) -> Trajectory:

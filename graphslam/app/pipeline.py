@@ -51,6 +51,8 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.evaluate.landmark_checks import sighting_findings
+from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.loop_ledger import Decision
 from graphslam.io.catalog import load
@@ -317,7 +319,9 @@ def _judge(
     report["streams"] = [s.as_row() for s in streams]
     metrics = out.table()
     figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
-    report["verdict"] = verdict_json([*observed(streams, settings), *verdict(figures)])
+    reports = [s.report for s in submaps]
+    seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
+    report["verdict"] = verdict_json([*observed(streams, settings), *seen, *verdict(figures)])
     return Run(
         name=log.name,
         submaps=identified,

@@ -1,0 +1,74 @@
+"""What a landmark front end made of the sightings: how many it used, and what its particles can say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from graphslam.core.findings import Finding
+from graphslam.core.log import SensorLog
+from graphslam.core.records import LandmarkObservations
+
+HALF = 0.5
+"""If most of the sightings are not used, those that are used are the exception."""
+LEAST_ANCESTORS = 10
+"""Independent samples below which a variance made of them is off by a factor of two more often than once in ten
+(χ²₉ / 9 is below 0.46 or above 1.88 in one case of ten)."""
+
+
+def sighting_findings(
+    log: SensorLog, reports: Sequence[Mapping[str, Any]], dropped: Mapping[str, int]
+) -> list[Finding]:
+    """Lines on the sightings offered and used, and on the particles.
+
+    Parameters
+    ----------
+    log : SensorLog
+    reports : sequence of mapping
+        Of all submaps.
+    dropped : mapping of str to int
+        Per ``"stream: reason"``.
+    """
+    if not all("used" in r and "observations" in r for r in reports):
+        return []
+    name = log.of_type(LandmarkObservations)
+    seen = sum(int(r["observations"]) for r in reports)
+    offered = len(log[name].ranges) if name is not None else seen
+    used = sum(int(r["used"]) for r in reports)
+    trimmed = sum(int(r.get("trimmed", 0)) for r in reports)
+    # a reason counts records or sightings; those of sightings say so
+    lost = {k.partition(": ")[2]: n for k, n in dropped.items() if name is not None and k.startswith(f"{name}: ")}
+    reasons = [f"{n} {k}" for k, n in lost.items()]
+    if seen - used - trimmed > 0:
+        reasons.append(f"{seen - used - trimmed} that no landmark explains, or a single one")
+    if trimmed:
+        reasons.append(f"{trimmed} trimmed as outliers")
+    why = ", ".join(reasons)
+    out = [
+        Finding("", "sightings", f"Sightings used of those offered: {used} of {offered}{': ' + why if why else ''}.")
+    ]
+    if offered == 0 or used == 0:
+        text = f"No sighting was used ({offered} offered{': ' + why if why else ''}): the path is that of the wheels."
+        out.append(Finding("bad", "sightings-not-used", text))
+    elif used < HALF * offered:
+        text = (
+            f"Only {used} of {offered} sightings were used ({why}): wheels and sightings hardly agree on where "
+            "landmarks are seen again. Check units, signs and identities of the sightings, and the speeds."
+        )
+        out.append(Finding("bad", "sightings-not-used", text))
+    return out + _particles(reports)
+
+
+def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Covariances made of particles that have few independent ones left."""
+    made = [r for r in reports if "ancestors" in r and r.get("handover", "moments") == "moments"]
+    few = [r for r in made if r["ancestors"] < LEAST_ANCESTORS]
+    if not few:
+        return []
+    least = min(int(r["ancestors"]) for r in few)
+    text = (
+        f"In {len(few)} of {len(made)} maps made of particles fewer than {LEAST_ANCESTORS} of the first particles have "
+        f"descendants (least: {least}): the covariances are the scatter of next to nothing, and too small. Use more "
+        "particles, shorter submaps, or rbpf-ekf, which smooths its submaps."
+    )
+    return [Finding("bad", "particles", text)]
