@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from frontends.dead_reckoning_kernels import complementary_kernel
 from frontends.drift import DriftModel
-from frontends.gaps import find_gaps
+from frontends.gaps import Gaps, find_gaps
 from frontends.reckoned import (
     FADING,
     GYRO,
@@ -59,12 +59,11 @@ class DeadReckoningNoise:
     """Part that lasts of the σ of the unit's own roll and pitch [rad]; the rest of it fades."""
     filter_time: float = 5.0
     """Time constant of the complementary filter, where the unit gives no attitude [s]."""
-    bridge: float = 2.0
-    """Longest gap in the records that is bridged [s]."""
     gap_speed: float = 0.5
-    """σ of the speed in a gap of the wheels, constant in it [m/s]."""
+    """σ of the speed in a gap of the wheels, constant in it [m/s]; at least, for speeds of the log that are spread more
+    widely about the last one before the gap say more."""
     gap_rate: float = 0.3
-    """σ of the yaw rate in a gap of the IMU, constant in it [rad/s]."""
+    """σ of the yaw rate in a gap of the IMU, constant in it [rad/s], where wheels do not tell the turn."""
     gap_tilt: float = 0.1
     """σ of roll and pitch in a gap of the IMU [rad]."""
     floor_position: float = 1e-4
@@ -75,7 +74,7 @@ class DeadReckoningNoise:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            positive = name in ("filter_time", "bridge", "floor_position", "floor_angle")
+            positive = name in ("filter_time", "floor_position", "floor_angle")
             if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
                 raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
 
@@ -94,6 +93,7 @@ def reckon(
     noise: DeadReckoningNoise | None = None,
     *,
     since: float | None = None,
+    longest: float = 20.0,
     where: str = "log",
     drops: DropCounter | None = None,
 ) -> Reckoned:
@@ -111,6 +111,10 @@ def reckon(
     noise : DeadReckoningNoise, optional
     since : float, optional
         Start of the path, and its frame; ``times[0]`` by default, else not after it [s].
+    longest : float
+        Longest gap in the records that is bridged [s]. In a gap of the wheels the last speed is held; its σ is how far
+        the speeds of the log are from it. In one of the IMU the wheels tell the turn if elsewhere they turn as the gyro
+        does, with what they differ by there as σ; otherwise the rate goes from the one before to the one after.
     where : str
         Name of the log, for messages.
     drops : DropCounter, optional
@@ -144,8 +148,8 @@ def reckon(
             wanted=f"[{least:.3f}, {imu.times[-1]:.3f}] s",
         )
     span = (begin, float(t[-1]))
-    imu_gaps = find_gaps(imu.times, *span, noise.bridge, where=f"{where}/imu", drops=drops)
-    wheel_gaps = find_gaps(wheels.times, *span, noise.bridge, where=f"{where}/wheels", drops=drops)
+    imu_gaps = find_gaps(imu.times, *span, longest, where=f"{where}/imu", drops=drops)
+    wheel_gaps = find_gaps(wheels.times, *span, longest, where=f"{where}/wheels", drops=drops)
 
     stamps = np.concatenate([imu.times, wheels.times])
     knots = np.union1d(stamps[(stamps > begin) & (stamps < t[-1])], np.append(t, begin))
@@ -162,16 +166,27 @@ def reckon(
             got=f"pitch {np.rad2deg(np.abs(tilt[:, 1]).max()):.0f}°",
             wanted="a ground vehicle; is T_base_imu right?",
         )
-    fine = _fine_steps(knots, tilt, _interpolate(knots, imu.times, to_base), speed)
+    rates = _interpolate(knots, imu.times, to_base)
+    gap_rate = noise.gap_rate
+    told = _turn_of_wheels(imu.times, to_base[:, 2], wheels, imu_gaps) if len(imu_gaps.begin) else None
+    if told is not None:
+        inside = imu_gaps.length_at(knots) > 0
+        latest = np.searchsorted(wheels.times, knots[inside], side="right") - 1
+        rates[inside, 2] = told[0] * wheels.yaw_rate[latest]
+        gap_rate = told[1]
+    fine = _fine_steps(knots, tilt, rates, speed)
 
     # variances per second of what is new: heading, distance, and along the axes of the base
     held = np.append(np.diff(wheels.times), 0.0)[active]
     held = np.where(held > 0, held, fine.h)
     in_wheels, in_imu = wheel_gaps.length_at(middle), imu_gaps.length_at(middle)
+    gap_speed = np.full(len(speed), noise.gap_speed)
+    for k in np.flatnonzero(in_wheels):
+        gap_speed[k] = max(noise.gap_speed, float(np.sqrt(np.mean((wheels.speed - speed[k]) ** 2))))
     fine.rates = np.column_stack(
         [
-            imu.noise.gyro**2 * np.sum(fine.g**2, axis=1) + noise.gap_rate**2 * in_imu,
-            np.where(speed != 0.0, noise.wheel**2 * held, 0.0) + noise.gap_speed**2 * in_wheels,
+            imu.noise.gyro**2 * np.sum(fine.g**2, axis=1) + gap_rate**2 * in_imu,
+            np.where(speed != 0.0, noise.wheel**2 * held, 0.0) + gap_speed**2 * in_wheels,
             noise.lateral**2 * np.abs(speed) + (noise.gap_tilt * speed) ** 2 * in_imu,
             noise.vertical**2 * np.abs(speed) + (noise.gap_tilt * speed) ** 2 * in_imu,
         ]
@@ -194,7 +209,37 @@ def reckon(
         transitions=F,
         noises=Q,
         floor=floor,
+        gaps=Gaps(np.concatenate([imu_gaps.begin, wheel_gaps.begin]), np.concatenate([imu_gaps.end, wheel_gaps.end])),
     )
+
+
+_TURN_WINDOW = 1.0
+"""Turns of wheels and gyro are compared over so long [s]."""
+
+
+def _turn_of_wheels(times: Array, rate: Array, wheels: VelocityControls, gaps: Gaps) -> tuple[float, float] | None:
+    """What the wheels' yaw rate is multiplied by to be the gyro's, and σ of what is left [rad/s]; None: no use.
+
+    Means over a second outside the gaps; of use are wheels that explain four fifths of the variance of the gyro.
+    """
+    n = int((times[-1] - times[0]) // _TURN_WINDOW)
+    if n < 10 or np.ptp(wheels.yaw_rate) == 0.0:
+        return None
+    edges = times[0] + _TURN_WINDOW * np.arange(n + 1)
+    turn = [np.concatenate([[0.0], np.cumsum(r[:-1] * np.diff(t))]) for t, r in
+            ((times, rate), (wheels.times, wheels.yaw_rate))]  # fmt: skip
+    gyro = np.diff(np.interp(edges, times, turn[0])) / _TURN_WINDOW
+    wheel = np.diff(np.interp(edges, wheels.times, turn[1])) / _TURN_WINDOW
+    free = np.ones(n, dtype=np.bool_)
+    for a, b in zip(gaps.begin, gaps.end):
+        free &= (edges[1:] <= a) | (edges[:-1] >= b)
+    free &= (edges[:-1] >= wheels.times[0]) & (edges[1:] <= wheels.times[-1])
+    x, y = wheel[free], gyro[free]
+    if len(x) < 10 or not np.any(x):
+        return None
+    slope = float(x @ y / (x @ x))
+    left = float(np.mean((y - slope * x) ** 2))
+    return None if left > 0.2 * float(np.mean(y**2)) else (slope, float(np.sqrt(left)))
 
 
 def _interpolate(times: Array, stamps: Array, values: Array) -> Array:

@@ -6,8 +6,9 @@ position: the thinning costs nothing and the dear part is done a few hundred tim
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -112,12 +113,41 @@ class _Clouds:
 Scanner = RangeScans | PointClouds | LaserScans
 
 
+def repeated_scans(ranges: npt.NDArray[np.floating[Any]], max_range: float) -> npt.NDArray[np.bool_]:
+    """Which scans ``(n,)`` are the one before, number for number, and hold a return: nothing was measured anew.
+
+    Parameters
+    ----------
+    ranges : (n, m)
+        NaN: no reading; ≥ ``max_range``: nothing met.
+    max_range : float
+    """
+    out = np.zeros(len(ranges), dtype=np.bool_)
+    if len(ranges) > 1:
+        with np.errstate(invalid="ignore"):
+            same = (ranges[1:] == ranges[:-1]) | (np.isnan(ranges[1:]) & np.isnan(ranges[:-1]))
+            met = (ranges[1:] > 0) & (ranges[1:] < max_range)
+        out[1:] = same.all(axis=1) & met.any(axis=1)
+    return out
+
+
+def repeated_clouds(clouds: Iterable[Array]) -> npt.NDArray[np.bool_]:
+    """The same of clouds ``(m, 3)``."""
+    out, before = [], None
+    for cloud in clouds:
+        out.append(before is not None and len(cloud) > 0 and np.array_equal(before, cloud))
+        before = cloud
+    return np.array(out, dtype=np.bool_)
+
+
 def beam_source(
     stream: Scanner, name: str, *, min_range: float, range_sigma: float, cloud_range: float, drops: DropCounter
 ) -> BeamSource:
     """List the beams of a stream that say something.
 
-    Left out and counted: beams without a reading, and what is nearer than ``min_range``. Scans in which no beam met
+    Left out and counted: beams without a reading, what is nearer than ``min_range``, and scans that are the one before
+    number for number: a sensor that measures never repeats itself, and a map that is shown the same scan from one place
+    after the other believes that nothing moves. Scans in which no beam met
     anything are kept, for they say that space is free, and counted.
     """
     if isinstance(stream, PointClouds):
@@ -127,11 +157,13 @@ def beam_source(
         nothing = ranges >= stream.max_range
         good = nothing | (ranges >= min_range)
     unread = np.isnan(ranges)
+    again = repeated_scans(ranges, stream.max_range)
+    drops.drop(name, "scan is the one before, number for number", int(again.sum()))
     drops.drop(name, "beam without a reading", int(unread.sum()))
     drops.drop(name, f"nearer than {min_range:g} m", int(np.sum(~good & ~unread)))
     drops.drop(name, "scan without a reading", int(np.sum(~good.any(axis=1))))
     drops.drop(name, "scan that met nothing (kept)", int(np.sum((nothing | ~good).all(axis=1) & good.any(axis=1))))
-    record, beam = (a.astype(np.int64) for a in np.nonzero(good))
+    record, beam = (a.astype(np.int64) for a in np.nonzero(good & ~again[:, None]))
     if isinstance(stream, RangeScans):
         times = stream.times[record] + stream.beam_times[beam]
         return _Spinning(stream, record, beam, times, stream.max_range, stream.sigma)
@@ -141,13 +173,19 @@ def beam_source(
 def _list_clouds(
     clouds: PointClouds, name: str, min_range: float, sigma: float, max_range: float, drops: DropCounter
 ) -> BeamSource:
-    rows, near, empty = [], 0, 0
+    rows, near, empty, again = [], 0, 0, 0
+    before: Array | None = None
     for k in range(len(clouds)):
-        length = np.linalg.norm(clouds.cloud(k) - clouds.origin, axis=1)
+        cloud = clouds.cloud(k)
+        length = np.linalg.norm(cloud - clouds.origin, axis=1)
         good = np.flatnonzero(length >= max(min_range, 1e-9))
         near += len(length) - len(good)
         empty += len(good) == 0
+        if before is not None and len(cloud) and np.array_equal(before, cloud):
+            again, good = again + 1, good[:0]
+        before = cloud
         rows.append(good)
+    drops.drop(name, "scan is the one before, number for number", again)
     drops.drop(name, f"nearer than {min_range:g} m", near)
     drops.drop(name, "scan without a reading", empty)
     record = np.repeat(np.arange(len(rows)), [len(r) for r in rows])

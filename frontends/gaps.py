@@ -11,6 +11,9 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 
+OPTION = "frontend.steps.longest_record"
+"""The option that limits gaps, by its full name."""
+
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
@@ -70,5 +73,5 @@ def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where:
             f"gap without records: {spacing[worst]:.3f} s after record {worst}",
             where=where,
             got=f"{stamps[worst]:.3f} to {stamps[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s",
+            wanted=f"gaps of at most {limit:g} s ({OPTION})",
         )

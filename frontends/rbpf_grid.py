@@ -20,6 +20,7 @@ from frontends.ancestry import Ancestry
 from frontends.drift import DriftModel
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter, GridParticles, Tally
+from frontends.scan_use import require_returns, uncorrected, uncorrected_covariance, with_findings
 from frontends.segslam.covariance import Drift, exit_covariance
 from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.core.errors import DataError
@@ -177,7 +178,9 @@ def run_rbpf(
     )
 
 
-def rbpf_submap(result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: float = 1.0) -> Submap:
+def rbpf_submap(
+    result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: float = 1.0, steps: Steps | None = None
+) -> Submap:
     """The whole run as one submap: the best particle's map and path, and an honest covariance of where it ends.
 
     Parameters
@@ -188,6 +191,8 @@ def rbpf_submap(result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: 
     key : int
     drift_scale : float
         Factor on the drift model's covariance.
+    steps : Steps, optional
+        With them, dead reckoning's own covariance is added where no scan corrects it (:mod:`frontends.scan_use`).
 
     Raises
     ------
@@ -208,12 +213,19 @@ def rbpf_submap(result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: 
         "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
         "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
     }
+    path = result.trajectory(lambda s: drift_scale * np.asarray(drift(s)))
+    added = np.zeros_like(exit.total)
+    if steps is not None and (stretches := uncorrected(steps)):
+        assert path.covariances is not None
+        more = [uncorrected_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
+        path = Trajectory(path.times, path.poses, path.covariances + np.array(more))
+        added = more[-1]
     return Submap(
         key=key,
         interval=(float(times[0]), float(times[-1])),
         exit_pose=result.final_pose,
-        exit_covariance=exit.total,
-        trajectory=result.trajectory(lambda s: drift_scale * np.asarray(drift(s))),
+        exit_covariance=exit.total + added,
+        trajectory=path,
         grid=result.particles.grids[result.best],
         uses=result.uses,
         report=report,
@@ -249,7 +261,12 @@ class RbpfGrid:
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
-            steps = make_steps(log, self.config.steps, drops=drops)
+            count = DropCounter()
+            steps = make_steps(log, self.config.steps, drops=count)
+            if drops is not None:
+                drops.counts.update(count.counts)
+            require_returns(steps, count)
             result = run_rbpf(steps, self.config.filter, seed.child(0))
             drift = replace(self.config.drift, dim=steps.dim)
-            yield rbpf_submap(result, drift, drift_scale=self.config.drift_scale)
+            submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)
+            yield with_findings(submap, steps)

@@ -10,10 +10,11 @@ frame); scale of the wheels; roll and pitch that fade (Ornstein-Uhlenbeck, 2); r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from frontends.gaps import Gaps
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -83,6 +84,8 @@ class Reckoned:
         Of the error state from pose k - 1 to k; record 0 is identity and zero.
     floor : (6,)
         σ that every covariance has at least: radians, metres.
+    gaps : Gaps
+        Of either stream, bridged.
     """
 
     odometry: Odometry
@@ -93,6 +96,7 @@ class Reckoned:
     transitions: Array
     noises: Array
     floor: Array
+    gaps: Gaps = field(default_factory=Gaps)
 
     def between(
         self, start: int, end: int, *, level_start: bool = False, level_end: bool = False

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frontends.gaps import refuse_long
+from frontends.gaps import Gaps, refuse_long
 from frontends.motion import MotionNoise, recorded_odometry
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -108,12 +108,14 @@ def chain(odometry: Odometry) -> Trajectory:
     return Trajectory(odometry.times, poses)
 
 
-def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter | None = None) -> Odometry:
-    """Records of odometry that span a gap, made less certain.
+def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter | None = None) -> tuple[Odometry, Gaps]:
+    """Records of odometry that span a gap, made less certain; and the gaps.
 
     A record tells the whole motion over its time, however long, but not how it went meanwhile: cut into pieces its
     covariance must cover more than the record's own. Records that take longer than thrice the usual (and than 1 s) are
-    counted, and those of which the motion is cut get σ = 20 % of their motion on every axis besides their own.
+    counted, and those of which the motion is cut get σ = 20 % of their motion on every axis besides their own. Where
+    the body moved before and after, and the record tells less than half of that speed, records may have been lost, and
+    with them motion: σ is then what the body drives (and, root of the mean square, turns) in that time.
 
     Raises
     ------
@@ -121,22 +123,29 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
         A record longer than ``limit`` seconds: names it.
     """
     if len(odometry.times) < 2:
-        return odometry
+        return odometry, Gaps()
     spacing = np.diff(odometry.times)
     k = np.flatnonzero(spacing > max(3.0 * float(np.median(spacing)), 1.0))
     refuse_long(odometry.times, k, limit, where)
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
     g = group_of(odometry.increments)
+    xi = g.log(odometry.increments[1:])
+    metres = np.linalg.norm(xi[:, g.position], axis=1)
+    radians = np.linalg.norm(np.delete(xi, np.r_[g.position], axis=1), axis=1)
+    sound = np.setdiff1d(np.arange(len(spacing)), k)
+    turns = float(np.sqrt(np.mean((radians[sound] / spacing[sound]) ** 2))) if len(sound) else 0.0
     covariances = odometry.covariances.copy()
-    for record in k + 1:
-        xi = g.log(odometry.increments[record])
-        metres = float(np.linalg.norm(xi[g.position]))
-        radians = float(np.linalg.norm(np.delete(xi, np.r_[g.position])))
-        sigma = np.full(g.dof, BRIDGED * radians)
-        sigma[g.position] = BRIDGED * metres
-        covariances[record] += np.diag(np.square(sigma))
-    return replace(odometry, covariances=covariances)
+    for i in k:
+        near = [j for j in (i - 1, i + 1) if 0 <= j < len(spacing) and j not in k]
+        speed = min((float(metres[j] / spacing[j]) for j in near), default=0.0)
+        sigma = np.full(g.dof, BRIDGED * radians[i])
+        sigma[g.position] = BRIDGED * metres[i]
+        if metres[i] < 0.5 * speed * spacing[i]:
+            sigma[g.heading] = max(sigma[g.heading], turns * spacing[i])
+            sigma[g.position] = speed * spacing[i]
+        covariances[i + 1] += np.diag(np.square(sigma))
+    return replace(odometry, covariances=covariances), Gaps(odometry.times[k], odometry.times[k + 1])
 
 
 def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise) -> Odometry:

@@ -36,7 +36,7 @@ class StepConfig:
     motion: tuple[str, ...] = ()
     """Streams of motion: an IMU and wheels, or one of odometry or controls; none: the best the log has."""
     noise: DeadReckoningNoise = field(default_factory=DeadReckoningNoise)
-    """Of an IMU and wheels; ``noise.bridge`` limits gaps in every stream of rates."""
+    """Of an IMU and wheels."""
     controls: MotionNoise = field(default_factory=MotionNoise)
     """Of controls in the plane; recorded odometry takes its floors."""
     yaw_bias: float = 0.0
@@ -59,7 +59,9 @@ class StepConfig:
     """The floors driven on are level on the whole, as in buildings: what gravity's roll and pitch show in the median
     over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did, or less."""
     longest_record: float = 20.0
-    """Longest time that one record of odometry may take: it tells the whole motion, not how it went [s]."""
+    """Longest gap in the records of the motion that is bridged [s]. In a gap the motion is a guess with a covariance
+    that says so; it is counted, and a line of the verdict. Records of odometry tell the whole motion, not how it
+    went."""
 
     def __post_init__(self) -> None:
         positive = {"period": self.period, "max_range": self.max_range}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from frontends.dead_reckoning import reckon
 from frontends.drift import PathErrors
-from frontends.gaps import find_gaps
+from frontends.gaps import Gaps, find_gaps
 from frontends.grid_motion import tilts
 from frontends.motion import steering_odometry, velocity_odometry
 from frontends.odometry_calibration import without_yaw_per_metre
@@ -37,6 +37,8 @@ class StepMotion:
     errors : PathErrors
     tilt : (n, 2) or None
     tilt_sigma, tilt_time : float
+    gaps : Gaps
+        In which the motion is a guess.
     """
 
     odometry: Odometry
@@ -46,6 +48,7 @@ class StepMotion:
     tilt: Array | None = None
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
+    gaps: Gaps = field(default_factory=Gaps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +138,9 @@ def _inertial(
 
     def solve(times: Array, further: Array, drops: DropCounter | None) -> StepMotion:
         since = min(float(times[0]), float(further.min(initial=times[0])))
-        r = reckon(imu, wheels, times, config.noise, since=since, where=log.name, drops=drops)
+        r = reckon(
+            imu, wheels, times, config.noise, since=since, longest=config.longest_record, where=log.name, drops=drops
+        )
         lasting = r.lasting
         return StepMotion(
             odometry=r.odometry,
@@ -145,6 +150,7 @@ def _inertial(
             tilt=r.tilt,
             tilt_sigma=float(np.hypot(lasting.attitude, lasting.attitude_bias)),
             tilt_time=lasting.attitude_time,
+            gaps=r.gaps,
         )
 
     begin = float(max(imu.times[0], wheels.times[0]))
@@ -175,9 +181,10 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
     whole = chain(odometry) if config.yaw_bias else upright
 
     def solve(times: Array, _: Array, drops: DropCounter | None) -> StepMotion:
-        sure = bridge(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
+        sure, gaps = bridge(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
         cut = cut_odometry(sure, times, config.controls)
-        motion = StepMotion(odometry=cut, poses=whole.interpolate(times), path=whole, errors=_errors(cut, config))
+        poses = whole.interpolate(times)
+        motion = StepMotion(odometry=cut, poses=poses, path=whole, errors=_errors(cut, config), gaps=gaps)
         if not config.odometry_tilt_sigma:
             return motion
         return replace(
@@ -205,13 +212,40 @@ def _controlled(
 
     def solve(times: Array, further: Array, drops: DropCounter | None) -> StepMotion:
         span = (float(times[0]), float(times[-1]))
-        find_gaps(controls.times, *span, config.noise.bridge, where=f"{log.name}/{name}", drops=drops)
-        odometry = dead_reckoned(times)
+        where = f"{log.name}/{name}"
+        gaps = find_gaps(controls.times, *span, config.longest_record, where=where, drops=drops)
+        odometry = doubted(dead_reckoned(times), controls, gaps)
         path = chain(dead_reckoned(np.union1d(times, further)))
         poses = path.poses[np.searchsorted(path.times, times)]
         if len(times) > 1 and not np.all(np.isfinite(poses)):
-            raise DataError("dead reckoning is not finite", where=f"{log.name}/{name}")
-        return StepMotion(odometry=odometry, poses=poses, path=path, errors=_errors(odometry, config))
+            raise DataError("dead reckoning is not finite", where=where)
+        return StepMotion(odometry=odometry, poses=poses, path=path, errors=_errors(odometry, config), gaps=gaps)
 
     end = float(controls.times[-1]) + _spacing(controls.times)
     return MotionSource((name,), 2, float(controls.times[0]), end, solve)
+
+
+def doubted(odometry: Odometry, controls: VelocityControls | SteeringControls, gaps: Gaps) -> Odometry:
+    """Increments in the plane whose covariances hold what a robot can have done in the gaps of its controls.
+
+    The last control before a gap is held. Its σ, constant in the gap, is how far speeds and turns of the log are from
+    it (root of the mean square): this robot has been seen to drive like that. Errors of one gap are one error, so that
+    the variances of its pieces add up to that of the whole gap.
+    """
+    if not len(gaps.begin):
+        return odometry
+    if isinstance(controls, SteeringControls):
+        rate = controls.speed * np.tan(controls.steering) / controls.geometry.wheelbase
+    else:
+        rate = controls.yaw_rate
+    t, covariances = odometry.times, odometry.covariances.copy()
+    for a, b in zip(gaps.begin, gaps.end):
+        last = int(np.searchsorted(controls.times, a, side="right")) - 1
+        sigma_v = float(np.sqrt(np.mean((controls.speed - controls.speed[last]) ** 2)))
+        sigma_w = float(np.sqrt(np.mean((rate - rate[last]) ** 2)))
+        for k in range(1, len(t)):
+            inside = min(t[k], b) - max(t[k - 1], a)
+            if inside > 0:
+                spent = float(inside) * float(b - a)
+                covariances[k] += np.diag([sigma_v**2, (0.1 * sigma_v) ** 2, sigma_w**2]) * spent
+    return replace(odometry, covariances=covariances)

@@ -7,7 +7,7 @@ base stands at the stamp. Front ends on grids see nothing else, so that any robo
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from frontends.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
 from frontends.drift import PathErrors
+from frontends.gaps import Gaps
 from frontends.scan_matching import match_neighbours
 from frontends.step_config import StepConfig
 from frontends.step_motion import MotionSource, motion_source
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
+from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds, check_offsets
@@ -63,6 +65,10 @@ class Steps:
     truth : Trajectory or None
     errors : PathErrors or None
         Honest covariance of dead reckoning over any interval, where the source of the motion lets it be known.
+    gaps : Gaps
+        In the records of the motion, which is a guess there.
+    findings : tuple of Finding
+        What was noticed when scans and motion were put beside each other.
 
     Raises
     ------
@@ -84,6 +90,8 @@ class Steps:
     name: str = "steps"
     truth: Trajectory | None = None
     errors: PathErrors | None = None
+    gaps: Gaps = field(default_factory=Gaps)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -216,6 +224,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         name=log.name + (f" (yaw rate off by {config.yaw_bias:g} rad/s)" if config.yaw_bias else ""),
         truth=log.truth.trajectory if log.truth is not None else None,
         errors=motion.errors,
+        gaps=motion.gaps,
     )
     return match_neighbours(steps, drops=drops) if config.match_scans else steps
 

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from frontends.filter_drift import FilterDrift
 from frontends.grid_config import GridFilterConfig
+from frontends.scan_use import require_returns, with_findings
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.progress import Watch
 from frontends.segslam.result import SegSlamResult
@@ -53,9 +54,15 @@ class SegSlam:
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`: the settled chain of the best particle, segment by segment."""
         c = self.config
-        steps = make_steps(log, c.steps, drops=drops)
+        count = DropCounter()
+        steps = make_steps(log, c.steps, drops=count)
+        if drops is not None:
+            drops.counts.update(count.counts)
+        require_returns(steps, count)
         result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=self.watch)
         for submap in settled(result, c.drift, c.segslam):
+            if submap.key == 0:
+                submap = with_findings(submap, steps)
             if after is None or submap.key > after.key:
                 yield submap
 
@@ -75,7 +82,7 @@ def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) ->
     return settle(
         segmap,
         chain,
-        drift_by_path(segmap, chain, drift),
+        drift_by_path(segmap, chain, drift, steps),
         config.handover,
         uses=steps.uses,
         reasons={b.step: b.why for b in result.boundaries},

@@ -15,10 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from frontends.filter_drift import FilterDrift
+from frontends.scan_use import uncorrected, uncorrected_covariance
 from frontends.segslam.config import HandoverConfig
 from frontends.segslam.covariance import exit_covariance
 from frontends.segslam.sampling import MapSample, nearest_step
 from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
+from frontends.steps import Steps
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2
@@ -48,12 +50,18 @@ class _Errors(Protocol):
     ) -> tuple[Array, Array]: ...
 
 
-def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift) -> Drift:
-    """What a filter of so many particles leaves of the errors along the paths of the segments of a chain."""
+def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | None = None) -> Drift:
+    """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
+
+    With the steps also what dead reckoning adds where no scan corrects it (:mod:`frontends.scan_use`).
+    """
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
+    stretches = [] if steps is None else uncorrected(steps)
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
-        return model.covariance(paths[start][: end - start + 1], segmap.particles, gravity=segmap.gravity and level_end)
+        path = paths[start][: end - start + 1]
+        C = model.covariance(path, segmap.particles, gravity=segmap.gravity and level_end)
+        return C if steps is None else C + uncorrected_covariance(steps, stretches, path, start, end)
 
     return drift
 

@@ -52,6 +52,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.landmark_checks import sighting_findings
+from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.loop_ledger import Decision
@@ -127,6 +128,7 @@ def _run(
     if watch is not None and hasattr(front, "watch"):
         front = replace(front, watch=watch)
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
+    noticed = check_streams(log)
     folder = None if out is None else RunFolder.start(out, effective, resume=resume)
 
     back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu))
@@ -146,7 +148,7 @@ def _run(
     seconds["backend"] = sum(back.seconds.values())
     seconds["total"] = time.perf_counter() - begin
 
-    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, work, drops, effective)
+    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, work, drops, effective, noticed)
     if folder is None:
         return result
     write_outputs(folder, result)
@@ -258,6 +260,7 @@ def _judge(
     work: FrontEndWork,
     drops: DropCounter,
     effective: dict[str, Any],
+    noticed: Sequence[Noticed],
 ) -> Run:
     """Metrics, residuals, and the value that the user gets."""
     hits = back.landmark_hits(submaps)
@@ -321,7 +324,7 @@ def _judge(
     figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
     reports = [s.report for s in submaps]
     seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
-    report["verdict"] = verdict_json([*observed(streams, settings), *seen, *verdict(figures)])
+    report["verdict"] = verdict_json([*observed(streams, noticed, submaps), *seen, *verdict(figures)])
     return Run(
         name=log.name,
         submaps=identified,

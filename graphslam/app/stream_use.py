@@ -71,6 +71,7 @@ def stream_use(
     spans: dict[str, list[tuple[float, float]]] = {}
     for e in graph.ledger.entries():
         spans.setdefault(e.stream, []).append((e.t_start, e.t_end))
+    left_out = {e["stream"]: str(e["why"]) for e in graph.events if e.get("event") == "imu-not-used"}
     out = []
     for name, stream in log.streams.items():
         times = np.asarray(stream.times, dtype=np.float64)
@@ -89,7 +90,7 @@ def stream_use(
             role, why = "gps", "" if asked else "gps.use is none"
         elif isinstance(stream, Imu):
             asked = settings.imu.use == name or settings.imu.use == "auto"
-            role, why = "imu", "" if asked else "imu.use is none"
+            role, why = "imu", left_out.get(name, "") if asked else "imu.use is none"
         if used < len(times) and not why:
             reasons = [f"{n} {k}" for k, n in lost.items()]
             outside = len(times) - used

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from graphslam.app.config import RunConfig
 from graphslam.app.stream_use import StreamUse
 from graphslam.core.findings import Finding, Level, findings_of_json
+from graphslam.core.submap import Submap
+from graphslam.evaluate.stream_checks import Noticed
 from graphslam.evaluate.without_truth import two_sided
 
 CONFIDENCE = 0.95
@@ -82,14 +83,18 @@ _STATED = frozenset(
 )
 
 
-def observed(streams: Sequence[StreamUse], settings: RunConfig) -> list[Finding]:
-    """Lines on what became of every stream.
+def observed(
+    streams: Sequence[StreamUse], noticed: Sequence[Noticed] = (), submaps: Sequence[Submap] = ()
+) -> list[Finding]:
+    """Lines on what became of every stream, what was noticed in it, and what the front end says.
 
     Parameters
     ----------
     streams : sequence of StreamUse
-    settings : RunConfig
-        Says which streams were asked for.
+    noticed : sequence of Noticed
+        Of the raw streams; what is bad in one that was not used is only worth a look.
+    submaps : sequence of Submap
+        Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
     """
     counts = "; ".join(s.in_words() for s in streams)
     out = [Finding("", "streams", f"Records used of those offered: {counts}.")] if streams else []
@@ -101,6 +106,12 @@ def observed(streams: Sequence[StreamUse], settings: RunConfig) -> list[Finding]
             out.append(Finding("look", "stream-not-used", text))
         elif s.role == "input" and s.used < MOSTLY * s.offered:
             out.append(Finding("look", "stream-part-used", f"Only {s.in_words()}: {s.why}."))
+    used = {s.name for s in streams if s.used}
+    for n in noticed:
+        level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
+        out.append(replace(n.finding, level=level))
+    for submap in submaps:
+        out += [f for row in submap.report.get("findings", ()) if (f := Finding.from_row(row))]
     return out
 
 
@@ -233,6 +244,10 @@ def _left_out(figures: Figures) -> list[Finding]:
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))
+        if e.get("event") == "imu-axes" and e.get("verdict") == "not checked":
+            why = f"could not be checked ({e.get('why')})"
+            text = f"IMU {e.get('stream')}: whether its axes are those of its mounting {why}."
+            out.append(Finding("", "imu-axes", text))
         if e.get("event") == "imu-contradicted":
             text = f"IMU {e.get('stream', '')}".strip()
             line = f"{text} and submaps contradict each other: one of them states too little noise."

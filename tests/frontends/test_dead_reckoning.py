@@ -170,8 +170,9 @@ def test_gaps_are_bridged_with_doubt_and_counted() -> None:
         np.testing.assert_allclose(r.odometry.covariances[20], sharp.odometry.covariances[20], rtol=1e-9)
         late = stream.take((stream.times <= 15.01) | (stream.times >= 21.49))
         streams[what] = late
-        with pytest.raises(DataError, match=rf"log/{what}: gap without records.*to 21\.5.*at most 2 s"):
-            reckon(streams["imu"], streams["wheels"], TIMES, NOISE)
+        option = r"at most 2 s \(frontend\.steps\.longest_record\)"
+        with pytest.raises(DataError, match=rf"log/{what}: gap without records.*to 21\.5.*{option}"):
+            reckon(streams["imu"], streams["wheels"], TIMES, NOISE, longest=2.0)
 
 
 def test_a_jump_of_the_clock_is_a_gap() -> None:
@@ -210,7 +211,7 @@ def test_refusals() -> None:
         reckon(weightless, d.wheels, TIMES)
     with pytest.raises(DataError, match="no such interval"):
         reckon(d.imu, d.wheels, TIMES).between(5, 101)
-    for bad in ({"bridge": 0.0}, {"wheel": -1.0}, {"wheel_scale": np.nan}):
+    for bad in ({"filter_time": 0.0}, {"wheel": -1.0}, {"wheel_scale": np.nan}):
         with pytest.raises(ConfigError):
             DeadReckoningNoise(**bad)
 

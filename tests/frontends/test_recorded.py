@@ -150,7 +150,8 @@ def test_bridges_cost_certainty(dim: int) -> None:
         covariances=o.covariances[keep],
     )
     drops = DropCounter()
-    sure = bridge(gap, 5.0, where="odometry", drops=drops)
+    sure, gaps = bridge(gap, 5.0, where="odometry", drops=drops)
+    np.testing.assert_allclose([gaps.begin[0], gaps.end[0]], gap.times[[29, 30]])
     assert drops.counts == {"odometry: gap bridged": 1}
     changed = np.flatnonzero(np.any(sure.covariances != gap.covariances, axis=(1, 2)))
     np.testing.assert_array_equal(changed, [30])
@@ -159,7 +160,11 @@ def test_bridges_cost_certainty(dim: int) -> None:
     assert np.sqrt(sure.covariances[30, x, x]) == pytest.approx(0.2 * metres, rel=0.01)
     with pytest.raises(DataError, match=r"odometry: gap without records: 3\.200 s after record 29"):
         bridge(gap, 3.0, where="odometry")
-    assert bridge(o, 1.0, where="odometry") is not None
+    assert bridge(o, 1.0, where="odometry")[0] is not None
+    # records that are lost, not late: the one after tells its own motion only, and the body drove on meanwhile
+    lost, _ = bridge(o.take(keep), 5.0, where="odometry")
+    speed = np.linalg.norm(log(o.increments[29])[x : x + dim]) / np.diff(o.times)[28]
+    assert np.sqrt(lost.covariances[30, x, x]) == pytest.approx(3.2 * speed, rel=0.2)
 
 
 def test_intervals_that_are_not_there() -> None:

@@ -60,5 +60,24 @@ def test_planar_gap_of_controls() -> None:
     make_steps(replace(log, streams={**log.streams, "wheels": hole}), drops=drops)
     assert drops.counts["square/wheels: gap bridged"] == 1
     hole = wheels.take((wheels.times < 3.1) | (wheels.times > 6.5))
-    with pytest.raises(DataError, match=r"square/wheels: gap without records.*3\.000 to 6\.600"):
-        make_steps(replace(log, streams={**log.streams, "wheels": hole}))
+    wide = replace(log, streams={**log.streams, "wheels": hole})
+    match = r"square/wheels: gap without records.*3\.000 to 6\.600.*at most 3 s \(frontend\.steps\.longest_record\)"
+    with pytest.raises(DataError, match=match):
+        make_steps(wide, StepConfig(longest_record=3.0))
+
+
+def test_a_gap_of_controls_is_as_wide_as_the_robot_drives() -> None:
+    """Speeds of the log are 0.5 and 1 m/s: the last one is held, and what the others are from it is the doubt."""
+    log = planar_log()
+    wheels = log["wheels"]
+    wheels = replace(wheels, speed=np.where(wheels.times < 2.0, 1.0, 0.5))
+    hole = wheels.take((wheels.times < 3.1) | (wheels.times > 6.5))
+    steps = make_steps(replace(log, streams={**log.streams, "wheels": hole}))
+    whole = make_steps(replace(log, streams={**log.streams, "wheels": wheels}))
+    assert len(steps.gaps.begin) == 1
+    length = float(steps.gaps.end[0] - steps.gaps.begin[0])
+    spread = np.sqrt(np.mean((hole.speed - 0.5) ** 2))
+    added = (steps.odometry.covariances - whole.odometry.covariances)[:, 0, 0]
+    assert np.sqrt(added.sum()) == pytest.approx(spread * length, rel=0.05)
+    inside = (steps.times > steps.gaps.begin[0]) & (steps.times - 0.4 < steps.gaps.end[0])
+    np.testing.assert_allclose(added[~inside], 0.0, atol=1e-12)

@@ -1,0 +1,59 @@
+"""Raw streams looked at before a run: what cannot be right in them whatever the map.
+
+Every check rests on what a stream says of itself, on physics, or on two streams that must agree. What is found is a
+line of the verdict; nothing is changed and nothing is dropped here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from graphslam.core.findings import Finding
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LaserScans, VelocityControls
+from graphslam.evaluate.stream_checks_beams import check_beams
+from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
+
+
+@dataclass(frozen=True, slots=True)
+class Noticed:
+    """A finding about one stream.
+
+    Parameters
+    ----------
+    stream : str
+        Its name: what is wrong with a stream that a run does not use does not spoil its map.
+    finding : Finding
+    """
+
+    stream: str
+    finding: Finding
+
+
+def check_streams(log: SensorLog) -> list[Noticed]:
+    """Look at every stream of a log.
+
+    Parameters
+    ----------
+    log : SensorLog
+
+    Returns
+    -------
+    list of Noticed
+        In the order of the streams.
+    """
+    out: list[Noticed] = []
+    wheels = next((s for s in log.streams.values() if isinstance(s, VelocityControls)), None)
+    for name, stream in log.streams.items():
+        found: list[Finding] = []
+        if isinstance(stream, LaserScans | RangeScans | PointClouds):
+            found = check_beams(stream, name)
+        elif isinstance(stream, Imu):
+            found = check_imu(stream, name)
+            if wheels is not None:
+                found += check_turns(stream, wheels, name)
+        out += [Noticed(name, f) for f in found]
+    return out

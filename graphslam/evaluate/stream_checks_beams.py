@@ -1,0 +1,135 @@
+"""Scans that cannot be right: without returns, the same in all beams, repeated, or in another unit."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from frontends.deskew import repeated_clouds, repeated_scans
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LaserScans
+
+Scanner = LaserScans | RangeScans | PointClouds
+Mask = npt.NDArray[np.bool_]
+
+SILENT = 5.0
+"""Scans without any return for so long are worth a look [s]: a robot that drives among things sees some of them."""
+CONSTANT = 1e-3
+"""Ranges of one scan that all lie within so much of each other are no measurement [m]: σ of a range finder is above it,
+and no room is a sphere about the scanner."""
+LEAST_BEAMS = 8
+"""Beams with a return that a scan needs to be called constant."""
+NEAREST, FARTHEST = 0.1, 1000.0
+"""Half of all things are neither nearer nor farther [m]: a body is larger than the one, and no scanner of a robot
+reaches the other."""
+MOST_CLOUDS = 200
+"""Clouds that are decoded for these checks, evenly over the stream: a recording may hold 10⁷ points."""
+SOME = 0.01
+"""Share of the scans above which a fault that no sound scanner has is said."""
+
+
+def check_beams(stream: Scanner, name: str) -> list[Finding]:
+    """Look at the scans of one scanner.
+
+    Parameters
+    ----------
+    stream : LaserScans, RangeScans or PointClouds
+    name : str
+        For the sentences.
+    """
+    if len(stream.times) == 0:
+        return [Finding("bad", "scans-missing", f"{name} holds no scan at all.")]
+    if isinstance(stream, PointClouds):
+        every = -(-len(stream) // MOST_CLOUDS)
+        same = repeated_clouds(stream.cloud(k) for k in range(min(len(stream), MOST_CLOUDS)))
+        stream = stream.take(slice(None, None, every))
+    else:
+        same = repeated_scans(stream.ranges, stream.max_range)
+    least, middle, most, count = _ranges(stream)
+    return [
+        *_silent(stream, name, count),
+        *_constant(name, least, most, count),
+        *_repeated(name, same),
+        *_unit(name, middle[count > 0]),
+    ]
+
+
+def _ranges(stream: Scanner) -> tuple[Array, Array, Array, npt.NDArray[np.int64]]:
+    """Least, median and greatest range of the returns of each scan, and how many there are."""
+    n = len(stream.times)
+    low, middle, high = np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan)
+    count = np.zeros(n, dtype=np.int64)
+    for k in range(n):
+        if isinstance(stream, PointClouds):
+            r = np.linalg.norm(stream.cloud(k) - stream.origin, axis=1)
+        else:
+            r = stream.ranges[k]
+            with np.errstate(invalid="ignore"):
+                r = r[(r > 0) & (r < stream.max_range)]
+        count[k] = len(r)
+        if len(r):
+            low[k], middle[k], high[k] = r.min(), np.median(r), r.max()
+    return low, middle, high, count
+
+
+def _silent(stream: Scanner, name: str, count: npt.NDArray[np.int64]) -> list[Finding]:
+    t, none = stream.times, count == 0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], none, [False]]).astype(np.int8)))
+    runs = [(a, b) for a, b in edges.reshape(-1, 2)]
+    if not runs:
+        return []
+    last = len(t) - 1
+    lengths = [float(t[min(b, last)] - t[a]) for a, b in runs]
+    worst = int(np.argmax(lengths))
+    share = float(none.mean())
+    if share < 0.5 and lengths[worst] < SILENT:
+        return []
+    said = f"{int(none.sum())} of {len(t)} scans of {name} hold no return"
+    where = f"the longest stretch is {lengths[worst]:.1f} s from {t[runs[worst][0]]:.2f} s"
+    if isinstance(stream, PointClouds):
+        cause = "the clouds are empty"
+    else:
+        r = stream.ranges[none]
+        kinds = {"no reading": np.isnan(r), "at or beyond max_range": r >= stream.max_range, "zero or less": r <= 0}
+        most = max(kinds, key=lambda k: int(kinds[k].sum()))
+        cause = f"most beams there are {most}"
+        if most == "at or beyond max_range":
+            cause += f", {stream.max_range:g} m (are the ranges in millimetres?)"
+    text = f"{said}; {where}; {cause}. The map knows nothing of it, and the path there is that of the odometry."
+    return [Finding("bad" if share > 0.5 else "look", "scans-silent", text)]
+
+
+def _constant(name: str, low: Array, high: Array, count: npt.NDArray[np.int64]) -> list[Finding]:
+    flat = (count >= LEAST_BEAMS) & (high - low < CONSTANT)
+    if flat.mean() <= SOME:
+        return []
+    text = (
+        f"{int(flat.sum())} of {len(flat)} scans of {name} have the same range in all beams "
+        f"({np.median(low[flat]):.3g} m): the sensor or its driver is stuck. Leave the stream out, or mend it."
+    )
+    return [Finding("bad", "scans-constant", text)]
+
+
+def _repeated(name: str, same: Mask) -> list[Finding]:
+    share = float(same.mean())
+    if share <= SOME:
+        return []
+    text = (
+        f"{int(same.sum())} of {len(same)} scans of {name} are the one before, number for number: the driver sends "
+        "scans twice, or the sensor is stuck. Front ends on grids leave them out."
+    )
+    return [Finding("bad" if share > 0.5 else "look", "scans-repeated", text)]
+
+
+def _unit(name: str, middle: Array) -> list[Finding]:
+    if not len(middle):
+        return []
+    usual = float(np.median(middle))
+    if NEAREST <= usual <= FARTHEST:
+        return []
+    unit = "kilometres" if usual < NEAREST else "millimetres"
+    text = f"Half of the returns of {name} are {'nearer' if usual < NEAREST else 'farther'} than {usual:.3g} m: "
+    return [Finding("bad", "scans-unit", text + f"the ranges seem to be in {unit}, wanted metres.")]
