@@ -33,7 +33,7 @@ def check_covariance(
     CovarianceError
     """
     P = np.array(cov, dtype=np.float64)
-    if P.ndim != 2 or P.shape[0] != P.shape[1] or (dim is not None and P.shape[0] != dim):
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or dim not in (None, len(P)):
         wanted = f"({dim}, {dim})" if dim is not None else "a square matrix"
         raise CovarianceError(f"{what} has the wrong shape", where=where, got=P.shape, wanted=wanted)
     if not np.all(usable(P)):
@@ -42,7 +42,7 @@ def check_covariance(
             f"{what} is not finite", where=where, got=f"{P[i, j]} at ({i}, {j})", wanted="finite numbers"
         )
     scale = np.sqrt(np.abs(np.diag(P)))
-    bound = 1e-6 * np.maximum(np.outer(scale, scale), 1e-300)
+    bound = 1e-6 * np.outer(scale, scale)
     if np.any(np.abs(P - P.T) > bound):
         i, j = np.argwhere(np.abs(P - P.T) > bound)[0]
         raise CovarianceError(

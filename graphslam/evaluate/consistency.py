@@ -54,16 +54,14 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
     e, P = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     if P.shape[-2:] != (e.shape[-1], e.shape[-1]):
         raise CovarianceError("covariance does not fit the error", got=P.shape, wanted=(*e.shape, e.shape[-1]))
-    flat = P.reshape(-1, *P.shape[-2:])
-    asymmetric = np.abs(flat - np.swapaxes(flat, -1, -2)).max(axis=(-1, -2), initial=0.0) > 1e-6 * np.abs(flat).max(
-        axis=(-1, -2), initial=1e-300
-    )
+    turned = np.swapaxes(P, -1, -2)
+    asymmetric = np.abs(P - turned).max(axis=(-1, -2)) > 1e-6 * np.abs(P).max(axis=(-1, -2))
     try:
-        if np.any(asymmetric) or not np.all(np.isfinite(flat)):
+        if np.any(asymmetric) or not np.all(np.isfinite(P)):
             raise np.linalg.LinAlgError
-        L = np.linalg.cholesky(P)
+        L = np.linalg.cholesky(0.5 * (P + turned))  # what check_covariance judges, so that it finds what failed here
     except np.linalg.LinAlgError:
-        for k, one in enumerate(flat):
+        for k, one in enumerate(P.reshape(-1, *P.shape[-2:])):
             check_covariance(one, what=f"covariance {k}")
         raise
     y = np.linalg.solve(L, e[..., None])[..., 0]

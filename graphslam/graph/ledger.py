@@ -132,10 +132,9 @@ second time: submap 0 spent it over [0.000, 10.000) s
     def refund(self, factor_id: int) -> None:
         """Take a factor's spendings back (the factor was removed)."""
         for e in self._by_factor.pop(factor_id, []):
-            entries = self._exclusive.get(e.stream, [])
-            i = bisect_left(entries, e)
-            if i < len(entries) and entries[i] == e:
-                del entries[i]
+            if e.kind == EXCLUSIVE:
+                entries = self._exclusive[e.stream]
+                del entries[bisect_left(entries, e)]
 
     def entries(self) -> list[Entry]:
         """All entries in order of time."""

@@ -16,6 +16,7 @@ from graphslam.core.gaussian import (
     check_covariance,
     chi2_mean_bounds,
     chi2_quantile,
+    equal_tail_gate,
     moment_match,
 )
 
@@ -126,6 +127,123 @@ def test_rounding_asymmetry_is_averaged_not_refused() -> None:
 def test_small_but_clear_asymmetry_is_refused_whatever_the_scale() -> None:
     with pytest.raises(CovarianceError, match="not symmetric"):
         check_covariance(1e-12 * np.array([[1.0, 0.5], [0.4, 1.0]]))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e4, 1e-3), (1e-9, 1e-9)])
+def test_what_counts_as_rounding_is_a_millionth_of_the_two_sigmas(units: tuple[float, float], sign: float) -> None:
+    """Sums of float32 figures differ by 1e-7 of σ_i σ_j; a wrong sign or a lost term by far more, in whatever units."""
+    unit = np.outer(units, units)
+    for off, refused in ((0.7e-6, False), (1.4e-6, True)):
+        P = unit * np.array([[1.0, 0.3 + sign * off], [0.3, 1.0]])
+        if refused:
+            with pytest.raises(CovarianceError, match="not symmetric"):
+                check_covariance(P)
+        else:
+            np.testing.assert_allclose(check_covariance(P), unit * np.array([[1, 0.3], [0.3, 1]]), rtol=3e-6)
+
+
+def test_refusals_name_the_first_bad_element_and_its_value() -> None:
+    P = np.eye(4)
+    P[1, 3] = P[3, 1] = np.nan
+    with pytest.raises(CovarianceError, match=r"nan at \(1, 3\)"):
+        check_covariance(P)
+    P[1, 3], P[3, 1] = 0.25, 0.5
+    with pytest.raises(CovarianceError, match=r"0\.25 and 0\.5 at \(1, 3\)"):
+        check_covariance(P)
+    with pytest.raises(CovarianceError, match="smallest eigenvalue -2"):
+        check_covariance(np.diag([3.0, -2.0, 1.0]))
+    with pytest.raises(CovarianceError, match="symmetric"):  # a variance below zero has no root, and no warning either
+        check_covariance([[-1.0, 0.2], [0.1, 1.0]])
+
+
+def test_a_gaussian_holds_checked_copies() -> None:
+    mean, P = [1.0, 2.0], [[2.0, 0.5 + 1e-9], [0.5, 1.0]]
+    g = Gaussian(mean, P)
+    assert isinstance(g.mean, np.ndarray)
+    np.testing.assert_array_equal(g.covariance, g.covariance.T)
+    with pytest.raises(CovarianceError, match=r"\(2, 2\)"):
+        Gaussian(mean, np.eye(3))
+    with pytest.raises(CovarianceError):
+        Gaussian(mean, -np.eye(2))
+
+
+def test_differences_of_many_points_wrap_each_heading_and_nothing_else() -> None:
+    g = Gaussian([10.0, 3.0, -3.0], np.eye(3), angular=(1, 2))
+    x = np.array([[20.0, -3.0, 3.0], [0.0, 3.1, -3.1]])
+    tau = 2 * np.pi
+    np.testing.assert_allclose(g.difference(x), [[10.0, tau - 6.0, 6.0 - tau], [-10.0, 0.1, -0.1]], atol=1e-12)
+
+
+def test_forms_of_a_gaussian_keep_its_angles_and_kl_wraps_them(rng: np.random.Generator) -> None:
+    P = random_covariance(rng, 3)
+    g = Gaussian([1.0, 2.0, 3.1], P, angular=(2,))
+    assert g.to_information().to_gaussian((2,)).angular == (2,)
+    info = g.to_information().matrix.toarray()
+    np.testing.assert_array_equal(info, info.T)
+    np.testing.assert_allclose(info, np.linalg.inv(P), rtol=1e-9)
+    turned = Gaussian([1.0, 2.0, 3.1 - 2 * np.pi], P, angular=(2,))
+    assert g.kl_from(turned) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_kl_of_correlated_gaussians_against_sampling(rng: np.random.Generator) -> None:
+    """KL(p ‖ q) is the mean of log p - log q over draws of p: a halved covariance or a dropped term does not fit."""
+    p = Gaussian(rng.normal(size=3), random_covariance(rng, 3))
+    q = Gaussian(p.mean + 0.3, 1.5 * random_covariance(rng, 3))
+    x = rng.multivariate_normal(p.mean, p.covariance, size=100_000)
+    ratio = stats.multivariate_normal(p.mean, p.covariance).logpdf(x)
+    ratio -= stats.multivariate_normal(q.mean, q.covariance).logpdf(x)
+    assert p.kl_from(q) == pytest.approx(ratio.mean(), abs=5 * ratio.std() / np.sqrt(len(x)))
+
+
+def test_covariance_blocks_are_symmetric_to_the_bit_and_in_the_order_asked(rng: np.random.Generator) -> None:
+    P = random_covariance(rng, 6)
+    info = Gaussian(np.zeros(6), P).to_information()
+    block = info.covariance_block([4, 1])
+    np.testing.assert_array_equal(block, block.T)
+    np.testing.assert_allclose(block, P[np.ix_([4, 1], [4, 1])], rtol=1e-8)
+    moments = info.to_gaussian().covariance
+    np.testing.assert_array_equal(moments, moments.T)
+
+
+def test_factors_need_no_pivots_and_little_fill_in() -> None:
+    """An arrow: eliminated from its point every entry fills in, in a fill-reducing order none does."""
+    n = 60
+    A = np.diag(np.full(n, 10.0))
+    A[0, :] = A[:, 0] = 0.1
+    A[0, 0] = 10.0
+    factor = Information(sp.csc_matrix(A), np.zeros(n)).factor()
+    assert factor.L.nnz == 2 * n - 1
+    np.testing.assert_array_equal(factor.perm_r, factor.perm_c)  # symmetric: rows go with columns
+
+
+@pytest.mark.parametrize("gate", [5.99, 13.8])
+@pytest.mark.parametrize(("dof", "other"), [(2, 3), (3, 1), (2, 6)])
+def test_equal_gates_fail_equally_many_good_observations(gate: float, dof: int, other: int) -> None:
+    rng = np.random.default_rng(dof + other)
+    n = 200_000
+    share = stats.chi2.sf(gate, dof)
+    failed = np.mean(rng.chisquare(other, n) > equal_tail_gate(gate, dof, other))
+    assert failed == pytest.approx(share, abs=5 * np.sqrt(share / n))
+    assert equal_tail_gate(gate, dof, dof) == pytest.approx(gate)
+
+
+def test_moment_matching_weighs_covariances_and_wraps_differences(rng: np.random.Generator) -> None:
+    """Two headings on both sides of the cut, 3 : 1, each with a covariance of its own: by hand."""
+    covariances = np.array([np.diag([1.0, 0.04]), np.diag([3.0, 0.02])])
+    g = moment_match([3.0, 1.0], [[0.0, np.pi - 0.01], [4.0, -np.pi + 0.01]], covariances, angular=(1,))
+    assert g.mean[0] == pytest.approx(1.0)
+    mean = np.angle(0.75 * np.exp(1j * (np.pi - 0.01)) + 0.25 * np.exp(1j * (np.pi + 0.01)))
+    assert g.mean[1] == pytest.approx(mean)
+    a, b = np.pi - 0.01 - mean, np.pi + 0.01 - mean
+    between = 0.75 * np.outer([-1.0, a], [-1.0, a]) + 0.25 * np.outer([3.0, b], [3.0, b])
+    np.testing.assert_allclose(g.covariance, np.diag([1.5, 0.035]) + between, atol=1e-12)
+    np.testing.assert_array_equal(g.covariance, g.covariance.T)
+    assert g.angular == (1,)
+
+
+def test_bounds_are_of_95_percent_unless_said_otherwise() -> None:
+    assert chi2_mean_bounds(3, 10) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 30) / 10))
 
 
 def test_chi2_bounds_hold_the_stated_share_of_means(rng: np.random.Generator) -> None:

@@ -81,6 +81,29 @@ def test_bad_covariance_is_named(cov: np.ndarray, what: str) -> None:
         nees(np.zeros((2, 2)), np.stack([np.eye(2), cov]))
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-8])
+def test_asymmetry_of_rounding_is_averaged_and_more_is_refused(scale: float) -> None:
+    """A millionth of the largest entry; which triangle a factorisation happens to read does not matter."""
+    P = scale * np.array([[1.0, 0.5 + 7e-7], [0.5, 1.0]])
+    assert nees([1.0, -1.0], P) == pytest.approx(nees([1.0, -1.0], P.T), rel=1e-12)
+    assert scale * nees([1.0, -1.0], P) == pytest.approx(4.0, rel=1e-5)
+    P = scale * np.array([[1.0, 0.5 + 1.4e-6], [0.5, 1.0]])
+    with pytest.raises(CovarianceError, match="covariance 0 is not symmetric"):
+        nees([1.0, 1.0], P)
+    # nearly singular: the lower triangle alone is not positive definite, their mean is
+    P = np.array([[1.0, 1.0 - 6e-7], [1.0 + 1e-7, 1.0]])
+    assert nees([1.0, 1.0], P) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_joint_nees_of_no_error_is_zero_and_of_both_forms_is_refused() -> None:
+    assert joint_nees(np.zeros(3), information=sp.eye_array(3)) == 0.0
+    assert joint_nees(np.zeros(3), covariance=np.eye(3)) == 0.0
+    with pytest.raises(CovarianceError, match="either"):
+        joint_nees(np.zeros(2), covariance=np.eye(2), information=sp.eye_array(2))
+    with pytest.raises(CovarianceError, match=r"\(3, 3\)"):
+        joint_nees(np.zeros(3), covariance=np.eye(2))
+
+
 def test_covariance_of_another_size_is_refused() -> None:
     with pytest.raises(CovarianceError, match="does not fit"):
         nees(np.zeros(3), np.eye(2))
@@ -94,8 +117,9 @@ def test_pose_error_is_the_right_tangent(rng: np.random.Generator) -> None:
     T = se3_exp(rng.normal(size=(5, 6)))
     assert np.allclose(pose_error(T, se3_compose(T, se3_exp(xi))), xi, atol=1e-12)
     assert np.allclose(vector_pose_error([0, 0, 3.1], [1, 2, -3.1]), [1, 2, 2 * np.pi - 6.2])
-    with pytest.raises(DataError, match="differ in kind"):
-        pose_error(np.zeros(3), np.zeros(7))
+    for a, b in ((3, 7), (7, 3), (4, 4), (8, 8), (6, 6)):
+        with pytest.raises(DataError, match="differ in kind"):
+            pose_error(np.zeros(a), np.zeros(b))
 
 
 # --- power ---------------------------------------------------------------------------------------------------
@@ -168,6 +192,66 @@ def test_missing_values_narrow_the_evidence_not_the_result(rng: np.random.Genera
     assert high[2] - low[2] > high[0] - low[0]
     assert mean[2] == pytest.approx(d2[:10, 2].mean() / 2)
     assert judged(d2, 2).count == 110
+    d2[:, 1] = np.nan
+    with pytest.raises(DataError, match=r"column has no value.*1"):
+        judged(d2, 2).curve()
+
+
+def test_one_value_a_run_may_come_as_a_plain_row() -> None:
+    c = judged(np.array([3.0, 1.0, 2.0]), 2)
+    assert (c.runs, c.count) == (3, 3)
+    assert c.mean_normalised == pytest.approx(1.0)
+    assert (judged(np.array(4.0), 2).runs, judged(np.ones((2, 3)), 2).runs) == (1, 2)
+    with pytest.raises(DataError, match="at least one value"):
+        judged(np.ones((2, 2, 2)), 2)
+
+
+def test_a_run_counts_as_one_draw_of_its_least_degrees_of_freedom() -> None:
+    """Values of 3 and 2 degrees of freedom in a run: its mean is spread as the widest; missing ones do nothing."""
+    dof = np.array([[3.0, 2.0, 1.0], [3.0, 3.0, 1.0]])
+    d2 = np.array([[3.0, 4.0, np.nan], [6.0, 3.0, np.nan]])
+    c = Consistency(quantity="x", nees=d2, dof=dof, gauge=GAUGE)
+    assert c.mean_normalised == pytest.approx(np.mean([(1.0 + 2.0) / 2, (2.0 + 1.0) / 2]))
+    assert c.bounds == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 4) / 4))
+    assert c.dimension == pytest.approx(11 / 4)
+    mean, low, high = Consistency(quantity="x", nees=d2[:, :2], dof=dof[:, :2], gauge=GAUGE).curve()
+    np.testing.assert_allclose(mean, [1.5, 1.5])
+    np.testing.assert_allclose(low, [stats.chi2.ppf(0.025, 6) / 6, stats.chi2.ppf(0.025, 4) / 4])
+    np.testing.assert_allclose(high, [stats.chi2.ppf(0.975, 6) / 6, stats.chi2.ppf(0.975, 4) / 4])
+    value = Consistency(quantity="x", nees=d2, dof=dof, gauge=GAUGE, unit="value")
+    assert value.mean_normalised == pytest.approx(16 / 11)
+    assert value.bounds == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 11) / 11))
+
+
+def test_a_column_is_judged_by_the_runs_that_have_it() -> None:
+    """A value that is missing does not lend its degrees of freedom."""
+    d2 = np.array([[2.0, 1.0], [np.nan, 1.0], [4.0, 1.0]])
+    dof = np.array([[2.0, 1.0], [1.0, 1.0], [2.0, 1.0]])
+    mean, low, high = Consistency(quantity="x", nees=d2, dof=dof, gauge=GAUGE, confidence=0.8).curve()
+    assert mean[0] == pytest.approx(1.5)
+    assert (low[0], high[0]) == pytest.approx(tuple(stats.chi2.ppf([0.1, 0.9], 4) / 4))
+
+
+def test_bounds_of_coverage_count_independent_units(rng: np.random.Generator) -> None:
+    """An honest estimator's coverage lies within as often as stated: runs or values, whichever are independent."""
+    d2 = rng.chisquare(3, size=(40, 5))
+    for unit, n in (("run", 40), ("value", 200)):
+        low, high = judged(d2, 3, unit=unit, confidence=0.9).coverage_bounds
+        draws = rng.binomial(n, 0.9, size=20_000) / n
+        inside = np.mean((draws >= low) & (draws <= high))
+        assert 0.9 <= inside < 0.96  # the binomial is discrete: not less than stated, and not much more
+        assert np.mean(draws > high) == pytest.approx(np.mean(draws < low), abs=0.04)
+
+
+def test_values_on_the_border_are_consistent_and_outside_their_region() -> None:
+    """Eq. 19 asks for D² below the quantile; the verdict for a mean beyond its bounds."""
+    edge = float(stats.chi2.ppf(0.95, 2))
+    c = judged(np.array([[edge * (1 - 1e-12)], [edge], [edge * (1 + 1e-12)], [0.1]]), 2)
+    assert c.coverage == pytest.approx(0.5, abs=0.26)
+    low, high = judged(np.ones((3, 1)), 2).bounds
+    for value, verdict in ((low * 2, "consistent"), (low * 1.99, "pessimistic"), (high * 2, "consistent")):
+        assert judged(np.full((3, 1), value), 2).verdict == verdict
+    assert judged(np.full((3, 1), high * 2.01), 2).verdict == "over-confident"
 
 
 def test_row_states_gauge_dimension_runs_and_confidence() -> None:
@@ -178,7 +262,18 @@ def test_row_states_gauge_dimension_runs_and_confidence() -> None:
     assert row["low"] == pytest.approx(stats.chi2.ppf(0.05, 12) / 12)
     assert row["high"] == pytest.approx(stats.chi2.ppf(0.95, 12) / 12)
     assert row["ci_honest"] == pytest.approx(3 / stats.chi2.ppf(0.9, 3))
-    assert GAUGE in judged(np.ones((2, 1)), 3)._repr_html_()
+    page = judged(np.ones((2, 1)), 3)._repr_html_()
+    assert GAUGE in page
+    assert "<td>0.3333</td>" in page
+
+
+def test_row_has_mean_and_median_of_the_known_indices() -> None:
+    q = stats.chi2.ppf(0.95, 3)
+    row = judged(np.array([[1.0, 2.0], [6.0, np.nan]]), 3).as_row()
+    assert (row["ci_mean"], row["ci_median"]) == pytest.approx((3.0 / q, 2.0 / q))
+    assert row["coverage"] == 1.0
+    assert row["unit"] == "run"
+    assert row["quantity"] == "x"
 
 
 def test_different_dimensions_are_weighted_by_their_degrees_of_freedom() -> None:
@@ -195,6 +290,8 @@ def test_different_dimensions_are_weighted_by_their_degrees_of_freedom() -> None
         ([[-1.0]], 3, {}),
         ([[np.inf]], 3, {}),
         ([[1.0]], 0, {}),
+        ([[1.0]], 0.99, {}),
+        ([[1.0]], 3, {"confidence": 0.0}),
         ([[1.0]], 3, {"confidence": 1.0}),
         ([[1.0]], 3, {"unit": "landmark"}),
     ],

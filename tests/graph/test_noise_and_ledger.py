@@ -103,6 +103,29 @@ def test_refund_makes_room_for_the_same_evidence_only(ledger):
         ledger.spend(3, "again", ["laser"], (15.0, 16.0))
 
 
+def test_refund_of_a_declared_factor_frees_nobody_elses_evidence(ledger):
+    """A scan match over the interval of a submap: removing the match must not make the submap's scans free again."""
+    ledger.spend(-1, "match before", ["laser"], (0.0, 10.0), kind="shared-scan")
+    ledger.spend(7, "match after", ["laser"], (15.0, 20.0), kind="shared-scan")
+    ledger.refund(-1)
+    ledger.refund(7)
+    assert [e.factor for e in ledger.entries() if e.stream == "laser"] == ["submap 0", "submap 1"]
+    for interval in ((0.0, 10.0), (10.0, 20.0)):
+        with pytest.raises(EvidenceReusedError):
+            ledger.spend(8, "again", ["laser"], interval)
+    ledger.refund(99)  # never entered
+    assert len(ledger) == 4
+
+
+def test_a_stream_named_twice_is_spent_once_and_refusals_name_the_first_stream(ledger):
+    streams = [f"beacon {c}" for c in "hgfedcbaijkl"]
+    ledger.spend(2, "beacons", [*streams, *streams], (0.0, 1.0))
+    assert len(ledger) == 4 + len(streams)
+    # whatever the order in which they are given: the same words at every run
+    with pytest.raises(EvidenceReusedError, match="'beacon a'"):
+        ledger.spend(3, "again", streams, (0.5, 2.0))
+
+
 @pytest.mark.parametrize("interval", [(1.0, 0.0), (np.nan, 1.0), (0.0, np.inf)])
 def test_impossible_intervals(ledger, interval):
     with pytest.raises(DataError, match="interval"):
