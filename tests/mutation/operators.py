@@ -1,7 +1,8 @@
 """Small changes of a program's meaning, found in its syntax tree: what a good test suite must notice.
 
 Left alone, because no test of behaviour could or should tell: docstrings, annotations, decorators, imports, the words
-of error messages, assertions, and conversions of types (``float(x)``, ``np.asarray(x)``, ``dtype=``: for mypy).
+of error messages, assertions, and conversions of types (``float(x)``, ``np.asarray(x)``, ``dtype=``: for mypy);
+and how notebooks show things.
 """
 
 from __future__ import annotations
@@ -114,6 +115,8 @@ def _changes(node: ast.AST, scope: str, statement: ast.stmt | None) -> Iterator[
                 continue
             owner = child if isinstance(child, ast.stmt) else statement
             inside = scope
+            if isinstance(child, ast.FunctionDef) and child.name == "_repr_html_":
+                continue
             if isinstance(child, ast.FunctionDef | ast.ClassDef):
                 inside = child.name if scope == "<module>" else f"{scope}.{child.name}"
             if owner is not None and not _is_docstring(child):
