@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 
 OPTION = "frontend.steps.longest_record"
-"""The option that limits gaps, by its full name."""
+"""The option that limits gaps of steps, by its full name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,10 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
     return Gaps(known[k], known[k + 1])
 
 
-def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str) -> None:
-    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds.
+def refuse_long(
+    stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION
+) -> None:
+    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets.
 
     Raises
     ------
@@ -73,5 +75,5 @@ def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where:
             f"gap without records: {spacing[worst]:.3f} s after record {worst}",
             where=where,
             got=f"{stamps[worst]:.3f} to {stamps[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s ({OPTION})",
+            wanted=f"gaps of at most {limit:g} s ({option})",
         )

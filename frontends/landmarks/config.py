@@ -126,6 +126,8 @@ class FilterConfig:
     """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
     control_hold: float = 0.5
     """Scans up to this long before the first control are used, with that control held backwards [s]."""
+    longest_gap: float = 60.0
+    """Longest time without a record of the motion that is bridged [s] (:mod:`frontends.motion_gaps`)."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None
@@ -138,6 +140,8 @@ class FilterConfig:
     def __post_init__(self) -> None:
         if self.particles < 1:
             raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
+        if not self.longest_gap >= 0:
+            raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
         if self.proposal not in ("1.0", "2.0"):
             raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
         if self.association not in ("likelihood", "known"):

@@ -38,6 +38,8 @@ class EkfFilterConfig:
     """Observations beyond are not used [m]."""
     control_hold: float = 0.5
     """Scans up to this long before the first control are used, with that control held backwards [s]."""
+    longest_gap: float = 60.0
+    """Longest time without a record of the motion that is bridged [s] (:mod:`frontends.motion_gaps`)."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None
@@ -53,6 +55,8 @@ class EkfFilterConfig:
     def __post_init__(self) -> None:
         if self.association not in ("known", "nearest", "jcbb"):
             raise ConfigError(f"association = {self.association!r}; known: known, nearest, jcbb")
+        if not self.longest_gap >= 0:
+            raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
         if not 0 < self.gate <= self.gate_new:
             raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
         if not self.outlier_gate >= 0:

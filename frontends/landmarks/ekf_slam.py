@@ -43,6 +43,7 @@ class _Run:
 
     def __init__(self, data: Prepared, config: EkfSlamConfig | EkfConfig, first: int, t_start: float) -> None:
         obs = data.observations
+        self.local = isinstance(config, EkfConfig)
         self.data, self.config, self.first, self.t_start = data, config, first, t_start
         self.next = first
         self.map = EkfMap(config, obs.T_base_sensor, obs.field_of_view, obs.max_range)
@@ -53,7 +54,7 @@ class _Run:
     def advance(self) -> None:
         """Take in the next scan."""
         obs, k = self.data.observations, self.next
-        rows = obs.scan(k)
+        rows = self.data.scan(k) if self.local else obs.scan(k)
         if self.config.association == "known":
             known = known_slots(obs, rows, self.slots)
         else:
@@ -91,9 +92,12 @@ class _Run:
     def report(self, used: int) -> dict[str, Any]:
         """Counts and the filter's own figures of honesty."""
         m, c = self.map, self.config
+        offsets = self.data.observations.offsets
         out: dict[str, Any] = {
+            "gaps": self.data.gaps_in(self.first, self.next),
             "scans": m.scans,
             "observations": m.observations,
+            "after_gap": int(offsets[self.next] - offsets[self.first]) - m.observations,
             "used": used,
             "not_associated": m.observations - used,
             "founded": m.foundings,
@@ -230,6 +234,8 @@ class Ekf:
                 run.map, now - previous, data.odometry.increments[k], int(obs.offsets[k + 1] - obs.offsets[k])
             )
             previous = now
+            if data.splits(run.next):
+                ended = "gap"
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
         if self.config.handover == "filter":
             return run.submap(key, report), run.next

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from frontends.landmarks.config import RangeBearingNoise
-from frontends.motion import MotionNoise, dead_reckoning, motion_stream
+from frontends.motion import MotionNoise, motion_stream
+from frontends.motion_gaps import SHORTEST, MotionGap, bridged_reckoning
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -36,6 +37,10 @@ class PrepareConfig(Protocol):
     @property
     def control_hold(self) -> float:
         """Scans up to this long before the first control are used, with that control held backwards [s]."""
+
+    @property
+    def longest_gap(self) -> float:
+        """Longest time without a record of the motion that is bridged [s]."""
 
     @property
     def motion(self) -> MotionNoise:
@@ -83,6 +88,32 @@ class Prepared:
     odometry: Odometry
     t_start: float
     uses: frozenset[str]
+    gaps: tuple[MotionGap, ...] = ()
+    """Gaps of the motion that were bridged."""
+
+    def unseen_gap(self, scan: int) -> bool:
+        """Does a gap of the motion end at a scan, with no scan in it? Then nothing tells where the robot went."""
+        t0 = self.observations.times[scan - 1] if scan else self.t_start
+        t1 = self.observations.times[scan]
+        return any(min(g.end, t1) - max(g.begin, t0) > SHORTEST for g in self.gaps)
+
+    def scan(self, scan: int) -> slice:
+        """Rows of a scan that a submap can use: none after an unseen gap, for the base is no longer near them."""
+        rows = self.observations.scan(scan)
+        return slice(rows.start, rows.start) if self.unseen_gap(scan) else rows
+
+    def splits(self, scan: int) -> bool:
+        """Does a submap end before a scan? The motion over an unseen gap is a submap by itself: its uncertainty is too
+        large for a map to be linear in it.
+        """
+        return scan < len(self) and (self.unseen_gap(scan) or (scan > 0 and self.unseen_gap(scan - 1)))
+
+    def gaps_in(self, first: int, last: int) -> list[dict[str, float]]:
+        """Gaps that end in the scans ``first … last - 1``, for the report of a submap."""
+        begin = self.observations.times[first - 1] if first else -np.inf
+        end = self.observations.times[last - 1] if last < len(self) else np.inf
+        unseen = [k for k in range(first, last) if self.unseen_gap(k)]
+        return [g.as_row() | {"unseen": float(bool(unseen))} for g in self.gaps if begin < g.end <= end]
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -165,11 +196,14 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # the map is made of what the filter saw
     t_start = float(min(motion.times[0], scans.times[0]))
     stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
-    odometry, motion_name = dead_reckoning(log, stamps, config.motion, hold=config.control_hold)
+    odometry, motion_name, gaps = bridged_reckoning(
+        log, stamps, config.motion, hold=config.control_hold, limit=config.longest_gap, drops=drops
+    )
     if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
         odometry = odometry.take(slice(1, None))
     rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
-    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, frozenset({motion_name, stream}))
+    uses = frozenset({motion_name, stream})
+    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, uses, tuple(gaps))
 
 
 def _variances(scans: LandmarkObservations, noise: RangeBearingNoise | None) -> Array:

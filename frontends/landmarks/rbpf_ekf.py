@@ -91,7 +91,7 @@ class RbpfEkf:
         ended, scan = None, first
         previous = t_start
         while ended is None and scan < len(obs.times):
-            rows = obs.scan(scan)
+            rows = data.scan(scan)
             known = self._known(obs, rows, slots)
             u, Q = data.odometry.increments[scan], data.odometry.covariances[scan]
             for filter in filters:
@@ -99,6 +99,8 @@ class RbpfEkf:
             ended = stopping.reason(particles, float(obs.times[scan]) - previous, u, rows.stop - rows.start)
             previous = float(obs.times[scan])
             scan += 1
+            if data.splits(scan):
+                ended = "gap"
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
         return self._summarise(data, filters, key, first, scan, t_start, slots, report), particles, scan
 
@@ -154,9 +156,11 @@ class RbpfEkf:
         if c.pooled:
             report |= distance("pooled", made.pooled, smoothed.gaussian) | {"dropped_filters": made.dropped_filters}
         report |= {
+            "gaps": data.gaps_in(first, last),
             "handover": c.handover,
             "scans": last - first,
             "observations": int(particles.observations),
+            "after_gap": int(obs.offsets[last] - obs.offsets[first]) - int(particles.observations),
             "used": int(smoothed.kept.sum()),
             "not_associated": int(particles.observations - len(association.observation)),
             "trimmed": int(len(smoothed.kept) - smoothed.kept.sum()),

@@ -167,6 +167,7 @@ class RbpfSlam:
         assert end.gaussian is not None
         report: dict[str, Any] = {
             "ended": "end-of-log",
+            "gaps": data.gaps_in(0, len(times)),
             "scans": p.scans,
             "observations": p.observations,
             "resamplings": p.resamplings,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
@@ -41,6 +43,8 @@ def sighting_findings(
     reasons = [f"{n} {k}" for k, n in lost.items()]
     if seen - used - trimmed > 0:
         reasons.append(f"{seen - used - trimmed} that no landmark explains, or a single one")
+    if after := sum(int(r.get("after_gap", 0)) for r in reports):
+        reasons.append(f"{after} right after a gap without wheels and scans")
     if trimmed:
         reasons.append(f"{trimmed} trimmed as outliers")
     why = ", ".join(reasons)
@@ -56,7 +60,7 @@ def sighting_findings(
             "landmarks are seen again. Check units, signs and identities of the sightings, and the speeds."
         )
         out.append(Finding("bad", "sightings-not-used", text))
-    return out + _particles(reports)
+    return out + _particles(reports) + _gaps(reports)
 
 
 def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
@@ -72,3 +76,29 @@ def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
         "particles, shorter submaps, or rbpf-ekf, which smooths its submaps."
     )
     return [Finding("bad", "particles", text)]
+
+
+def _gaps(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Gaps of the motion that were bridged."""
+    out = []
+    for r in reports:
+        for g in r.get("gaps", ()):
+            text = (
+                f"No motion was recorded from {g['begin']:.1f} to {g['end']:.1f} s ({g['end'] - g['begin']:.1f} s). It "
+                f"was bridged by {g['speed']:.2f} ± {g['speed_sigma']:.2g} m/s and {np.rad2deg(g['yaw_rate']):.1f} ± "
+                f"{np.rad2deg(g['yaw_rate_sigma']):.2g} °/s, which is how the robot drives elsewhere in the log; "
+            )
+            if not g["unseen"]:
+                out.append(Finding("look", "motion-gap", text + "the sightings went on, and decide."))
+            elif r["scans"] == 1:
+                text += (
+                    "no sighting came either, so the map is split there. Look whether the place is right afterwards."
+                )
+                out.append(Finding("look", "motion-gap", text))
+            else:
+                text += (
+                    "no sighting came either, and a single map over the whole log cannot hold so large an uncertainty. "
+                    "Use rbpf-ekf or ekf, which split their maps there."
+                )
+                out.append(Finding("bad", "motion-gap", text))
+    return out
