@@ -58,9 +58,7 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
     return Gaps(known[k], known[k + 1])
 
 
-def refuse_long(
-    stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION
-) -> None:
+def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION) -> None:
     """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets.
 
     Raises
