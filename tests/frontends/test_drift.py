@@ -10,15 +10,21 @@ from frontends.recorded import RecordedErrors
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.records import Odometry
 
-PURE = dict.fromkeys(("position_walk", "position_scale", "z_walk", "z_scale", "heading_walk", "heading_scale"), 0.0)
+PURE = dict.fromkeys(
+    ("position_walk", "position_scale", "z_walk", "z_scale", "heading_walk", "heading_scale", "bend"), 0.0
+)
+
+BENT = DriftModel(dim=2, position_start=0.01, position_walk=0.03, position_scale=0.0, heading_start=0.002,
+                  heading_walk=0.002, heading_scale=0.001, bend=1.0)  # fmt: skip
+"""As :func:`straight_errors` draws them."""
 
 
 def test_each_term_is_what_it_says() -> None:
     model = DriftModel(**{**PURE, "position_walk": 0.02, "z_scale": 0.004, "heading_scale": 0.001})
     C = model.covariance(25.0)
-    assert C[3, 3] == pytest.approx(0.01**2 + 0.02**2 * 25)
-    assert C[5, 5] == pytest.approx(0.01**2 + 0.1**2)
-    assert C[2, 2] == pytest.approx(0.002**2 + 0.025**2)
+    assert C[3, 3] == pytest.approx(model.position_start**2 + 0.02**2 * 25)
+    assert C[5, 5] == pytest.approx(model.z_start**2 + 0.1**2)
+    assert C[2, 2] == pytest.approx(model.heading_start**2 + 0.025**2)
     assert C[0, 0] == C[1, 1] == pytest.approx(model.tilt**2)
     np.testing.assert_array_equal(C, model(25.0))
     np.testing.assert_array_equal(C, np.diag(np.diag(C)))
@@ -48,7 +54,7 @@ def straight_errors(rng: np.random.Generator, lengths: np.ndarray, walk: float, 
 
 
 def test_bent_paths_are_as_far_off_as_the_model_says(rng: np.random.Generator) -> None:
-    model = DriftModel(dim=2, position_scale=0.0, heading_walk=0.002, heading_scale=0.001, bend=1.0)
+    model = BENT
     for L in (5.0, 40.0):
         e = straight_errors(rng, np.full(4000, L), 0.002, 0.001)
         ratio = np.linalg.solve(model.covariance(L), e.T @ e / len(e))
@@ -60,7 +66,7 @@ def test_a_fit_to_samples_of_errors_finds_the_model(rng: np.random.Generator) ->
     e = straight_errors(rng, lengths, 0.002, 0.001)
     model = fit_drift(lengths, e[:, :, None] * e[:, None, :])
     for L in (5.0, 20.0, 60.0):
-        true = DriftModel(dim=2, position_scale=0.0, heading_walk=0.002, heading_scale=0.001, bend=1.0).covariance(L)
+        true = BENT.covariance(L)
         np.testing.assert_allclose(np.linalg.eigvals(np.linalg.solve(true, model.covariance(L))).real, 1.0, atol=0.3)
     assert model.bend == pytest.approx(1.0, abs=0.15)
 

@@ -10,7 +10,16 @@ import pytest
 from scipy import stats
 
 from frontends.segslam.paths import concatenate, seams
-from frontends.segslam.sampling import OPEN, draw_weights, grow, nearest_step, root_of_particle, root_of_segment
+from frontends.segslam.sampling import (
+    OPEN,
+    _draw,
+    draw_weights,
+    grow,
+    nearest_step,
+    probabilities,
+    root_of_particle,
+    root_of_segment,
+)
 from frontends.segslam.segmap import SAME, Entry, SegMap
 from graphslam.core import se3
 from graphslam.core.errors import DataError
@@ -102,6 +111,77 @@ def test_enumeration_on_a_chain_is_the_product_of_the_choices() -> None:
     weights = np.array([1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     table = all_samples(m, root_of_segment(m, 6), weights=weights)
     assert sum(v for k, v in table.items() if 1 in k) == Fraction(3, 4)
+
+
+def test_segments_that_fit_are_drawn_by_weight_or_alike_where_none_has_any() -> None:
+    fits = np.array([4, 1, 3])
+    weights = np.array([9.0, 1.0, 9.0, 0.0, 3.0])
+    assert probabilities(fits, weights).tolist() == [0.75, 0.25, 0.0]
+    for none in (None, np.zeros(5)):
+        np.testing.assert_allclose(probabilities(fits, none), 1 / 3)
+
+
+@pytest.mark.parametrize("number", [0.0, 0.3, np.nextafter(1.0, 0.0)])
+def test_rounding_never_draws_a_segment_without_weight(number: float) -> None:
+    """The random number may be zero, and rounded shares may sum to less than one."""
+
+    class Fixed:
+        def random(self) -> float:
+            return number
+
+    shares = np.array([0.0, *[0.1] * 6, 0.0, 0.0])
+    k = _draw(np.arange(9), shares, Fixed())  # type: ignore[arg-type]
+    assert k == (6 if number > 0.9 else 1 + int(6 * number))
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_segments_with_one_boundary_in_common_only_those_that_fit_are_drawn(first: int) -> None:
+    """One that begins earlier would overlap with what is there, wherever it stands in the list."""
+    m = small_segmap(8, 2)
+    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    early, late = first, 1 - first
+    m.close(2, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[late])
+    m.open(2, [Entry(T_entry=ZERO)], which=[late])
+    order = (early, late) if first == 0 else (late, early)
+    for p in order:
+        m.close(4, [flat_grid()], [straight(ZERO, 4.0 if p == early else 2.0, 4 if p == early else 2)], which=[p])
+    m.open(4, [Entry(T_entry=ZERO)] * 2)
+    lengths = Counter[int]()
+    for seed in range(30):
+        s = grow(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
+        spans = sorted(map(tuple, s.intervals.tolist()))
+        assert spans in ([(0, 4), (4, 5)], [(0, 2), (2, 4), (4, 5)])
+        lengths[len(s)] += 1
+    assert min(lengths[2], lengths[3]) > 5
+    # from the first of the short ones on: what comes after it is the other short one, never the long one
+    assert sorted(map(tuple, grow(m, root_of_segment(m, 0), np.random.default_rng(0)).intervals.tolist())) == [
+        (0, 2),
+        (2, 4),
+    ]
+
+
+def test_without_gravity_frames_are_whole_poses_in_both_directions() -> None:
+    """Bodies roll and pitch: a frame stands where the body of both segments is one, tilted as it comes."""
+    rng = np.random.default_rng(3)
+    m = SegMap(np.arange(9.0), np.arange(9.0), 1, dim=3, gravity=False)
+    for k in range(3):
+        path = se3.se3_exp(0.4 * rng.normal(size=(3, 6)))
+        m.open(2 * k, [Entry(T_entry=path[0])])
+        m.close(2 * k + 2, [flat_grid(dim=3)], [path])
+    m.open(6, [Entry(T_entry=se3.se3_exp(0.4 * rng.normal(size=6)))])
+    for root in (root_of_segment(m, 1), root_of_segment(m, 0), root_of_particle(m, 0, 7)):
+        s = grow(m, root, np.random.default_rng(0))
+        assert s.poses.shape == (len(s), 7)
+        place = {int(i): k for k, i in enumerate(s.segments)}
+        assert len(s) == 3 + (root.segment == OPEN)
+        for a, b in ((0, 1), (1, 2), (2, OPEN)):
+            if b not in place:
+                continue
+            entry = root.entry if b == OPEN else m[b].T_entry
+            before = se3.se3_compose(s.poses[place[a]], m[a].T_exit)
+            after = se3.se3_compose(s.poses[place[b]], entry)
+            np.testing.assert_allclose(se3.se3_log(se3.se3_between(before, after)), 0.0, atol=1e-9)
+        assert np.abs(s.poses[1:, 3:5]).max() > 0.05  # tilted indeed
 
 
 def test_ties_are_broken_at_random() -> None:
@@ -197,7 +277,9 @@ def test_of_an_interval_one_segment_is_drawn_once() -> None:
     m = twice()
     n = np.full(len(m), 1.0)
     n[4], n[5] = 3.0, 1.0
-    table = all_samples(m, root_of_segment(m, 9), weights=n)
+    # every interval has its segment after two links: the orders of all that come later need not be tried
+    table = all_samples(m, root_of_segment(m, 9), weights=n, local_depth=2)
+    assert {len(k) for k in table} == {5}
     assert sum(table.values()) == Fraction(1)
     assert sum(v for k, v in table.items() if 4 in k) == Fraction(3, 4)
 

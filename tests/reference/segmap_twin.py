@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
@@ -130,25 +129,17 @@ def all_samples(
 ) -> dict[tuple[int, ...], Fraction]:
     """Every map sample, as the sorted tuple of its segments, with its probability, by trying every choice there is."""
     found: dict[tuple[int, ...], Fraction] = {}
-    for script in _scripts(segmap, root, weights, options):
+    digits: list[int] = []  # an odometer over choices whose number depends on the ones before
+    while True:
+        script = _Script(digits, weights)
         sample = grow_by(segmap, root, script.order, script.choose, **options)
         key = tuple(sorted(sample.segments.tolist()))
         found[key] = found.get(key, Fraction(0)) + script.chance
-    return found
-
-
-def _scripts(segmap: SegMap, root: Root, weights: np.ndarray | None, options: dict[str, Any]) -> Iterator[_Script]:
-    """Scripts that between them make every choice: an odometer over choices whose number depends on the ones before."""
-    digits: list[int] = []
-    while True:
-        probe = _Script(digits, weights)
-        grow_by(segmap, root, probe.order, probe.choose, **options)
-        yield _Script(digits, weights)
-        digits = (digits + [0] * len(probe.options))[: len(probe.options)]
-        while digits and digits[-1] + 1 >= probe.options[len(digits) - 1]:
+        digits = (digits + [0] * len(script.options))[: len(script.options)]
+        while digits and digits[-1] + 1 >= script.options[len(digits) - 1]:
             digits.pop()
         if not digits:
-            return
+            return found
         digits[-1] += 1
 
 
