@@ -103,13 +103,20 @@ def own_front_end(folder: Path) -> str:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 0\n")
     (info / "entry_points.txt").write_text("[graphslam.frontends]\n" + toml.replace('"', ""))
     return """
+from graphslam.core.gaussian import chi2_mean_bounds
 one = gs.run("my-log", frontend="dead-reckoning", config={"frontend": {"seconds": 5.0}}, progress=False)
 assert len(one.submaps) == 10, one
 half = gs.run("my-log", frontend="dead-reckoning", out="half", progress=False)
 resumed = gs.run("my-log", frontend="dead-reckoning", out="half", resume=True, progress=False)
 assert np.array_equal(resumed.map.trajectory.poses, half.map.trajectory.poses)
-true = gs.run(source, frontend="dead-reckoning", progress=False)  # a simulated log states its own noise
-assert 0.05 < true.metric("nees_per_dof") < 3.5, true.metric("nees_per_dof")
+nees = dof = 0.0  # a simulated log states its own noise
+for seed in range(5):
+    drive = gs.simulate("landmark-field", preset="quick", seed=seed)
+    true = gs.run(drive, frontend="dead-reckoning", progress=False)
+    nees, dof = nees + true.metric("nees"), dof + true.metric("nees_dof")
+low, high = chi2_mean_bounds(dof, 1, 0.999)
+assert 0.5 < low / dof < high / dof < 2.0, (low, high, dof)  # half or twice the covariance is told
+assert low < nees < high, (low, nees, high)
 """
 
 

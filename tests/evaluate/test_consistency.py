@@ -261,7 +261,7 @@ def test_row_states_gauge_dimension_runs_and_confidence() -> None:
     assert row["nees_over_n"] == 1.0
     assert row["low"] == pytest.approx(stats.chi2.ppf(0.05, 12) / 12)
     assert row["high"] == pytest.approx(stats.chi2.ppf(0.95, 12) / 12)
-    assert row["ci_honest"] == pytest.approx(3 / stats.chi2.ppf(0.9, 3))
+    assert row["ci_honest"] == row["ci_mean"] == pytest.approx(3 / stats.chi2.ppf(0.9, 3))
     assert GAUGE in judged(np.ones((2, 1)), 3)._repr_html_()
 
 

@@ -72,11 +72,17 @@ def test_a_fit_to_samples_of_errors_finds_the_model(rng: np.random.Generator) ->
 
 
 def test_a_fit_to_covariances_of_a_model_is_that_model() -> None:
-    true = DriftModel(bend=0.5, heading_walk=0.001)
     lengths = np.linspace(1.0, 80.0, 30)
-    model = fit_drift(lengths, np.array([true.covariance(L) for L in lengths]))
-    for L in (3.0, 30.0, 80.0):
-        np.testing.assert_allclose(model.covariance(L), true.covariance(L), rtol=0.03, atol=1e-9)
+    for true in (
+        DriftModel(bend=0.5, heading_walk=0.001),
+        DriftModel(bend=0.9, heading_walk=0.004, position_scale=0.003, position_walk=0.02, z_walk=0.01, tilt=0.02),
+        DriftModel(dim=2, bend=0.0, heading_walk=0.0, heading_scale=0.0),
+    ):
+        model = fit_drift(lengths, np.array([true.covariance(L) for L in lengths]))
+        for L in (3.0, 30.0, 80.0):
+            np.testing.assert_allclose(model.covariance(L), true.covariance(L), rtol=0.03, atol=1e-9)
+        assert model.dim == true.dim
+        assert model.bend == pytest.approx(true.bend, abs=0.02)
 
 
 def test_calibrated_on_planar_odometry() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from frontends.grid_config import GridFilterConfig
 from frontends.grid_motion import motion_covariance, move, square_root, tilted, tilts, walk_tilt_errors
 from graphslam.core.errors import ConfigError
 from graphslam.core.poses import group_of, heading_of
-from graphslam.core.se3 import se3_exp
+from graphslam.core.se3 import quat_multiply, se3_exp
 
 QUIET = {"motion_scale": 0.0, "position_walk": 0.0, "height_walk": 0.0, "heading_walk": 0.0, "heading_turn": 0.0,
          "tilt_walk": 0.0}  # fmt: skip
@@ -29,6 +31,32 @@ def test_noise_is_the_odometrys_plus_walks_of_the_path() -> None:
     assert np.allclose(flat, np.diag(wanted[[3, 4, 2]] - 4 * np.diag(odometry)[[3, 4, 2]]), rtol=1e-12)
     still = motion_covariance(np.array([0.0, 0, 0, 0, 0, 0, 1]), odometry, GridFilterConfig(**QUIET))
     assert np.array_equal(still, np.zeros((6, 6)))
+
+
+def test_the_path_of_a_step_is_that_of_its_position_and_its_turn_that_about_the_vertical() -> None:
+    """A body that rolls over a kerb goes no further and turns no more for it."""
+    config = GridFilterConfig(heading_turn=0.2)
+    level = np.array([0.3, 0.0, 0.1, 0.0, 0.0, np.sin(0.2), np.cos(0.2)])
+    rolled = np.concatenate([level[:3], quat_multiply(level[3:], np.array([np.sin(0.25), 0.0, 0.0, np.cos(0.25)]))])
+    none = np.zeros((6, 6))
+    np.testing.assert_allclose(
+        motion_covariance(rolled, none, config), motion_covariance(level, none, config), rtol=1e-9
+    )
+    back = np.concatenate([level[:3], -level[3:]])
+    np.testing.assert_allclose(motion_covariance(back, none, config), motion_covariance(level, none, config), rtol=1e-9)
+
+
+def test_models_are_those_of_the_configuration() -> None:
+    """Whatever is set is handed on: nothing falls back on a default of its own."""
+    c = GridFilterConfig(hit=0.8, miss=0.3, clamp=(0.05, 0.99), floor=0.11, unknown=0.2, interpolation="nearest",
+                         cast_sigma=0.3, cast_clip=2.0, cast_effective_beams=3.0, greatest_exponent=0.5)  # fmt: skip
+    model = c.beam_model()
+    assert (model.hit, model.miss, model.clamp) == (0.8, 0.3, (0.05, 0.99))
+    end, cast = c.likelihood_of(120), replace(c, likelihood="cast").likelihood_of(30)
+    assert (end.exponent, end.floor, end.unknown, end.interpolation) == (0.5, 0.11, 0.2, "nearest")
+    assert (cast.exponent, cast.sigma, cast.clip) == (0.1, 0.3, 2.0)
+    GridFilterConfig(particles=1, weight_beams=1, threads=1, map_beams=0, young=0, lift=1.0, ess_fraction=1.0)
+    GridFilterConfig(lift=0.0, walk_scale=0.0, motion_scale=0.0)
 
 
 def test_walks_are_scaled_and_the_odometrys_own_noise_is_not() -> None:
@@ -94,6 +122,8 @@ def test_errors_of_gravity_keep_their_spread_and_forget_in_time(rng: np.random.G
     "bad",
     [
         {"particles": 0}, {"threads": 0}, {"ess_fraction": 0.0}, {"voxel_size": float("nan")}, {"heading_walk": -1.0},
+        {"ess_fraction": 1.01}, {"lift": 1.01}, {"lift": -0.01}, {"map_beams": -1}, {"young": -1}, {"walk_scale": -1.0},
+        {"motion_scale": float("inf")}, {"greatest_exponent": 0.0}, {"tilt_walk": float("nan")},
         {"likelihood": "guess"}, {"endpoint_effective_beams": 0.0}, {"hit": 0.4}, {"floor": 0.0}, {"weight_beams": 0},
     ],
 )  # fmt: skip

@@ -148,6 +148,14 @@ def test_an_order_is_given_up_when_it_fills_in_a_third_more(
         np.testing.assert_array_equal(joined.order, kept)
 
 
+def test_every_join_that_needs_a_factor_looks_after_its_order() -> None:
+    a, b = two()
+    a.fill = b.fill = 1e-3  # as if the last fresh order had been far better
+    joined = eif.join_maps(a, b, eif.match_by_id(a, b))
+    assert joined.fill == pytest.approx(joined.symbolic().nnz / len(joined.values))
+    np.testing.assert_allclose(joined.x, eif.join_maps(*two(), eif.match_by_id(a, b)).x, atol=1e-12)
+
+
 def test_a_fresh_order_of_a_long_map_fills_in_little(rng: np.random.Generator) -> None:
     """Sixty links end to end: any good order leaves a factor about as sparse as the matrix; a random one does not."""
     chain = [

@@ -2,7 +2,7 @@
 
 Left alone, because no test of behaviour could or should tell: docstrings, annotations, decorators, imports, the words
 of error messages, assertions, and conversions of types (``float(x)``, ``np.asarray(x)``, ``dtype=``: for mypy);
-and how notebooks show things.
+protocols; and how notebooks show things.
 """
 
 from __future__ import annotations
@@ -116,6 +116,8 @@ def _changes(node: ast.AST, scope: str, statement: ast.stmt | None) -> Iterator[
             owner = child if isinstance(child, ast.stmt) else statement
             inside = scope
             if isinstance(child, ast.FunctionDef) and child.name == "_repr_html_":
+                continue
+            if isinstance(child, ast.ClassDef) and any(_name(b) == "Protocol" for b in child.bases):
                 continue
             if isinstance(child, ast.FunctionDef | ast.ClassDef):
                 inside = child.name if scope == "<module>" else f"{scope}.{child.name}"

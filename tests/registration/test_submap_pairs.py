@@ -148,8 +148,9 @@ def test_covariance_is_honest_for_maps_that_are_bent_inside() -> None:
             e = se3.se3_log(se3.se3_between(T, m.T_target_source))
             nees.append(e @ np.linalg.solve(m.covariance, e) / 6)
     assert accepted >= 4
-    # as bent as here it is on the safe side: a tenth to one and a half of what it says
-    assert 0.05 < np.mean(nees) < 1.5
+    # On the safe side, by four: each map's drift inside may be all of the error, and level maps have next to none in
+    # roll and pitch. Twenty degrees of freedom tell that from half and from twice the covariance.
+    assert 0.125 < np.mean(nees) < 0.42
 
 
 def test_in_the_plane() -> None:
