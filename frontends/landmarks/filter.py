@@ -179,6 +179,12 @@ class ParticleSet:
         return len(np.unique(self.ancestor))
 
     @property
+    def effective_ancestors(self) -> float:
+        """Effective number of lines of descent ``1 / Σ f²``, f being the share of the weight of each."""
+        share = np.bincount(self.ancestor, weights=self.weights)
+        return float(1.0 / np.sum(share**2))
+
+    @property
     def confirmed(self) -> int:
         """Number of features of the standard particle that are no longer provisional."""
         return int(np.count_nonzero(self.hits[self.best] >= self.config.confirm_hits))

@@ -12,16 +12,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from frontends.landmarks.filter import ParticleSet
 from frontends.landmarks.summarise import REGULARISER, Association, Smoothed, moment_matched
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, moment_match
 
-VARIANCE_FACTOR = 2.0
-"""Pose variances of two Gaussians that differ by more than this raise the flag."""
-LEAST_ESS = 10.0
-"""An effective sample size below this, at any scan, raises the flag."""
+FALSE_ALARM = 0.01
+"""Share of the submaps of honest filters that each test of the flag may blame."""
+LEAST_ESS = 2.0
+"""An effective sample size below this, at any scan, raises the flag: one particle decided alone."""
+LEAST_ANCESTORS = 10.0
+"""Particles that are handed over as moments and descend from fewer raise the flag: a variance made of nine degrees of
+freedom is off by a factor of two in one case of ten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,17 +126,39 @@ def flag(report: dict[str, Any], particles: int) -> list[str]:
     Parameters
     ----------
     report : dict
-        With the figures of :func:`distance` and ``min_ess``.
+        With the figures of :func:`distance`, ``min_ess``, ``effective_ancestors``, ``handover``, and ``chi2`` with
+        ``dof`` of the smoothing.
     particles : int
         A set smaller than :data:`LEAST_ESS` cannot reach it and is not blamed for that alone.
     """
     reasons = []
-    for prefix in ("moment", "pooled"):
+    handed = {"moments": "moment", "pooled": "pooled"}.get(report.get("handover", "smoothed"))
+    lines = float(report.get("effective_ancestors", particles))
+    for prefix, samples in (("moment", lines), ("pooled", lines * report.get("pooled_filters", 1))):
         ratio = report.get(f"{prefix}_pose_variance_ratio")
-        if ratio is None and f"{prefix}_kl" in report:
+        if ratio is None and f"{prefix}_kl" in report and handed == prefix:
             reasons.append(f"{prefix}-missing")
-        elif ratio is not None and not np.all(np.abs(np.log(ratio)) <= np.log(VARIANCE_FACTOR)):
-            reasons.append(f"{prefix}-pose-variance")
+        elif ratio is not None:
+            low, high = variance_bounds(samples)
+            if not all(low <= r <= high for r in ratio):
+                reasons.append(f"{prefix}-pose-variance")
+    if handed == "moment" and lines < min(LEAST_ANCESTORS, particles):
+        reasons.append("ancestors")
     if report["min_ess"] < min(LEAST_ESS, particles):
         reasons.append("ess")
+    if report.get("dof", 0) > 0 and report["chi2"] > stats.chi2.isf(FALSE_ALARM, report["dof"]):
+        reasons.append("residuals")
     return reasons
+
+
+def variance_bounds(samples: float) -> tuple[float, float]:
+    """Between which a variance made of independent samples lies, over the true one, in honest maps.
+
+    It is ``χ²_ν / samples``, ``ν = samples - 1``, and three of them are looked at (Bonferroni). Fewer than two samples
+    have no bounds: they say nothing.
+    """
+    nu = samples - 1.0
+    if nu < 1.0:
+        return 0.0, np.inf
+    tail = FALSE_ALARM / 3.0 / 2.0
+    return float(stats.chi2.ppf(tail, nu) / samples), float(stats.chi2.isf(tail, nu) / samples)

@@ -154,7 +154,10 @@ class RbpfEkf:
         made = particle_gaussians(filters, association, smoothed, inflate=c.moment_inflation)
         report |= distance("moment", made.moments, smoothed.gaussian)
         if c.pooled:
-            report |= distance("pooled", made.pooled, smoothed.gaussian) | {"dropped_filters": made.dropped_filters}
+            report |= distance("pooled", made.pooled, smoothed.gaussian) | {
+                "dropped_filters": made.dropped_filters,
+                "pooled_filters": c.pooled - made.dropped_filters,
+            }
         report |= {
             "gaps": data.gaps_in(first, last),
             "handover": c.handover,
@@ -164,9 +167,12 @@ class RbpfEkf:
             "used": int(smoothed.kept.sum()),
             "not_associated": int(particles.observations - len(association.observation)),
             "trimmed": int(len(smoothed.kept) - smoothed.kept.sum()),
+            "particles": c.particles,
+            "association": c.association,
             "resamplings": particles.resamplings,
             "min_ess": round(particles.min_ess, 3),
             "ancestors": particles.ancestors,
+            "effective_ancestors": round(particles.effective_ancestors, 3),
             "dropped_particles": made.dropped_particles,
             "chi2": smoothed.chi2,
             "dof": smoothed.dof,

@@ -73,13 +73,39 @@ def _summary(result: Any, out: Path) -> str:
     dropped = result.report["records_dropped"]
     lines = [table(result.metrics.to_dict("records"), ["key", "value", "unit"])]
     lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
-    chi2 = result.metrics.set_index("key")["value"].get("join_chi2_per_dof")
-    if chi2 is not None and not 0.7 < chi2 < 1.4:
-        scale = result.report["covariance_scale"] * chi2
-        lines.append(f"note: join χ²/dof is {chi2:.2f}, not 1: try --set backend.covariance_scale={scale:.2g}")
+    lines += join_note(result)
     lines += ["", *verdict_text(result.verdict), ""]
     lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
     return "\n".join(lines)
+
+
+CAUSES = frozenset(
+    {"residuals", "calibration", "sightings-not-used", "motion-gap", "particles", "gps-mirrored", "gps-scale"}
+    | {"gps-correlated", "stuck"}
+)
+"""Lines of a verdict that name why submaps fit each other badly."""
+
+
+def join_note(result: Any) -> list[str]:
+    """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
+    from graphslam.app.verdict import CERTAIN
+    from graphslam.evaluate.without_truth import two_sided
+
+    m = result.metrics.set_index("key")["value"]
+    chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
+    if chi2 is None or not dof > 0:
+        return []
+    low, high, said = two_sided(chi2, dof, CERTAIN)
+    if said == "consistent":
+        return []
+    text = f"note: join χ²/dof is {chi2:.3g}; for {dof:.4g} degrees of freedom 999 of 1000 honest runs lie between "
+    text += f"{low:.3g} and {high:.3g}. "
+    causes = [f.code for f in result.verdict if f.code in CAUSES and f.level in ("look", "bad")]
+    if said == "over-confident" and causes:
+        named = ", ".join(f"“{c}”" for c in dict.fromkeys(causes))
+        return [f"{text}The verdict names a cause ({named}): mend that before any covariance is scaled"]
+    scale = result.report["covariance_scale"] * chi2
+    return [f"{text}Without another cause: --set backend.covariance_scale={scale:.2g}"]
 
 
 def demo(

@@ -12,7 +12,9 @@ from graphslam.app.config import RunConfig
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
+from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import GpsRecord
 
 Role = Literal["input", "gps", "imu", "unused"]
 
@@ -87,7 +89,18 @@ def stream_use(
             role = "input"
         elif isinstance(stream, Gps):
             asked = settings.gps.use != "none"
-            role, why = "gps", "" if asked else "gps.use is none"
+            role = "gps"
+            factors = sum(isinstance(r, GpsRecord) for r in graph.records.values())
+            used = min(used, factors)  # fixes that wait for a datum to the end are in the ledger, and in no factor
+            if not asked:
+                why = "gps.use is none"
+            elif used == 0 and spent.any():
+                why = (
+                    f"its {int(spent.sum())} fixes on the path span less than {GpsFactorConfig().baseline:g} m, on the "
+                    "ground or in the map, so that the heading of their frame stays unknown"
+                )
+            elif used < len(times) and settings.gps.use != "all":
+                why = f"gps.use is {settings.gps.use}: the others are kept back to test with"
         elif isinstance(stream, Imu):
             asked = settings.imu.use == name or settings.imu.use == "auto"
             role, why = "imu", left_out.get(name, "") if asked else "imu.use is none"

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from scipy import stats
+
 from graphslam.app.stream_use import StreamUse
 from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
@@ -28,6 +30,10 @@ IN_WORDS = {
 }
 SMALL_GAP = 1e-6
 """Of the objective: an objective above the optimum by less is at it."""
+FLAGGED = 0.05
+"""Share of the submaps of honest runs that front ends may flag by chance."""
+QUARTER = 0.25
+"""Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
 MOSTLY = 0.95
 """Share of the records of a stream below which the verdict asks to look at what became of the others."""
 
@@ -104,7 +110,7 @@ def observed(
         elif s.used == 0 and s.role == "input":
             text = f"Nothing of {s.name} was used ({s.offered} records): {s.why}."
             out.append(Finding("look", "stream-not-used", text))
-        elif s.role == "input" and s.used < MOSTLY * s.offered:
+        elif (s.asked and s.used < QUARTER * s.offered) or (s.role == "input" and s.used < MOSTLY * s.offered):
             out.append(Finding("look", "stream-part-used", f"Only {s.in_words()}: {s.why}."))
     used = {s.name for s in streams if s.used}
     for n in noticed:
@@ -145,7 +151,10 @@ def bounded(ratio: float, dof: float) -> tuple[str, Level]:
     """A ratio with its bounds in words, and the level of its line."""
     low, high, said = two_sided(ratio, dof, CONFIDENCE)
     text = f"{ratio:.3g}, {CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({dof:.4g} degrees of freedom); "
-    return text + IN_WORDS[said], "good" if said == "consistent" else "bad" if said == "over-confident" else "look"
+    level: Level = "good"
+    if said != "consistent":  # one honest run in forty is outside on either side: bad is what one in a thousand is not
+        level = "bad" if ratio > two_sided(ratio, dof, CERTAIN)[1] else "look"
+    return text + IN_WORDS[said], level
 
 
 def number(value: Any) -> bool:
@@ -217,12 +226,39 @@ def _tests(figures: Figures) -> list[Finding]:
     for row in class_rows(figures):
         cause = "these measurements contradict the others, or state too little noise."
         judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), row.get("dof"), cause)
+        if row.get("class") == "gps" and number(row.get("chi2_per_dof")) and number(row.get("dof")):
+            out += _too_small(float(row["chi2_per_dof"]), float(row["dof"]))
     m = figures.metrics
+    cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
+    judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
+    alike, white = m.get("gps_nis_joint_autocorrelation"), m.get("gps_nis_joint_white")
+    if alike is not None and white is not None and abs(alike) > white * stats.norm.isf(0.5e-3) / stats.norm.isf(0.025):
+        text = f"Errors of withheld fixes are alike from one to the next (correlation {alike:.2f}; independent ones "
+        text += f"stay within ± {white:.2f} in 95 % of the runs): {_LASTS}"
+        out.append(Finding("look", "gps-correlated", text))
     cause = (
         "submaps that saw the same landmarks disagree by more than they say; noise, mounting or association is wrong."
     )
     judge("Disagreement of loops over its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
     return out
+
+
+_LASTS = (
+    "errors of the receiver last for longer than the time between fixes, and every fix counts as new. State them with "
+    "gps.bias_sigma, or a larger gps.sigma."
+)
+
+
+def _too_small(ratio: float, dof: float) -> list[Finding]:
+    """Fixes that lie nearer to the map than they say."""
+    low = two_sided(ratio, dof, CERTAIN)[0] if dof > 0 else 0.0
+    if ratio >= low:
+        return []
+    text = (
+        f"Fixes lie nearer to the map than they say (χ²/dof {ratio:.3g}, an honest run stays above {low:.3g} in 999 of "
+    )
+    text += f"1000 runs). Either their σ is stated too large, which costs accuracy only; or {_LASTS}"
+    return [Finding("look", "gps-correlated", text)]
 
 
 def _certificate(figures: Figures) -> Finding:
@@ -234,13 +270,25 @@ def _certificate(figures: Figures) -> Finding:
     return Finding("good" if text.startswith("certified") else "look", "certificate", f"Global optimum: {text}")
 
 
+def _flagged(figures: Figures) -> list[Finding]:
+    """Submaps that the front end flags: honest ones are flagged now and then, by chance."""
+    counts = figures.part("flagged_submaps")
+    flagged, n = counts.get("any", 0), figures.metrics.get("submaps", 0.0)
+    if not (number(flagged) and flagged):
+        return []
+    why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and number(v))
+    text = f"{flagged:g} of {n:g} submaps were flagged by the front end ({why})"
+    usual = stats.binom.ppf(CERTAIN, int(n), FLAGGED) if n else 0.0
+    if flagged <= usual:
+        return [Finding("", "flagged", f"{text}: not more than chance flags.")]
+    return [Finding("look", "flagged", f"{text}; chance flags more than {usual:g} in one honest run of a thousand.")]
+
+
 def _left_out(figures: Figures) -> list[Finding]:
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
         out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
-    flagged = figures.part("flagged_submaps").get("any", 0)
-    if number(flagged) and flagged:
-        out.append(Finding("look", "flagged", f"{flagged:g} of the submaps were flagged by the front end."))
+    out += _flagged(figures)
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))

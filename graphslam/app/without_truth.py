@@ -94,7 +94,7 @@ def check_without_truth(
     innovations = _innovations(graph, gps, settings) if graph.dim == 2 else None
     if innovations is not None:
         for row in innovations.tests().to_dict("records"):
-            for key in ("value", "low", "high", "autocorrelation", "inside"):
+            for key in ("value", "low", "high", "dof", "autocorrelation", "white", "inside"):
                 direction = "one" if key == "value" else "none"
                 out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)
     loops = None

@@ -64,7 +64,13 @@ def sighting_findings(
 
 
 def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Covariances made of particles that have few independent ones left."""
+    """One particle, or covariances made of particles that have few independent ones left."""
+    if any(r.get("particles") == 1 and r.get("association") != "known" for r in reports):
+        text = (
+            "A single particle decided which sighting is of which landmark, and no other could contradict it. Set "
+            "frontend.particles to 20 or more."
+        )
+        return [Finding("look", "particles", text)]
     made = [r for r in reports if "ancestors" in r and r.get("handover", "moments") == "moments"]
     few = [r for r in made if r["ancestors"] < LEAST_ANCESTORS]
     if not few:

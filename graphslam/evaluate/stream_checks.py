@@ -13,8 +13,9 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
-from graphslam.core.records import LaserScans, VelocityControls
+from graphslam.core.records import Gps, LaserScans, VelocityControls
 from graphslam.evaluate.stream_checks_beams import check_beams
+from graphslam.evaluate.stream_checks_gps import check_gps
 from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
 
 
@@ -51,6 +52,8 @@ def check_streams(log: SensorLog) -> list[Noticed]:
         found: list[Finding] = []
         if isinstance(stream, LaserScans | RangeScans | PointClouds):
             found = check_beams(stream, name)
+        elif isinstance(stream, Gps):
+            found = check_gps(stream, name, log)
         elif isinstance(stream, Imu):
             found = check_imu(stream, name)
             if wheels is not None:

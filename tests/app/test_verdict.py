@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 import graphslam as gs
-from graphslam.app.cli_run import _summary
+from graphslam.app.cli_run import _summary, join_note
 from graphslam.app.report import make_report
 from graphslam.app.run import Run
 from graphslam.app.verdict import Figures, stated
@@ -82,3 +84,19 @@ def test_what_is_no_finding_of_ours_is_left_out() -> None:
         value["lines"].append(row)
     assert findings_of_json(value) == [good]
     assert findings_of_json({"lines": 3}) == findings_of_json(None) == []
+
+
+def test_the_note_on_the_join_is_one_that_honest_runs_do_not_get(run: Run) -> None:
+    """Two-sided bounds at the join's own degrees of freedom; and a cause that a check names comes first."""
+
+    def noted(chi2: float, dof: float, verdict: list[Finding]) -> list[str]:
+        metrics = pd.DataFrame({"key": ["join_chi2_per_dof", "join_dof"], "value": [chi2, dof]})
+        return join_note(SimpleNamespace(metrics=metrics, report={"covariance_scale": 1.0}, verdict=verdict))
+
+    assert join_note(run) == []
+    assert noted(1.5, 20, []) == []
+    assert "covariance_scale=1.5" in noted(1.5, 200, [])[0]
+    assert "covariance_scale=0.8" in noted(0.8, 2000, [])[0]
+    (line,) = noted(1.5, 200, [Finding("bad", "calibration", "x"), Finding("", "streams", "y")])
+    assert "calibration" in line
+    assert "covariance_scale" not in line

@@ -1,0 +1,113 @@
+"""GPS fixes looked at before a run: against themselves, and against what the wheels say over short times.
+
+Dead reckoning drifts, but over some ten metres it tells how far the robot went and which way it turned. Chords between
+fixes must be as long and turn as much: that needs no map and no alignment. Chords are taken as long as ten times the
+stated σ of a fix, so that noise turns them by less than 10°.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from frontends.motion import MotionNoise, dead_reckoning, motion_stream
+from graphslam.core.errors import DataError, MissingDataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array, se2_compose, se2_transform, wrap_angle
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Gps, Odometry
+
+CHORD = 10.0
+"""Length of the chords that are compared, in σ of a fix."""
+SHORTEST_CHORD = 5.0
+"""And at least this [m]."""
+LEAST_CHORDS = 3
+MOVED = 20.0
+"""Way of the wheels below which standing fixes say nothing [m]."""
+TWICE = 2.0
+"""Chords that are longer or shorter than those of the wheels by more than this factor are not in metres: no wheel is
+wrong by so much."""
+TURNED = np.deg2rad(60.0)
+"""Turns of the wheels, summed in absolute value, from which on their sign can be compared with that of the fixes."""
+
+
+def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
+    """Lines on the fixes of a log.
+
+    Parameters
+    ----------
+    gps : Gps
+    name : str
+        Of the stream.
+    log : SensorLog
+        Its motion stream, if it has a planar one, is what the fixes are compared with.
+    """
+    if len(gps.times) == 0:
+        return [Finding("look", "gps-empty", f"{name} holds no fix.")]
+    try:
+        stream, motion = motion_stream(log)
+    except MissingDataError:
+        return []
+    if len(motion.times) < 2 or (isinstance(motion, Odometry) and motion.increments.shape[1] != 3):
+        return []
+    inside = (gps.times >= motion.times[0]) & (gps.times <= motion.times[-1])
+    if not inside.any():
+        text = (
+            f"{name} and {stream} have no time in common: fixes from {gps.times[0]:.1f} to {gps.times[-1]:.1f} s, "
+            f"motion from {motion.times[0]:.1f} to {motion.times[-1]:.1f} s. Their clocks "
+            "have different zeros; bring them onto one clock."
+        )
+        return [Finding("bad", "gps-clock", text)]
+    fixes, t = gps.positions[inside, :2], gps.times[inside]
+    path = _reckoned(log, t, gps.lever[:2])
+    if path is None:
+        return []
+    way = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    if way > MOVED and len(fixes) > 2 and bool(np.all(fixes == fixes[0])):
+        text = f"{name} is stuck: all {len(fixes)} fixes are the same while the wheels drive {way:.0f} m."
+        return [Finding("bad", "gps-stuck", text)]
+    return _chords(fixes, path, float(np.median(gps.sigma)), name, stream)
+
+
+def _reckoned(log: SensorLog, t: Array, lever: Array) -> Array | None:
+    """Antenna ``(n, 2)`` at the fixes by the wheels alone."""
+    try:
+        steps = dead_reckoning(log, t, MotionNoise(), hold=1.0)[0].increments
+    except DataError:
+        return None
+    poses = np.zeros((len(steps), 3))
+    for k in range(1, len(steps)):
+        poses[k] = se2_compose(poses[k - 1], steps[k])
+    return np.asarray(se2_transform(poses, np.broadcast_to(lever, (len(poses), 2))))
+
+
+def _chords(fixes: Array, path: Array, sigma: float, name: str, stream: str) -> list[Finding]:
+    ends = [0]
+    for k in range(1, len(path)):
+        if np.linalg.norm(path[k] - path[ends[-1]]) >= max(CHORD * sigma, SHORTEST_CHORD):
+            ends.append(k)
+    if len(ends) <= LEAST_CHORDS:
+        return []
+    a, b = np.diff(fixes[ends], axis=0), np.diff(path[ends], axis=0)
+    ratio = float(np.median(np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)))
+    if not 1.0 / TWICE < ratio < TWICE:
+        degrees = bool(np.all(np.abs(fixes[:, 0]) <= 360.0) and np.all(np.abs(fixes[:, 1]) <= 360.0))
+        probably = (
+            "they are probably degrees of longitude and latitude" if degrees and ratio < 0.01 else "check the unit"
+        )
+        text = (
+            f"{name} moves {ratio:.3g} times as far as {stream} says (median of {len(a)} stretches): {probably}. "
+            "Positions are metres in a local frame, x east and y north."
+        )
+        return [Finding("bad", "gps-scale", text)]
+    turn = [np.unwrap(np.arctan2(d[:, 1], d[:, 0])) for d in (a, b)]
+    ta, tb = (wrap_angle(np.diff(x)) for x in turn)
+    if np.sum(np.abs(tb)) > TURNED:
+        slope = float(np.sum(ta * tb) / np.sum(tb**2))
+        if slope < 0.0:
+            text = (
+                f"{name} turns the other way round than {stream} (turns are {slope:.2f} times those of the wheels): "
+                "its axes are probably swapped or one is reversed. Wanted x east, y north; or the steering has the "
+                "wrong sign."
+            )
+            return [Finding("bad", "gps-mirrored", text)]
+    return []
