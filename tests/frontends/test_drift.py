@@ -113,6 +113,11 @@ def test_refusals() -> None:
         fit_drift([1.0, 2.0], np.zeros((3, 6, 6)))
     with pytest.raises(DataError, match="too few"):
         fit_drift([1.0, 1.0, 2.0], np.zeros((3, 6, 6)))
+    with pytest.raises(DataError, match="too few"):
+        fit_drift([-1.0, 1.0, 2.0], np.zeros((3, 6, 6)))
+    three = np.array([0.0, 1.0, 4.0])  # as many as there are terms: no length at all is one
+    found = fit_drift(three, np.array([DriftModel().covariance(L) for L in three]))
+    np.testing.assert_allclose(found.covariance(2.0), DriftModel().covariance(2.0), rtol=0.05, atol=1e-7)
     two = Odometry(times=np.arange(2.0), increments=np.array([[0, 0, 0], [0.1, 0, 0]]), covariances=np.zeros((2, 3, 3)))
     with pytest.raises(DataError, match="too short"):
         calibrate(RecordedErrors(odometry=two), np.array([0.0, 0.1]))
