@@ -223,6 +223,10 @@ def test_a_run_counts_as_one_draw_of_its_least_degrees_of_freedom() -> None:
     assert value.bounds == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 11) / 11))
 
 
+def test_runs_weigh_alike_however_many_values_they_have() -> None:
+    assert judged(np.array([[1.0, np.nan], [3.0, 3.0]]), 1).mean_normalised == pytest.approx(2.0)
+
+
 def test_a_column_is_judged_by_the_runs_that_have_it() -> None:
     """A value that is missing does not lend its degrees of freedom."""
     d2 = np.array([[2.0, 1.0], [np.nan, 1.0], [4.0, 1.0]])

@@ -79,6 +79,17 @@ def test_frames_at_the_end_are_level_where_submaps_are() -> None:
     np.linalg.cholesky(MODEL.covariance(path[:1], 20))  # no way: the starts alone
 
 
+@pytest.mark.parametrize("group", [SE2, SE3])
+def test_a_single_step_by_hand(group: Group) -> None:
+    """A heading that errs at the start moves the end to the left by the way; one that errs at the end does not."""
+    path = np.stack([group.identity, group.identity])
+    path[1, 0] = 2.0
+    C = MODEL.covariance(path, 20, gravity=False)
+    y, walk = group.position.start + 1, MODEL.heading_walk**2 * (1.0 + MODEL.few / 20) * 2.0
+    assert C[group.heading, group.heading] == pytest.approx(MODEL.heading_start**2 + walk)
+    assert C[group.heading, y] == pytest.approx(0.5 * walk * 2.0)
+
+
 def test_impossible_models_and_paths() -> None:
     with pytest.raises(ConfigError, match="heading_walk"):
         FilterDrift(heading_walk=-1.0)
