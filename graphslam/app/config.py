@@ -7,6 +7,7 @@ Unknown keys are refused with their full name; the effective configuration is wr
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 import types
 import typing
@@ -17,7 +18,8 @@ from typing import Any, Literal
 
 import tomli_w
 
-from graphslam.core.errors import ConfigError
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.reading import LARGEST, read_text
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -196,6 +198,8 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
             raise ConfigError(f"{name} = {value!r}; wanted {len(args)} values")
         return tuple(_convert(a, v, name) for a, v in zip(args, value, strict=True))
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not (abs(value) <= LARGEST or abs(value) == math.inf):
+            raise ConfigError(f"{name} = {value}; wanted a number, at most {LARGEST:g}")
         return float(value)
     if hint in (int, bool, str) and type(value) is hint:
         return value
@@ -224,10 +228,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         Missing or malformed.
     """
     try:
-        return tomllib.loads(path.read_text())
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_text(path))
+    except DataError as error:
+        raise ConfigError(str(error)) from None
+    except (ValueError, RecursionError) as error:  # tomllib's own errors are ValueErrors
         raise ConfigError(f"{path}: not a TOML file ({error})") from None
 
 

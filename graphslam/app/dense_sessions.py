@@ -11,6 +11,7 @@ import numpy as np
 from graphslam.app import config as cfg
 from graphslam.app.config import BackEndConfig, GpsConfig
 from graphslam.app.run import Run
+from graphslam.app.run_files import read_options
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
@@ -117,7 +118,7 @@ def _options(run: Run, part: str, kind: Any) -> Any:
     file = None if run.folder is None else Path(run.folder) / "config.toml"
     values = run.report.get(part)
     if values is None and file is not None and file.is_file():
-        values = cfg.read_toml(file).get(part)
+        values = read_options(file.parent).get(part)
     if values is None:
         raise DataError(f"a run does not say its {part} options", where=run.name, wanted="a finished run")
     return cfg.build(kind, {k: v for k, v in values.items() if v is not None}, part)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app import config as cfg
 from graphslam.app.dense_sessions import DenseSession, back_end_config, is_dense, put, session_of, with_grids
 from graphslam.app.dense_ties import attach
 from graphslam.app.front_ends import make_front_end
 from graphslam.app.outputs import open_run
 from graphslam.app.pipeline import load_log_source
 from graphslam.app.run import Run
+from graphslam.app.run_files import read_options
 from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
@@ -161,7 +161,7 @@ def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
     folder = None if run.folder is None else Path(run.folder) / "config.toml"
     if folder is None or not folder.is_file():
         raise DataError("a run without a folder does not say its front end's options", where=run.name)
-    options = cfg.read_toml(folder)
+    options = read_options(folder.parent)
     front: Any = make_front_end(str(run.report["frontend"]), options.get("frontend", {}))
     seed = SeedTree(int(run.report["seed"])).child("localise")
     submaps = list(front.submaps(log, seed=seed, after=None, drops=DropCounter()))

@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graphslam.app.config import read_toml
-from graphslam.core.errors import DataError, FormatError, RunFolderError
+from graphslam.app.run_files import read_events, read_options
+from graphslam.core.errors import DataError
 from graphslam.graph.loop_candidates import FRONT_END
 from graphslam.graph.loop_ledger import Decision, LoopLedger
 from graphslam.graph.loop_ties import ties_entries
 
 DECIDED = "decided on with all loops"
 """Why a factor of a front end's match is taken out where it is a loop among others from then on."""
-
-
-def read_events(folder: str | Path) -> list[dict[str, Any]]:
-    """``events.jsonl`` of a run folder.
-
-    Raises
-    ------
-    RunFolderError
-        It has none.
-    FormatError
-        A line is no JSON object.
-    """
-    file = Path(folder) / "events.jsonl"
-    if not file.is_file():
-        raise RunFolderError(f"{folder}: has no events.jsonl; give a folder of a finished run")
-    out = []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            event = json.loads(line)
-        except ValueError as error:
-            raise FormatError(f"line {number} is not JSON ({error})", where=str(file)) from None
-        if not isinstance(event, dict):
-            raise FormatError(f"line {number} is no event", where=str(file), got=type(event).__name__)
-        out.append(event)
-    return out
 
 
 def loops_of_run(folder: str | Path) -> LoopLedger:
@@ -176,7 +150,7 @@ def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path 
     from graphslam.app.pipeline import run
 
     ordered = sorted(undone, key=lambda x: x.loop)
-    options = read_toml(Path(folder) / "config.toml")
+    options = read_options(Path(folder))
     said = options.pop("run")
     run(
         source or said["source"],

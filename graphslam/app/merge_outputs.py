@@ -11,14 +11,13 @@ from graphslam.app.merge import MergedMap
 from graphslam.app.merge_dense import MergedSubmaps
 from graphslam.app.outputs import landmarks_csv
 from graphslam.app.report import report_beside
+from graphslam.app.run_files import MERGED_DENSE_FORMAT, MERGED_FORMAT
 from graphslam.app.run_folder import RunFolder
 from graphslam.core.atomic import write_npz
 from graphslam.evaluate.without_truth import class_consistency
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
 
-MERGED_FORMAT = "graphslam.merged-map/1"
-MERGED_DENSE_FORMAT = "graphslam.merged-submaps/1"
 MOST_STATES = 6000
 """Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
 

@@ -10,26 +10,31 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.figures import save_figures
-from graphslam.app.loops import read_events
 from graphslam.app.run import GlobalMap, Run
+from graphslam.app.run_files import (
+    ASSOCIATION_FORMAT,
+    FIXES_FORMAT,
+    GPS_FORMAT,
+    MAP_FORMAT,
+    read_association,
+    read_events,
+    read_fixes,
+    read_gps_residuals,
+    read_ledger,
+    read_map,
+    read_metrics,
+    read_report,
+)
 from graphslam.app.run_folder import RunFolder
 from graphslam.app.run_maps import draw_run_map, write_run_map
-from graphslam.core.atomic import read_json, read_npz, write_npz
-from graphslam.core.errors import FormatError, RunFolderError
-from graphslam.core.geometry import Array
-from graphslam.core.records import Gps
+from graphslam.core.atomic import write_npz
+from graphslam.core.errors import RunFolderError
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.gps import GpsResiduals
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
-
-MAP_FORMAT = "graphslam.map/1"
-GPS_FORMAT = "graphslam.gps-residuals/1"
-FIXES_FORMAT = "graphslam.fixes/1"
-ASSOCIATION_FORMAT = "graphslam.association/1"
 
 
 def write_outputs(folder: RunFolder, run: Run) -> None:
@@ -111,13 +116,6 @@ def _association_arrays(submaps: Any) -> dict[str, Any]:
     }
 
 
-def read_association(folder: Path) -> dict[int, Array]:
-    """Landmark identities that a run's back end gave, by submap key."""
-    a = read_npz(folder / "association.npz", fmt=ASSOCIATION_FORMAT)
-    o = a["offsets"]
-    return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
-
-
 def identified_submaps(path: str | Path) -> list[Submap]:
     """Submaps of a store or of a run folder; a run's carry the identities of its back end."""
     path = Path(path)
@@ -146,59 +144,22 @@ def open_run(path: str | Path) -> Run:
             "run again with --resume" if (root / "config.toml").is_file() else "give a folder that graphslam run wrote"
         )
         raise RunFolderError(f"{root}: not a finished run; {hint}")
-    report = read_json(root / "run.json", fmt="graphslam.run/1")
-    a = read_npz(root / "map.npz", fmt=MAP_FORMAT)
-    try:
-        m = GlobalMap(
-            trajectory=Trajectory(a["trajectory_times"], a["trajectory_poses"], a["trajectory_covariances"]),
-            node_times=a["node_times"],
-            node_poses=a["node_poses"],
-            node_covariances=a["node_covariances"],
-            landmark_ids=a["landmark_ids"],
-            landmarks=a["landmarks"],
-            landmark_covariances=a["landmark_covariances"],
-            landmark_hits=a["landmark_hits"],
-            T_gps_world=a.get("T_gps_world"),
-            base_nodes=a.get("base_nodes"),
-        )
-    except KeyError as error:
-        raise FormatError(f"map lacks array {error}", where=str(root / "map.npz")) from None
+    report, m = read_report(root), read_map(root)
     return Run(
         name=str(report["source"]),
         submaps=identified_submaps(root),
         map=m,
-        metrics=pd.read_json(root / "metrics.json", orient="records"),
+        metrics=read_metrics(root),
         report=report,
         events=read_events(root) if (root / "events.jsonl").is_file() else [],
-        ledger=pd.read_csv(root / "ledger.csv", keep_default_na=False) if (root / "ledger.csv").is_file() else None,
+        ledger=read_ledger(root) if (root / "ledger.csv").is_file() else None,
         folder=root,
-        gps={p.stem.removeprefix("gps_"): _gps(p) for p in sorted(root.glob("gps_*.npz"))},
-        fixes=_fixes(root / "fixes.npz"),
+        gps={p.stem.removeprefix("gps_"): read_gps_residuals(p) for p in sorted(root.glob("gps_*.npz"))},
+        fixes=read_fixes(root),
         truth=read_truth(root),
         truth_path=_path(root / "truth.tum", m.dim),
         dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
     )
-
-
-def _gps(file: Path) -> GpsResiduals:
-    a = read_npz(file, fmt=GPS_FORMAT)
-    return GpsResiduals(
-        times=a["times"],
-        residuals=a["residuals"],
-        points=a["points"],
-        T_gps_map=a["T_gps_map"],
-        lever=a["lever"],
-        fitted=int(a["fitted"]),
-        outside=int(a["outside"]),
-        in_gap=int(a["in_gap"]),
-    )
-
-
-def _fixes(file: Path) -> Gps | None:
-    if not file.is_file():
-        return None
-    a = read_npz(file, fmt=FIXES_FORMAT)
-    return Gps(times=a["times"], positions=a["positions"], sigma=a["sigma"], lever=a["lever"])
 
 
 def _path(file: Path, dim: int) -> Trajectory | None:

@@ -8,9 +8,8 @@ import numpy as np
 
 from graphslam.app.dense_ties import SESSION
 from graphslam.app.markup import missing, note, picture, section
-from graphslam.app.outputs import MAP_FORMAT
 from graphslam.app.report_folder import ReportFolder
-from graphslam.core.atomic import read_npz
+from graphslam.app.run_files import read_map, read_merged_dense
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.markup import Markup, join
 from graphslam.evaluate.consistency import Consistency, nees, pose_error
@@ -74,18 +73,17 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
     if folder.kind == "merged":
         return _session_ties(folder)
     try:
-        m = read_npz(folder.path / "map.npz", fmt=MAP_FORMAT)
-        nodes, covariances, path = m["node_poses"], m["node_covariances"], m["trajectory_poses"]
-    except (GraphSlamError, KeyError) as error:
+        m = read_map(folder.path)
+    except GraphSlamError as error:
         folder.problems["map.npz"] = _said(folder, error)
         return [missing("loops over the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")]
-    bases = m.get("base_nodes", np.arange(len(nodes)))
-    return [*_loops(folder, nodes, path), *_nees(folder, nodes, covariances, bases)]
+    bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
+    loops = _loops(folder, m.node_poses, m.trajectory.poses)
+    return [*loops, *_nees(folder, m.node_poses, m.node_covariances, bases)]
 
 
 def _session_ties(folder: ReportFolder) -> list[Markup]:
     """Ties between sessions over the paths of both."""
-    from graphslam.app.merge_outputs import MERGED_DENSE_FORMAT  # it writes reports, and so imports this
     from graphslam.plots.loops import plot_loops
     from graphslam.plots.save import png
 
@@ -93,13 +91,14 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
     if not ties:
         return [missing("ties between sessions over their paths: there are none that are places.")]
     try:
-        nodes = read_npz(folder.path / "merged.npz", fmt=MERGED_DENSE_FORMAT)["nodes"]
+        nodes = read_merged_dense(folder.path)["nodes"]
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
         gap = np.full((1, 2), np.nan)  # lifts the pen
         path = np.concatenate([x for p in paths for x in (p, gap)])
-        ends = [(int(e["i"]), int(e["j"]), "accepted") for e in ties]
+        known = range(len(nodes))
+        ends = [(e["i"], e["j"], "accepted") for e in ties if e["i"] in known and e["j"] in known]
         ax = plot_loops(None, path, nodes, ends, title="ties between sessions, from above")
-    except (GraphSlamError, KeyError, TypeError, ValueError) as error:
+    except GraphSlamError as error:
         return [missing("ties between sessions over their paths: ", _said(folder, error), ".")]
     return [picture(png(ax), "Paths of the sessions in the common frame, and the places that tie them")]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,17 +9,22 @@ from typing import Any, Literal, TypeVar
 
 import pandas as pd
 
-from graphslam.app.config import read_toml
-from graphslam.app.loops import ledger_of_events, read_events
+from graphslam.app.loops import ledger_of_events
+from graphslam.app.run_files import (
+    read_events,
+    read_ledger,
+    read_merge_report,
+    read_metrics,
+    read_options,
+    read_report,
+)
 from graphslam.core.atomic import read_json
-from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError
+from graphslam.core.errors import GraphSlamError, RunFolderError
 from graphslam.graph.loop_ledger import LoopLedger
 from graphslam.io.submap_store import SubmapStore
 
 Kind = Literal["run", "interrupted", "merged"]
 T = TypeVar("T")
-# Ours; and what values of a wrong kind raise in files that somebody wrote by hand.
-_UNREADABLE = (GraphSlamError, OSError, ValueError, TypeError, KeyError, IndexError, AttributeError)
 _PNG_HEAD, _PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 MOST_BYTES = 8_000_000
 """A picture larger than this is left out of the page."""
@@ -127,34 +131,40 @@ def read_folder(path: str | Path) -> ReportFolder:
     def attempt(name: str, read: Callable[[], T], otherwise: T) -> T:
         try:
             return read()
-        except _UNREADABLE as error:
+        except (GraphSlamError, OSError) as error:
             known = " ".join(str(error).replace(f"{root}/", "").split())
             out.problems[name] = known if (root / name).exists() else "is not there"
             return otherwise
 
     if kind == "merged":
-        out.report = attempt("merge.json", lambda: read_json(root / "merge.json", fmt="graphslam.merge/1"), {})
+        out.report = attempt("merge.json", lambda: read_merge_report(root), {})
     else:
-        out.config = attempt("config.toml", lambda: read_toml(root / "config.toml"), {})
+        out.config = attempt("config.toml", lambda: read_options(root), {})
         out.submaps = attempt("submaps/index.json", lambda: _index(root), [])
     if kind == "run":
-        out.report = attempt("run.json", lambda: read_json(root / "run.json", fmt="graphslam.run/1"), {})
+        out.report = attempt("run.json", lambda: read_report(root), {})
     if kind == "interrupted":
         for name in ("run.json", "metrics.json", "events.jsonl", "ledger.csv"):
             out.problems[name] = "is not there: it is written when a run is finished"
         return out
-    out.metrics = attempt("metrics.json", lambda: _metrics(root / "metrics.json"), [])
+    out.metrics = attempt("metrics.json", lambda: _metrics(root), [])
     out.events = attempt("events.jsonl", lambda: read_events(root), None)
     if out.events is not None:
         events = out.events
         nothing: tuple[LoopLedger | None, list[dict[str, Any]]] = (None, [])
         out.loops, out.loop_rows = attempt("events.jsonl", lambda: _loops(events), nothing)
-    out.ledger = attempt("ledger.csv", lambda: _ledger(root / "ledger.csv"), None)
+    out.ledger = attempt("ledger.csv", lambda: read_ledger(root), None)
     if (root / "clearest.json").is_file():
         out.clearest = attempt(
             "clearest.json", lambda: read_json(root / "clearest.json", fmt="graphslam.clearest/1"), None
         )
     return out
+
+
+def _metrics(root: Path) -> list[dict[str, Any]]:
+    """Rows of the metrics; what is no number has no value."""
+    rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root).to_dict("records")]
+    return [r if r["value"] == r["value"] else {**r, "value": None} for r in rows]
 
 
 def _index(root: Path) -> list[dict[str, Any]]:
@@ -169,26 +179,3 @@ def _loops(events: list[dict[str, Any]]) -> tuple[LoopLedger | None, list[dict[s
     for row, d in zip(rows, ledger.current()):
         row["gates"] = {k: v for k, v in (d.gates or {}).items() if v is not None and v == v}
     return ledger, rows
-
-
-def _metrics(file: Path) -> list[dict[str, Any]]:
-    try:
-        rows = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"not JSON ({error})", where=file.name) from None
-    if not isinstance(rows, list) or not all(isinstance(r, dict) for r in rows):
-        raise FormatError("no list of metrics", where=file.name)
-    return rows
-
-
-def _ledger(file: Path) -> pd.DataFrame:
-    wanted = ["factor_id", "factor", "stream", "t_start", "t_end", "kind", "note"]
-    try:
-        found = pd.read_csv(file, keep_default_na=False)
-    except ValueError as error:  # pandas's own errors are ValueErrors
-        raise FormatError(f"not a table ({error})", where=file.name) from None
-    if lacking := [c for c in wanted if c not in found.columns]:
-        raise FormatError(f"table lacks columns {lacking}", where=file.name, wanted=wanted)
-    for c in ("t_start", "t_end"):
-        found[c] = pd.to_numeric(found[c], errors="coerce")
-    return found

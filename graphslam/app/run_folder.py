@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from graphslam.app.config import dump_toml
+from graphslam.app.config import dump_toml, read_toml
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import RunFolderError
+from graphslam.core.errors import ConfigError, RunFolderError
 from graphslam.io.submap_store import GridLoader, SubmapStore
 
 
@@ -76,9 +76,9 @@ class RunFolder:
     def _check_same(self, old: Path, config: Mapping[str, Any]) -> None:
         """A resumed run must be the run that was stopped."""
         try:
-            before = tomllib.loads(old.read_text())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise RunFolderError(f"{old}: damaged ({error})") from None
+            before = read_toml(old)
+        except ConfigError as error:
+            raise RunFolderError(f"{self.path}: damaged ({error})") from None
         for key, a, b in _differences(before, tomllib.loads(dump_toml(config))):
             raise RunFolderError(f"{self.path}: cannot resume, {key} was {a!r} and is {b!r} now")
 

@@ -18,6 +18,7 @@ import numpy as np
 from graphslam.app.config import MapConfig
 from graphslam.app.metrics import Metrics
 from graphslam.app.run import GlobalMap, Run
+from graphslam.app.run_files import read_options
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
@@ -264,10 +265,7 @@ def map_of_folder(path: str | Path, *, heights: Callable[[MapConfig], MapConfig]
 
 def folder_options(root: Path) -> dict[str, Any]:
     """``config.toml`` of a run folder; nothing where there is none."""
-    import tomllib
-
-    file = root / "config.toml"
-    return tomllib.loads(file.read_text()) if file.is_file() else {}
+    return read_options(root)
 
 
 def map_config(values: Mapping[str, Any]) -> MapConfig:

@@ -21,12 +21,23 @@ import pandas as pd
 from graphslam.app.run_folder import make_folder, sweep
 from graphslam.core.atomic import atomic_open, read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
+from graphslam.core.npz import flags, floats, ints, texts
 from graphslam.evaluate.montecarlo import Measurement
 
 logger = logging.getLogger(__name__)
 
 STUDY_FORMAT = "graphslam.study/1"
 TRIAL_FORMAT = "graphslam.trial/1"
+_IDENTITY = {"name": str, "seed": int, "quick": bool, "worlds": {str: str}, "versions": {str: str}}
+_TRIAL = {
+    **dict.fromkeys(("world", "error", "details", "source"), texts()),
+    **dict.fromkeys(("run", "seed"), ints()),
+    "algorithms": texts("a"),
+    "quantities": texts("q"),
+    **dict.fromkeys(("algorithm", "quantity", "submap"), ints("n")),
+    "value": floats("n", finite=False),
+    "timing": flags("n"),
+}
 TABLE_COLUMNS = ("world", "run", "algorithm", "submap", "quantity", "value")
 
 
@@ -124,7 +135,7 @@ class StudyFolder:
         ------
         MissingDataError, FormatError
         """
-        value = read_json(self.path / "study.json", fmt=STUDY_FORMAT)
+        value = read_json(self.path / "study.json", fmt=STUDY_FORMAT, shape=_IDENTITY)
         value.pop("format")
         return value
 
@@ -187,21 +198,21 @@ class StudyFolder:
         FormatError
             Damaged, or the trial of another place.
         """
-        a = read_npz(path, fmt=TRIAL_FORMAT)
-        try:
-            world, run = str(a["world"]), int(a["run"])
-            frame = pd.DataFrame(
-                {
-                    "algorithm": a["algorithms"].astype(object)[a["algorithm"]],
-                    "submap": a["submap"],
-                    "quantity": a["quantities"].astype(object)[a["quantity"]],
-                    "value": a["value"],
-                }
-            )
-            timing, seed = a["timing"], int(a["seed"])
-            error, details, source = (str(a[name]) for name in ("error", "details", "source"))
-        except (KeyError, ValueError, IndexError, TypeError) as problem:
-            raise FormatError(f"not a whole trial ({problem})", where=str(path)) from None
+        a = read_npz(path, fmt=TRIAL_FORMAT, fields=_TRIAL)
+        world, run = str(a["world"]), int(a["run"])
+        for name, names in (("algorithm", "algorithms"), ("quantity", "quantities")):
+            if len(a[name]) and (a[name].min() < 0 or a[name].max() >= len(a[names])):
+                raise FormatError(f"array {name!r} names none of {names!r}", where=str(path), got=a[name].max())
+        frame = pd.DataFrame(
+            {
+                "algorithm": a["algorithms"].astype(object)[a["algorithm"]],
+                "submap": a["submap"],
+                "quantity": a["quantities"].astype(object)[a["quantity"]],
+                "value": a["value"],
+            }
+        )
+        timing, seed = a["timing"], int(a["seed"])
+        error, details, source = (str(a[name]) for name in ("error", "details", "source"))
         if path != self.trial_path(world, run):
             raise FormatError("trial of another place", where=str(path), got=f"{world}/{run:06d}")
         return TrialRecord(

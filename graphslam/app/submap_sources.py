@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,9 @@ import numpy as np
 
 from graphslam.app.outputs import identified_submaps
 from graphslam.app.run import Run
+from graphslam.app.run_files import read_options
 from graphslam.core.errors import MissingDataError
+from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.io.catalog import load
@@ -81,9 +82,9 @@ def submap_source(source: Run | SubmapSource | str | Path | Sequence[Submap]) ->
 
 def _run_facts(root: Path) -> tuple[float, str]:
     """Covariance scale and kind of identities of a run folder; of a bare store 1 and the truth's."""
-    file = root / "config.toml"
-    if not file.is_file():
+    values = read_options(root)
+    if not values:
         return 1.0, "truth"
-    values = tomllib.loads(file.read_text())
     known = values.get("frontend", {}).get("association") == "known"
-    return float(values.get("backend", {}).get("covariance_scale", 1.0)), "truth" if known else "run"
+    backend = check_json(values.get("backend", {}), {"covariance_scale?": float}, str(root / "config.toml"))
+    return float(backend.get("covariance_scale", 1.0)), "truth" if known else "run"

@@ -9,11 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.atomic import read_npz, write_npz
+from graphslam.core.errors import FormatError
 from graphslam.core.geometry import Array
+from graphslam.core.npz import floats, ints
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.tum import write_tum
 
 JOINED_FORMAT = "graphslam.joined/1"
+JOINED = {"times": floats("m"), "poses": floats("m", 3), "landmark_ids": ints("n"), "landmarks": floats("n", 2)}
 
 
 def write_joined(
@@ -47,4 +50,8 @@ def read_joined(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     ------
     MissingDataError, FormatError
     """
-    return read_npz(Path(folder) / "joined.npz", fmt=JOINED_FORMAT)
+    file = Path(folder) / "joined.npz"
+    arrays = read_npz(file, fmt=JOINED_FORMAT, fields=JOINED)
+    if np.any(np.diff(arrays["times"]) <= 0):
+        raise FormatError("stamps of the nodes do not rise", where=str(file))
+    return arrays

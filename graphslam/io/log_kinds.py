@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from graphslam.core.imu import Imu, ImuNoise
+from graphslam.core.npz import Field, check_arrays, floats, ints, texts
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import (
@@ -37,25 +38,35 @@ class Kind:
     Parameters
     ----------
     cls : type
-    fields : tuple of str
-        Arrays stored under the field's own name.
+    fields : mapping of str to Field
+        Arrays stored under the name of a field of the class.
     pack : callable
         Stream → further arrays.
     unpack : callable
         Arrays → further arguments of the class.
+    more : mapping of str to Field
+        The further arrays.
     """
 
     cls: type
-    fields: tuple[str, ...]
+    fields: Mapping[str, Field]
     pack: Callable[[Any], dict[str, Any]] = _nothing
     unpack: Callable[[Arrays], dict[str, Any]] = _nothing
+    more: Mapping[str, Field] = field(default_factory=dict)
 
     def arrays(self, stream: Any) -> dict[str, Any]:
         """The stream as arrays by name."""
         return {**{f: getattr(stream, f) for f in self.fields}, **self.pack(stream)}
 
-    def stream(self, arrays: Arrays) -> Any:
-        """Inverse of :meth:`arrays`; what the class refuses is raised as it is."""
+    def stream(self, arrays: Arrays, where: str) -> Any:
+        """Inverse of :meth:`arrays`; what the class refuses is raised as it is.
+
+        Raises
+        ------
+        FormatError
+            An array is missing, of another type or shape, or not finite; names the file.
+        """
+        arrays = check_arrays(arrays, {**self.fields, **self.more}, where)
         return self.cls(**{f: arrays[f] for f in self.fields}, **self.unpack(arrays))
 
 
@@ -107,38 +118,87 @@ def _unpack_clouds(a: Arrays) -> dict[str, Any]:
     return {"source": ArrayClouds(a["points"], a["offsets"])}
 
 
-def _floats(*names: str) -> dict[str, Callable[[Any], dict[str, Any]]]:
+def _floats(*names: str) -> dict[str, Any]:
     """Packing of fields that are single numbers."""
     return {
         "pack": lambda s: {n: np.float64(getattr(s, n)) for n in names},
         "unpack": lambda a: {n: float(a[n]) for n in names},
+        "more": {n: floats(finite=n != "max_range") for n in names},
     }
 
 
+_TIMES = {"times": floats("n")}
 KINDS: dict[str, Kind] = {
-    "laser-scans": Kind(LaserScans, ("times", "ranges", "bearings", "T_base_sensor"), **_floats("max_range")),
+    "laser-scans": Kind(
+        LaserScans,
+        {**_TIMES, "ranges": floats("n", "m", finite=False), "bearings": floats("m"), "T_base_sensor": floats(3)},
+        **_floats("max_range"),
+    ),
     "range-scans": Kind(
         RangeScans,
-        ("times", "ranges", "directions", "beam_times", "T_base_mount", "spin", "spin_rate"),
+        {
+            **_TIMES,
+            "ranges": floats("n", "m", finite=False),
+            "directions": floats("m", 3),
+            "beam_times": floats("m"),
+            "T_base_mount": floats(7),
+            "spin": floats("n"),
+            "spin_rate": floats("n"),
+        },
         **_floats("max_range", "sigma"),
     ),
-    "point-clouds": Kind(PointClouds, ("times", "origin", "T_base_sensor"), _pack_clouds, _unpack_clouds),
-    "imu": Kind(Imu, ("times", "angular_rate", "specific_force", "T_base_imu"), _pack_imu, _unpack_imu),
-    "steering-controls": Kind(SteeringControls, ("times", "speed", "steering"), _pack_steering, _unpack_steering),
-    "velocity-controls": Kind(VelocityControls, ("times", "speed", "yaw_rate")),
-    "odometry": Kind(Odometry, ("times", "increments", "covariances")),
-    "gps": Kind(Gps, ("times", "positions", "sigma", "lever")),
+    "point-clouds": Kind(
+        PointClouds,
+        {**_TIMES, "origin": floats(3), "T_base_sensor": floats(7)},
+        _pack_clouds,
+        _unpack_clouds,
+        {"points": floats("q", 3), "offsets": ints("n+1")},
+    ),
+    "imu": Kind(
+        Imu,
+        {
+            **_TIMES,
+            "angular_rate": floats("n", 3),
+            "specific_force": floats("n", 3),
+            "T_base_imu": floats(7),
+        },
+        _pack_imu,
+        _unpack_imu,
+        {
+            "attitude": floats("n", 2, optional=True),
+            **{f"noise_{f.name}": floats() for f in dataclasses.fields(ImuNoise)},
+        },
+    ),
+    "steering-controls": Kind(
+        SteeringControls,
+        {**_TIMES, "speed": floats("n"), "steering": floats("n")},
+        _pack_steering,
+        _unpack_steering,
+        {"wheelbase": floats(), "encoder_offset": floats(), "model": texts()},
+    ),
+    "velocity-controls": Kind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
+    "odometry": Kind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
+    "gps": Kind(Gps, {**_TIMES, "positions": floats("n", "c"), "sigma": floats("n"), "lever": floats("c")}),
     "landmark-observations": Kind(
         LandmarkObservations,
-        ("times", "offsets", "ranges", "bearings", "sigmas", "T_base_sensor"),
+        {
+            **_TIMES,
+            "offsets": ints("n+1"),
+            "ranges": floats("q"),
+            "bearings": floats("q"),
+            "sigmas": floats("q", 2, finite=False),
+            "T_base_sensor": floats(3),
+        },
         _pack_landmarks,
         _unpack_landmarks,
+        {"max_range": floats(finite=False), "field_of_view": floats(2), "ids": ints("q", optional=True)},
     ),
     "trajectory": Kind(
         Trajectory,
-        ("times", "poses"),
+        {**_TIMES, "poses": floats("n", "p")},
         lambda s: {} if s.covariances is None else {"covariances": s.covariances},
         lambda a: {"covariances": a.get("covariances")},
+        {"covariances": floats("n", "d", "d", optional=True)},
     ),
 }
 """By the name that ``log.json`` gives."""

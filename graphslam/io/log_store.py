@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
-from graphslam.core.errors import DataError, FormatError, GraphSlamError
+from graphslam.core.errors import DataError, FormatError
 from graphslam.core.log import SensorLog, Truth
+from graphslam.core.npz import floats, ints
+from graphslam.core.reading import inside
+from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.log_kinds import KINDS, Arrays
 
@@ -82,35 +85,53 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
     """
     root = Path(folder)
     index_path = root / INDEX_NAME
-    index = read_json(index_path, fmt=LOG_FORMAT)
     where = str(index_path)
-    streams = {}
-    for entry in _get(index, "streams", list, where):
-        name, file, kind, records = (_get(entry, k, t, where) for k, t in _ENTRY)
-        path = _inside(root, file, where)
+    index = read_json(index_path, fmt=LOG_FORMAT, shape=_INDEX)
+    streams: dict[str, Stream] = {}
+    for entry in index["streams"]:
+        name, kind = entry["name"], entry["kind"]
+        path = inside(root, entry["file"], where)
+        if name in streams:
+            raise FormatError("stream listed twice", where=where, got=repr(name[:80]))
         arrays = read_npz(path, fmt=STREAM_FORMAT)
         if kind not in KINDS or str(arrays.get("kind")) != kind:
             raise FormatError(
                 "unknown stream kind", where=str(path), got=f"{arrays.get('kind')} listed as {kind!r}", wanted=kind
             )
-        streams[name] = _build(str(path), lambda a=arrays, k=kind: KINDS[k].stream(a))  # type: ignore[misc]
-        if len(streams[name].times) != records:
-            raise FormatError("wrong number of records", where=str(path), got=len(streams[name].times), wanted=records)
+        streams[name] = _build(str(path), lambda a=arrays, k=kind, p=path: KINDS[k].stream(a, str(p)))  # type: ignore[misc]
+        if len(streams[name].times) != entry["records"]:
+            raise FormatError(
+                "wrong number of records", where=str(path), got=len(streams[name].times), wanted=entry["records"]
+            )
     truth = None
     if index.get("truth") is not None:
-        path = _inside(root, _get(index, "truth", str, where), where)
-        truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT)))
+        path = inside(root, index["truth"], where)
+        truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT, fields=_TRUTH)))
     return SensorLog(
-        name=_get(index, "name", str, where),
+        name=index["name"],
         streams=streams,
         truth=truth,
-        read=_get(index, "read", dict, where),
-        dropped=_get(index, "dropped", dict, where),
-        meta=_get(index, "meta", dict, where),
+        read=index["read"],
+        dropped=index["dropped"],
+        meta=index["meta"],
     )
 
 
-_ENTRY: tuple[tuple[str, type], ...] = (("name", str), ("file", str), ("kind", str), ("records", int))
+_INDEX = {
+    "name": str,
+    "streams": [{"name": str, "file": str, "kind": str, "records": int}],
+    "truth?": str,
+    "read": {str: int},
+    "dropped": {str: int},
+    "meta": {},
+}
+_TRUTH = {
+    "times": floats("n"),
+    "poses": floats("n", "p"),
+    "covariances": floats("n", "d", "d", optional=True),
+    "landmark_ids": ints("l"),
+    "landmarks": floats("l", "c"),
+}
 
 
 def _truth_arrays(truth: Truth) -> dict[str, Any]:
@@ -134,30 +155,10 @@ def _truth(a: Arrays) -> Truth:
 
 
 def _build(where: str, make: Callable[[], Any]) -> Any:
-    """Run a constructor on what a file held; whatever it does not like is the file's fault."""
+    """Run a constructor on what a file held; what it refuses is the file's fault."""
     try:
         return make()
-    except FormatError:
-        raise
-    except KeyError as error:
-        raise FormatError(f"array {error} is missing", where=where) from None
-    except (DataError, ValueError, TypeError, IndexError, AttributeError) as error:
-        if isinstance(error, DataError) and error.where == where:
+    except DataError as error:
+        if error.where is not None and error.where.startswith(where):
             raise
         raise FormatError(f"holds an impossible record ({error})", where=where) from error
-    except GraphSlamError:
-        raise
-
-
-def _get(mapping: Any, key: str, kind: type, where: str) -> Any:
-    value = mapping.get(key) if isinstance(mapping, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise FormatError(f"key {key!r} is missing or of the wrong type", where=where, wanted=kind.__name__)
-    return value
-
-
-def _inside(root: Path, file: str, where: str) -> Path:
-    """A file name of the index, which must not lead out of the folder."""
-    if not _SAFE_NAME.fullmatch(file):
-        raise FormatError("file name leads out of the log", where=where, got=repr(file), wanted="a plain file name")
-    return root / file

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from graphslam.core.errors import DataError, FormatError
+from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
+from graphslam.core.json_file import check_json, parse_json
+from graphslam.core.npz import check_arrays, flags, floats, ints, texts
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 
 SUBMAP_FORMAT = "graphslam.submap/1"
+Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def submap_arrays(submap: Submap) -> dict[str, Any]:
@@ -68,7 +73,7 @@ def _plain(value: Any) -> Any:
     raise FormatError("a submap's report holds something JSON has no word for", got=type(value).__name__)
 
 
-def submap_from_arrays(arrays: Mapping[str, Any], *, where: str) -> Submap:
+def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
     """The submap that :func:`submap_arrays` wrote down; optional arrays may be missing.
 
     Raises
@@ -79,78 +84,110 @@ def submap_from_arrays(arrays: Mapping[str, Any], *, where: str) -> Submap:
         Its values are impossible (the particular kind of :class:`DataError` is kept); names the file.
     """
 
-    def need(name: str) -> Any:
-        if name not in arrays:
-            raise FormatError(f"array {name!r} is missing", where=where, got=sorted(arrays))
-        return arrays[name]
-
+    a = check_arrays(arrays, _FIELDS, where)
     try:
-        dim, d = int(need("dim")), {2: 3, 3: 6}.get(int(need("dim")))
-        exit_pose = np.asarray(need("exit_pose"), dtype=np.float64)
-        if d is None or exit_pose.shape != ({2: 3, 3: 7}[dim],):
+        dim, exit_pose, interval = int(a["dim"]), a["exit_pose"], a["interval"]
+        if len(exit_pose) != {2: 3, 3: 7}.get(dim):
             raise FormatError("dim and exit_pose do not agree", where=where, got=(dim, exit_pose.shape))
-        interval = np.asarray(need("interval"), dtype=np.float64)
-        if interval.shape != (2,):
-            raise FormatError("interval is not two times", where=where, got=interval.shape)
         rest: dict[str, Any] = {
-            "uses": frozenset(str(s) for s in np.asarray(arrays.get("used", ()), dtype=np.str_).ravel()),
-            "report": json.loads(str(arrays["report"])) if "report" in arrays else {},
-            "trajectory": _trajectory(arrays),
-            "matches": _matches(arrays),
-            "cloud": arrays.get("cloud"),
+            "uses": frozenset(a["used"].tolist()) if "used" in a else frozenset(),
+            "report": check_json(parse_json(str(a.get("report", "{}")), f"{where}, report"), {str: object}, where),
+            "trajectory": _trajectory(a, where),
+            "matches": _matches(a, where),
+            "cloud": a.get("cloud"),
         }
-        key, span = int(need("key")), (float(interval[0]), float(interval[1]))
-        if bool(arrays.get("has_landmarks", True)):
-            landmarks = _landmark_map(arrays, need, exit_pose, dim, d, where)
-            if "exit_covariance" not in arrays:
+        key, span = int(a["key"]), (float(interval[0]), float(interval[1]))
+        if bool(a.get("has_landmarks", True)):
+            landmarks = _landmark_map(a, dim, where)
+            if "exit_covariance" not in a:
                 return Submap.from_landmarks(key, landmarks, interval=span, **rest)
             rest["landmarks"] = landmarks
-        return Submap(key=key, interval=span, exit_pose=exit_pose, exit_covariance=need("exit_covariance"), **rest)
+        return Submap(
+            key=key, interval=span, exit_pose=exit_pose, exit_covariance=_need(a, "exit_covariance", where), **rest
+        )
     except DataError as error:
         if error.where is not None and error.where.startswith(where):
             raise
         inside = f"{where}: {error.where}" if error.where else where
         raise type(error)(error.what, where=inside, got=error.got, wanted=error.wanted) from None
-    except (ValueError, TypeError, KeyError) as error:
-        raise FormatError(f"an array is of the wrong kind ({error})", where=where) from None
 
 
-def _landmark_map(
-    arrays: Mapping[str, Any], need: Callable[[str], Any], exit_pose: Any, dim: int, d: int, where: str
-) -> LandmarkMap:
-    ids = np.asarray(need("landmark_ids"))
-    positions = np.asarray(need("landmarks"), dtype=np.float64)
-    if ids.ndim != 1 or (len(ids) and not np.issubdtype(ids.dtype, np.integer)):
-        raise FormatError("landmark_ids are not a list of integers", where=where, got=f"{ids.dtype} {ids.shape}")
-    if positions.size != len(ids) * dim:
-        raise FormatError("landmarks do not fit landmark_ids", where=where, got=positions.shape, wanted=(len(ids), dim))
+_FIELDS = {
+    "key": ints(),
+    "dim": ints(),
+    "interval": floats(2),
+    "exit_pose": floats("p"),
+    "exit_covariance": floats("d", "d", optional=True),
+    "has_landmarks": flags(optional=True),
+    "used": texts("u", optional=True),
+    "report": texts(optional=True),
+    "landmark_ids": ints("l", optional=True),
+    "landmarks": floats("l", "c", optional=True),
+    "covariance": floats("v", "v", optional=True),
+    "information_data": floats("z", optional=True),
+    "information_indices": ints("z", optional=True),
+    "information_indptr": ints("v+1", optional=True),
+    "sightings": ints("q", 2, optional=True),
+    "trajectory_times": floats("n", optional=True),
+    "trajectory_poses": floats("n", "p", optional=True),
+    "trajectory_covariances": floats("n", "d", "d", optional=True),
+    "cloud": floats("k", 3, optional=True),
+    "match_targets": ints("r", optional=True),
+    "match_poses": floats("r", "p", optional=True),
+    "match_covariances": floats("r", "d", "d", optional=True),
+    "match_fitness": floats("r", optional=True),
+    "match_support": floats("r", optional=True),
+}
+
+
+def _need(arrays: Arrays, name: str, where: str) -> npt.NDArray[Any]:
+    if name not in arrays:
+        raise FormatError(f"array {name!r} is missing", where=where, got=sorted(arrays))
+    return arrays[name]
+
+
+def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
+    ids, positions = _need(a, "landmark_ids", where), _need(a, "landmarks", where)
+    if positions.shape[1] != dim:
+        raise FormatError(
+            "landmarks do not fit the dimension", where=where, got=positions.shape, wanted=(len(ids), dim)
+        )
     information = None
-    if "covariance" not in arrays:
-        n = d + dim * len(ids)
-        parts = [np.asarray(need(f"information_{p}")) for p in ("data", "indices", "indptr")]
-        information = sp.csc_matrix((parts[0], parts[1], parts[2]), shape=(n, n))
-        information.check_format(full_check=True)
+    if "covariance" not in a:
+        n = (3 if dim == 2 else 6) + positions.size
+        data, indices, indptr = (_need(a, f"information_{p}", where) for p in ("data", "indices", "indptr"))
+        if len(indptr) != n + 1 or indptr[0] != 0 or np.any(np.diff(indptr) < 0) or indptr[-1] != len(data):
+            raise FormatError("information_indptr is impossible", where=where, got=indptr.shape, wanted=f"({n + 1},)")
+        if len(indices) and (indices.min() < 0 or indices.max() >= n):
+            raise FormatError("information_indices are impossible", where=where, wanted=f"0 … {n - 1}")
+        information = sp.csc_matrix((data, indices, indptr), shape=(n, n))
+        off = abs(information - information.T)
+        if off.nnz and off.max() > 1e-6 * abs(information).max():
+            raise FormatError("information is not symmetric", where=where)
     return LandmarkMap(
-        ids=ids.astype(np.int64),
-        exit_pose=exit_pose,
+        ids=ids,
+        exit_pose=a["exit_pose"],
         positions=positions,
-        covariance=arrays.get("covariance"),
+        covariance=a.get("covariance"),
         information=information,
-        sightings=arrays.get("sightings"),
+        sightings=a.get("sightings"),
     )
 
 
-def _trajectory(arrays: Mapping[str, Any]) -> Trajectory | None:
-    if "trajectory_times" not in arrays or len(arrays["trajectory_times"]) == 0:
+def _trajectory(a: Arrays, where: str) -> Trajectory | None:
+    if len(a.get("trajectory_times", ())) == 0:
         return None
-    return Trajectory(arrays["trajectory_times"], arrays["trajectory_poses"], arrays.get("trajectory_covariances"))
+    return Trajectory(a["trajectory_times"], _need(a, "trajectory_poses", where), a.get("trajectory_covariances"))
 
 
-def _matches(arrays: Mapping[str, Any]) -> tuple[Match, ...]:
-    if "match_targets" not in arrays:
+def _matches(a: Arrays, where: str) -> tuple[Match, ...]:
+    if "match_targets" not in a:
         return ()
     names = ("targets", "poses", "covariances", "fitness", "support")
-    return tuple(
+    found = tuple(
         Match(target=int(t), T_target_here=T, covariance=P, fitness=float(f), support=float(s))
-        for t, T, P, f, s in zip(*(arrays[f"match_{n}"] for n in names), strict=True)
+        for t, T, P, f, s in zip(*(_need(a, f"match_{n}", where) for n in names), strict=True)
     )
+    for k, q in enumerate(found):
+        check_covariance(q.covariance, what=f"covariance of match {k}", where=where)
+    return found

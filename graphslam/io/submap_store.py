@@ -19,6 +19,8 @@ from typing import Any
 from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.npz import check_arrays, floats, ints
+from graphslam.core.reading import inside, safe_name
 from graphslam.core.submap import DensePayload, Submap
 from graphslam.io.submap_file import SUBMAP_FORMAT, submap_arrays, submap_from_arrays
 
@@ -74,7 +76,7 @@ class SubmapStore:
             Names the file.
         """
         entry = self.entries[k]
-        file = self.path / entry["file"]
+        file = inside(self.path, entry["file"], str(self.path / INDEX))
         submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT), where=str(file))
         found = {**_entry(submap), "file": entry["file"]}
         if found != entry:
@@ -160,26 +162,30 @@ def _entry(submap: Submap) -> dict[str, Any]:
     }
 
 
+_INDEX = {
+    "dim": int,
+    "count": int,
+    "submaps": [{"key": int, "file": str, "interval": (float, float), "landmarks": int}],
+}
+_TRUTH = {
+    "keys": ints("m"),
+    "exit_poses": floats("m", "p"),
+    "landmark_ids": ints("n"),
+    "landmarks": floats("n", "c"),
+}
+
+
 def _read_index(file: Path) -> list[dict[str, Any]]:
-    index = read_json(file, fmt=INDEX_FORMAT)
-    try:
-        entries: list[dict[str, Any]] = [
-            {
-                "key": int(e["key"]),
-                "file": str(e["file"]),
-                "interval": [float(t) for t in e["interval"]],
-                "landmarks": int(e["landmarks"]),
-            }
-            for e in index["submaps"]
-        ]
-        dim, count = int(index["dim"]), int(index["count"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"an entry is missing or of the wrong kind ({error!r})", where=str(file)) from None
+    index = read_json(file, fmt=INDEX_FORMAT, shape=_INDEX)
+    entries: list[dict[str, Any]] = [
+        {**{k: e[k] for k in ("key", "file", "landmarks")}, "interval": [float(t) for t in e["interval"]]}
+        for e in index["submaps"]
+    ]
+    dim, count = index["dim"], index["count"]
     if count != len(entries) or dim not in (2, 3):
         raise FormatError("count or dim is wrong", where=str(file), got=(count, dim), wanted=(len(entries), "2 or 3"))
     for e in entries:
-        if Path(e["file"]).name != e["file"] or e["file"] in ("", ".", ".."):
-            raise FormatError("a submap lies outside the folder", where=str(file), got=e["file"], wanted="a file name")
+        safe_name(e["file"], str(file))
     keys = [e["key"] for e in entries]
     if any(b <= a for a, b in itertools.pairwise(keys)):
         raise FormatError("keys do not rise", where=str(file), got=keys)
@@ -245,12 +251,7 @@ def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
     file = next((c for c in candidates if c.is_file()), None)
     if file is None:
         return None
-    arrays = read_npz(file, fmt="none")
     try:
-        return MapTruth(**{n: arrays[n] for n in ("keys", "exit_poses", "landmark_ids", "landmarks")})
-    except KeyError as error:
-        raise FormatError(f"array {error} is missing", where=str(file), got=sorted(arrays)) from None
+        return MapTruth(**check_arrays(read_npz(file, fmt="none"), _TRUTH, str(file)))
     except GeometryError as error:
         raise GeometryError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None
-    except (ValueError, TypeError) as error:
-        raise FormatError(f"an array is of the wrong kind ({error})", where=str(file)) from None

@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
 
 from graphslam.core import se3
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.errors import FormatError
 from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.reading import read_text, usable
 from graphslam.core.trajectory import Trajectory
 
 # Files in the wild print quaternions with as few as three digits.
@@ -57,12 +57,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
         the plane with ``dim=2``; names the line.
     """
     where = str(path)
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        raise MissingDataError("no such file", where=where) from None
-    except UnicodeDecodeError:
-        raise FormatError("not a text file", where=where) from None
+    text = read_text(path)
     rows: list[list[float]] = []
     lines: list[int] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -79,7 +74,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
             raise FormatError(f"not a number ({error})", where=f"{where}:{number}") from None
         lines.append(number)
     data = np.array(rows).reshape(-1, 8)
-    _refuse(~np.all(np.isfinite(data), axis=1), "not finite", where, lines, rows)
+    _refuse(~np.all(usable(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)
     _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
     _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "time does not increase", where, lines, data[:, 0])

@@ -185,7 +185,7 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
 
 def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     """A merged folder by hand: two paths side by side, two ties of which one is a factor."""
-    from graphslam.app.merge_outputs import MERGED_DENSE_FORMAT
+    from graphslam.app.run_files import MERGED_DENSE_FORMAT
     from graphslam.core.atomic import write_npz
     from graphslam.core.trajectory import Trajectory
     from graphslam.io.tum import write_tum
