@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import tomli_w
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.reading import LARGEST, read_text
 
 
@@ -229,8 +229,10 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(read_text(path))
+    except MissingDataError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.what})") from None
     except DataError as error:
-        raise ConfigError(str(error)) from None
+        raise ConfigError(f"{path}: not a TOML file ({error.what})") from None
     except (ValueError, RecursionError) as error:  # tomllib's own errors are ValueErrors
         raise ConfigError(f"{path}: not a TOML file ({error})") from None
 

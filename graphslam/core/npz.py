@@ -19,7 +19,10 @@ import numpy.typing as npt
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.reading import LARGEST, check_size, usable
 
-_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U"}
+MOST_HEADER = 1 << 16
+"""Bytes of the longest header of an array that is read."""
+
+_KINDS = {"float": "fiu", "int": "iu", "bool": "b", "text": "U"}
 _HEADER = re.compile(
     r"\{'descr': '([<>|=]?[biufU][0-9]{1,6})', 'fortran_order': (True|False), 'shape': \(([0-9, ]*)\), \} *\n"
 )
@@ -148,7 +151,7 @@ def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.
         raise ValueError(f"{name} is no array of NumPy")
     width = 2 if head[6] == 1 else 4
     length = int.from_bytes(stream.read(width), "little")
-    if length > 1 << 16:
+    if length > MOST_HEADER - 12:
         raise ValueError(f"{name} has a header of {length} bytes")
     said = _HEADER.fullmatch(stream.read(length).decode("latin-1"))
     if said is None:
@@ -181,6 +184,8 @@ def check_arrays(
                 continue
             raise FormatError(f"array {name!r} is missing", where=where, got=sorted(arrays)[:20])
         a = arrays[name]
+        if a.size == 0 and a.dtype.kind in "fiu" and field.kind in ("float", "int"):
+            a = a.astype(np.float64 if field.kind == "float" else np.int64)  # an empty list has no type of its own
         if a.dtype.kind not in _KINDS[field.kind] or not _fits(a.shape, field.shape, lengths):
             wanted = ", ".join(f"{n} = {lengths[n]}" if n in lengths else str(n) for n in field.shape)
             raise FormatError(
@@ -194,11 +199,12 @@ def check_arrays(
             if np.any(bad):
                 at = tuple(int(i) for i in np.argwhere(bad)[0])
                 raise FormatError(
-                    f"array {name!r} holds a number that cannot be used at {list(at)}",
+                    f"array {name!r} is not finite, or too large, at {list(at)}",
                     where=where,
                     got=a[at],
                     wanted=f"finite numbers, at most {LARGEST:g}",
                 )
+            a = a if a.dtype.kind == "f" else a.astype(np.float64)
         if field.kind == "int":
             if a.dtype.kind == "u" and a.size and int(a.max()) >= 2**63:
                 raise FormatError(f"array {name!r} holds a number that is too large", where=where, got=a.max())

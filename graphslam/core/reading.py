@@ -79,8 +79,14 @@ def check_size(size: int, where: str) -> None:
         )
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
+def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> bytes:
     """Bytes of a file, decompressed if it begins like xz, gzip or bzip2; no more than the limit is ever held.
+
+    Parameters
+    ----------
+    path : path
+    first : int, optional
+        About so many bytes are enough.
 
     Raises
     ------
@@ -92,14 +98,16 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     where = str(path)
     try:
         with open(path, "rb") as stream:
-            first = stream.read(6)
+            head = stream.read(6)
             stream.seek(0)
-            opened = next((make for magic, make in _MAGIC if first.startswith(magic)), None)
+            opened = next((make for magic, make in _MAGIC if head.startswith(magic)), None)
             parts, size = [], 0
             for part in _plain(stream) if opened is None else _unpacked(stream, opened, where):
                 size += len(part)
                 check_size(size, where)
                 parts.append(part)
+                if first is not None and size >= first:
+                    break
             return b"".join(parts)
     except (FileNotFoundError, NotADirectoryError):
         raise MissingDataError("no such file", where=where) from None
@@ -197,7 +205,7 @@ def safe_name(name: str, where: str) -> str:
     FormatError
     """
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,200}", name):
-        raise FormatError("names a file outside its folder", where=where, got=repr(name[:80]), wanted="a file name")
+        raise FormatError("file name leads out of its folder", where=where, got=repr(name[:80]), wanted="a file name")
     return name
 
 
@@ -210,5 +218,5 @@ def inside(folder: Path, name: str, where: str) -> Path:
     """
     path = folder / safe_name(name, where)
     if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
-        raise FormatError("names a file outside its folder", where=where, got=f"{name} → {path.resolve()}")
+        raise FormatError("file name leads out of its folder", where=where, got=f"{name} → {path.resolve()}")
     return path

@@ -20,7 +20,7 @@ held as integers: 6 bytes a point.
 
 from __future__ import annotations
 
-import lzma
+import io
 import os
 import threading
 from pathlib import Path
@@ -33,7 +33,9 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.npz import MOST_HEADER, npy_header, read_npy
 from graphslam.core.point_clouds import PointClouds, check_offsets
+from graphslam.core.reading import read_bytes
 from graphslam.core.records import Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
@@ -67,7 +69,7 @@ class PackedClouds:
         self._path, self._step, self._offsets = path, step, offsets
         self._points: npt.NDArray[np.int16] | None = None
         self._lock = threading.Lock()
-        shape, dtype = self._read(header_only=True)
+        shape, _, dtype, _ = self._header(read_bytes(path, first=MOST_HEADER))
         if len(shape) != 2 or shape[0] != 3 or dtype != np.int16:
             raise FormatError(
                 "points are no planar int16", where=str(path), got=f"{dtype} {shape}", wanted="int16 (3, q)"
@@ -98,24 +100,22 @@ class PackedClouds:
         units = self._points[self._offsets[k] : self._offsets[k + 1]]
         return np.multiply(units[np.all(units != MISSING, axis=1)], self._step, dtype=np.float64)
 
-    def _read(self, *, header_only: bool = False) -> Any:
-        """Shape and type of the array, or its points ``(q, 3)``."""
-        path = self._path
+    def _read(self) -> npt.NDArray[Any]:
+        """Points ``(q, 3)`` of the array."""
+        data = read_bytes(self._path)
+        shape, fortran, dtype, begin = self._header(data[:MOST_HEADER])
+        if len(data) - begin != dtype.itemsize * shape[0] * shape[1]:
+            raise FormatError(
+                "points are truncated or corrupt", where=str(self._path), got=f"{len(data) - begin} bytes", wanted=shape
+            )
+        array = np.frombuffer(data, dtype, offset=begin).reshape(shape, order="F" if fortran else "C")
+        return np.ascontiguousarray(array.T)
+
+    def _header(self, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
         try:
-            with lzma.open(path) if path.suffix == ".xz" else open(path, "rb") as stream:
-                if header_only:
-                    version = np.lib.format.read_magic(stream)
-                    read = {
-                        (1, 0): np.lib.format.read_array_header_1_0,
-                        (2, 0): np.lib.format.read_array_header_2_0,
-                    }.get(version)
-                    if read is None:
-                        raise FormatError("unknown version of npy", where=str(path), got=version)
-                    shape, _, dtype = read(stream)
-                    return shape, dtype
-                return np.ascontiguousarray(np.lib.format.read_array(stream, allow_pickle=False).T)
-        except (lzma.LZMAError, EOFError, ValueError, OSError) as error:
-            raise FormatError(f"points are truncated or corrupt ({error})", where=str(path)) from None
+            return npy_header(io.BytesIO(data), self._path.name)
+        except ValueError as error:
+            raise FormatError(f"points are truncated or corrupt ({error})", where=str(self._path)) from None
 
 
 def read_lidar_pack(
@@ -226,12 +226,10 @@ def _points_file(root: Path) -> Path:
 
 
 def _read_offsets(path: Path) -> npt.NDArray[np.int64]:
+    data = read_bytes(path)
     try:
-        with open(path, "rb") as stream:
-            raw = np.lib.format.read_array(stream, allow_pickle=False)
-    except FileNotFoundError:
-        raise MissingDataError("no such file", where=str(path)) from None
-    except (ValueError, EOFError, OSError) as error:
+        raw = read_npy(io.BytesIO(data), len(data), path.name)
+    except (ValueError, EOFError) as error:
         raise FormatError(f"offsets are truncated or corrupt ({error})", where=str(path)) from None
     last = int(raw[-1]) if raw.ndim == 1 and len(raw) and raw.dtype.kind in "iu" else 0
     offsets = check_offsets(raw, last, where=str(path))

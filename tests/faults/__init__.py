@@ -1,0 +1,1 @@
+"""Faults on purpose: damaged files, hostile folders, a machine that fails."""
