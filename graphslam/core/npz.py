@@ -139,6 +139,12 @@ def read_npy(stream: IO[bytes], size: int, name: str) -> npt.NDArray[Any]:
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
 
 
+def npy_begin(head: bytes) -> int:
+    """Where the numbers of an array in NumPy's format begin, by its first 12 bytes."""
+    width = 2 if head[6:7] == b"\x01" else 4
+    return 8 + width + min(int.from_bytes(head[8 : 8 + width], "little"), MOST_HEADER)
+
+
 def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Shape, order, type and length of the header of an array in NumPy's format.
 

@@ -102,7 +102,8 @@ def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> byt
             stream.seek(0)
             opened = next((make for magic, make in _MAGIC if head.startswith(magic)), None)
             parts, size = [], 0
-            for part in _plain(stream) if opened is None else _unpacked(stream, opened, where):
+            step = _CHUNK if first is None else first
+            for part in _plain(stream, step) if opened is None else _unpacked(stream, opened, where, step):
                 size += len(part)
                 check_size(size, where)
                 parts.append(part)
@@ -115,8 +116,8 @@ def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> byt
         raise MissingDataError(f"cannot be read ({error.strerror})", where=where) from None
 
 
-def _plain(stream: IO[bytes]) -> Iterator[bytes]:
-    while part := stream.read(_CHUNK):
+def _plain(stream: IO[bytes], step: int) -> Iterator[bytes]:
+    while part := stream.read(step):
         yield part
 
 
@@ -149,14 +150,14 @@ _MAGIC: tuple[tuple[bytes, Callable[[], Any]], ...] = (
 )
 
 
-def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str) -> Iterator[bytes]:
+def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str, step: int) -> Iterator[bytes]:
     """Parts of the content of a compressed file, which may be several streams after each other."""
     try:
         data = stream.read(_CHUNK)
         while data:
             inner = make()
             while not inner.eof:
-                part = inner.decompress(data, _CHUNK)
+                part = inner.decompress(data, step)
                 if part:
                     yield part
                 data = b""

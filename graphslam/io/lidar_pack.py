@@ -33,7 +33,7 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.npz import MOST_HEADER, npy_header, read_npy
+from graphslam.core.npz import MOST_HEADER, npy_begin, npy_header, read_npy
 from graphslam.core.point_clouds import PointClouds, check_offsets
 from graphslam.core.reading import read_bytes
 from graphslam.core.records import Odometry, Stream
@@ -69,7 +69,7 @@ class PackedClouds:
         self._path, self._step, self._offsets = path, step, offsets
         self._points: npt.NDArray[np.int16] | None = None
         self._lock = threading.Lock()
-        shape, _, dtype, _ = self._header(read_bytes(path, first=MOST_HEADER))
+        shape, _, dtype, _ = self._header(read_bytes(path, first=npy_begin(read_bytes(path, first=12))))
         if len(shape) != 2 or shape[0] != 3 or dtype != np.int16:
             raise FormatError(
                 "points are no planar int16", where=str(path), got=f"{dtype} {shape}", wanted="int16 (3, q)"

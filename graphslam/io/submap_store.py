@@ -178,7 +178,7 @@ _TRUTH = {
 def _read_index(file: Path) -> list[dict[str, Any]]:
     index = read_json(file, fmt=INDEX_FORMAT, shape=_INDEX)
     entries: list[dict[str, Any]] = [
-        {**{k: e[k] for k in ("key", "file", "landmarks")}, "interval": [float(t) for t in e["interval"]]}
+        {k: [float(t) for t in e[k]] if k == "interval" else e[k] for k in ("key", "file", "interval", "landmarks")}
         for e in index["submaps"]
     ]
     dim, count = index["dim"], index["count"]
@@ -251,7 +251,10 @@ def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
     file = next((c for c in candidates if c.is_file()), None)
     if file is None:
         return None
+    arrays = read_npz(file, fmt="none")
+    if "landmarks" in arrays and arrays["landmarks"].size == 0:
+        arrays["landmarks"] = arrays["landmarks"].reshape(0, 2)  # of no landmarks the dimension need not be told
     try:
-        return MapTruth(**check_arrays(read_npz(file, fmt="none"), _TRUTH, str(file)))
+        return MapTruth(**check_arrays(arrays, _TRUTH, str(file)))
     except GeometryError as error:
         raise GeometryError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None

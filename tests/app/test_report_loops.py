@@ -194,7 +194,10 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     for name, y in (("a", 0.0), ("b", 1.0)):
         write_tum(tmp_path / f"trajectory_{name}.tum", Trajectory(np.arange(5.0), path + [0.0, y, 0.0]))
     nodes = np.concatenate([path[[0, 2, 4]], path[[0, 2, 4]] + [0.0, 1.0, 0.0]])
-    write_npz(tmp_path / "merged.npz", {"format": MERGED_DENSE_FORMAT, "nodes": nodes})
+    of_submaps = {"session_of_submap": np.array([0, 1]), "keys": np.array([0, 1])}
+    bases = {"bases": nodes, "base_covariances": np.zeros((6, 3, 3))}
+    whole = {"format": MERGED_DENSE_FORMAT, "sessions": np.array(["a", "b"]), **of_submaps, **bases}
+    write_npz(tmp_path / "merged.npz", {**whole, "nodes": nodes})
     tie = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
     candidates = [{**tie, "accepted": True, "why": "agrees"}, {**tie, "accepted": False, "why": "<b>no</b>"}]
     sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "ties": 1, "candidates": candidates}]

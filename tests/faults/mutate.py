@@ -90,7 +90,7 @@ def damage_text(rng: Rng, data: bytes) -> bytes:
         elif kind == 7:
             words.insert(w, words[w])
         else:
-            words[w] = pick(rng, ODD_WORDS) if rng.random() < 0.8 else str(10.0 ** int(rng.integers(-320, 320)))
+            words[w] = pick(rng, ODD_WORDS) if rng.random() < 0.8 else f"1e{int(rng.integers(-330, 330))}"
         lines[k] = separator.join(words)
     return "\n".join(lines).encode("utf-8", "surrogatepass")
 

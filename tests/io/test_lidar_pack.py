@@ -158,7 +158,9 @@ def _cut(path: Path, keep: float) -> None:
 def test_truncated_points_are_told_when_they_are_needed(bare):
     _cut(bare / "xyz_i16_planar.npy.xz", 0.8)
     log = read_lidar_pack(bare, step=STEP, period=0.1)  # the stamps are still good
-    with pytest.raises(FormatError, match=r"xyz_i16_planar.npy.xz: points are truncated or corrupt"):
+    with pytest.raises(
+        FormatError, match=r"xyz_i16_planar.npy.xz: (points are|compressed data is) truncated or corrupt"
+    ):
         log["clouds"].cloud(0)
 
 
