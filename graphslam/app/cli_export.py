@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit
 
 
@@ -26,6 +26,7 @@ def export(
     ),
     confidence: float = typer.Option(0.95, help="Of the landmarks' ellipses."),
     out: Path | None = typer.Option(None, help="File; default map.FORMAT in the run folder."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Path, landmarks with ellipses and GPS of a run on the globe."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 
 COLUMNS = [
@@ -31,6 +31,7 @@ def join(
     workers: int | None = typer.Option(None, help="Processes that share the joins of eif-tree."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler to send the joins of eif-tree to."),
     out: Path | None = typer.Option(None, help="Folder for joined.npz and nodes.tum."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Join submaps into one map by one method."""
@@ -66,6 +67,7 @@ def compare(
     scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),
     memory: bool = typer.Option(True, help="Measure peak memory in a process per method."),
     figure: Path | None = typer.Option(None, help="PNG of objectives side by side."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Every method on the same submaps: objective, gap, time, memory, non-zeros, NEES and CI where truth is known."""

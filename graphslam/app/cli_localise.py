@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 
 
@@ -21,6 +21,7 @@ def localise(
     submap: list[int] = typer.Option([], help="Of a run folder, only the submap of this key; may be repeated."),
     begin: float | None = typer.Option(None, help="Of a log, from this time on [s]."),
     end: float | None = typer.Option(None, help="Of a log, up to this time [s]."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Find submaps, or a stretch of a log, in a saved map: pose with covariance, every candidate, and why not."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 
 SHOWN = ("loop", "verdict", "source", "submap_i", "submap_j", "fitness", "chi2", "weight", "effect", "factor_id", "why")
@@ -24,6 +24,7 @@ def loops(
     undo: int | None = typer.Option(None, help="Take this loop out, solve again, and write the run anew."),
     redo: int | None = typer.Option(None, help="Take in again a loop that was undone."),
     source: str | None = typer.Option(None, help="Log of the run, for --undo and --redo, where it is no card."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Loops of a run: where each came from, its gates, χ², weight and effect, accepted or not, and why."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 
 CANDIDATES = (
@@ -32,6 +32,7 @@ def make_map(
     ),
     low: float | None = typer.Option(None, help="Floor plans begin this far above the path [m]; default the run's."),
     high: float | None = typer.Option(None, help="Floor plans end this far above the path [m]; default the run's."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """The fused map of a run, made again from its folder: no scan is read."""

@@ -7,7 +7,7 @@ from typing import cast
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 
 
@@ -25,6 +25,7 @@ def merge(
     identity_gate: float = typer.Option(25.0, help="Split off sightings beyond this χ² (2 dof); 0 = never."),
     tolerance: float = typer.Option(0.5, help="Landmarks of two maps this near after alignment agree [m]."),
     out: Path = typer.Option(..., help="Folder for the merged map."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Merge runs of several robots or days into one map, solved as one problem, by the landmarks they share."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit
 
 
@@ -19,6 +19,7 @@ def report(
     run: Path = typer.Argument(..., help="Folder that run, demo or merge wrote, finished or not."),
     out: Path | None = typer.Option(None, help="File of the page; default report.html in the folder."),
     show: bool = typer.Option(False, "--open", help="Show it in the browser."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """One self-contained HTML page of a run: verdict, figures, metrics, graph, loops and why, evidence, events."""

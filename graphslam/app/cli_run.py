@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,23 @@ import typer
 
 from graphslam.app import config as cfg
 from graphslam.app.terminal import emit, table, verdict_text
+from graphslam.core.reading import set_size_limit
 
+
+def _limit(size: str | None) -> str | None:
+    """Set the limit for this process: a number of bytes, or with K, M or G of thousands, millions, 10⁹ of them."""
+    if size is not None:
+        found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?([kKmMgG]?)B?", size.strip())
+        n = 0 if found is None else int(float(found[1]) * 1000 ** " KMG".index(found[2].upper() or " "))
+        if n <= 0:
+            raise typer.BadParameter(f"{size!r}; wanted for example 500M or 4G")
+        set_size_limit(n)
+    return size
+
+
+MAX_SIZE = typer.Option(
+    None, "--max-size", callback=_limit, help="Most that is read of one file, decompressed; 2G unless told, e.g. 8G."
+)
 JSON = typer.Option(False, "--json", help="One JSON object on stdout, nothing else there.")
 
 
@@ -32,6 +49,7 @@ def run(
     saved: list[Path] = typer.Option(
         [], "--continue", help="Run folder whose graph this session joins, in OUT/continued; may be repeated."
     ),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Raw log → submaps → graph → map, with everything that was measured on the way."""

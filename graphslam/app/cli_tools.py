@@ -7,7 +7,7 @@ from typing import Any, Literal, cast, get_args
 
 import typer
 
-from graphslam.app.cli_run import JSON
+from graphslam.app.cli_run import JSON, MAX_SIZE
 from graphslam.app.terminal import emit, table
 from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, UnknownNameError
 
@@ -25,8 +25,12 @@ def solve(
     repair: bool = typer.Option(
         False, "--repair", help="Project indefinite information matrices instead of refusing them."
     ),
+    create_missing: bool = typer.Option(
+        False, "--create-missing", help="Make vertices that only edges name instead of refusing the file."
+    ),
     out: Path | None = typer.Option(None, help="g2o file for the solution."),
     certify: bool = typer.Option(False, "--certify", help="Say whether the answer is the global optimum."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Solve a pose-graph file from its best start, and say honestly whether it is at its optimum."""
@@ -41,7 +45,7 @@ def solve(
                 f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"
             )
         path = found
-    value = solve_file(path, solver, repair=repair, out=out, certificate=certify)
+    value = solve_file(path, solver, repair=repair, create_missing=create_missing, out=out, certificate=certify)
     emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
 
 
@@ -52,6 +56,7 @@ def evaluate(
     delta: float = typer.Option(10.0, help="Distance [m] (or time [s]) of the relative error."),
     delta_unit: str = typer.Option("m", help="m or s."),
     max_diff: float = typer.Option(0.01, help="Stamps further apart are no pair [s]."),
+    max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
     """Absolute and relative trajectory error (ATE, RPE)."""

@@ -9,6 +9,7 @@ from typing import Any
 
 from graphslam.app.run_files import read_events, read_options
 from graphslam.core.errors import DataError
+from graphslam.core.json_file import check_json
 from graphslam.graph.loop_candidates import FRONT_END
 from graphslam.graph.loop_ledger import Decision, LoopLedger
 from graphslam.graph.loop_ties import ties_entries
@@ -151,7 +152,8 @@ def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path 
 
     ordered = sorted(undone, key=lambda x: x.loop)
     options = read_options(Path(folder))
-    said = options.pop("run")
+    wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
+    said = check_json(options, wanted, str(Path(folder) / "config.toml")).pop("run")
     run(
         source or said["source"],
         frontend=said["frontend"],

@@ -95,8 +95,7 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
         gap = np.full((1, 2), np.nan)  # lifts the pen
         path = np.concatenate([x for p in paths for x in (p, gap)])
-        known = range(len(nodes))
-        ends = [(e["i"], e["j"], "accepted") for e in ties if e["i"] in known and e["j"] in known]
+        ends = [(e["i"], e["j"], "accepted") for e in ties]
         ax = plot_loops(None, path, nodes, ends, title="ties between sessions, from above")
     except GraphSlamError as error:
         return [missing("ties between sessions over their paths: ", _said(folder, error), ".")]

@@ -19,7 +19,7 @@ from graphslam.app.run_files import (
     read_report,
 )
 from graphslam.core.atomic import read_json
-from graphslam.core.errors import GraphSlamError, RunFolderError
+from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
 from graphslam.graph.loop_ledger import LoopLedger
 from graphslam.io.submap_store import SubmapStore
 
@@ -139,7 +139,7 @@ def read_folder(path: str | Path) -> ReportFolder:
     if kind == "merged":
         out.report = attempt("merge.json", lambda: read_merge_report(root), {})
     else:
-        out.config = attempt("config.toml", lambda: read_options(root), {})
+        out.config = attempt("config.toml", lambda: _options(root), {})
         out.submaps = attempt("submaps/index.json", lambda: _index(root), [])
     if kind == "run":
         out.report = attempt("run.json", lambda: read_report(root), {})
@@ -159,6 +159,12 @@ def read_folder(path: str | Path) -> ReportFolder:
             "clearest.json", lambda: read_json(root / "clearest.json", fmt="graphslam.clearest/1"), None
         )
     return out
+
+
+def _options(root: Path) -> dict[str, Any]:
+    if not (root / "config.toml").exists():
+        raise MissingDataError("no such file", where="config.toml")
+    return read_options(root)
 
 
 def _metrics(root: Path) -> list[dict[str, Any]]:

@@ -174,13 +174,12 @@ def read_options(root: Path) -> dict[str, Any]:
     ConfigError, FormatError
     """
     file = root / "config.toml"
-    if not file.is_file():
+    if not file.exists():
         return {}
     values = read_toml(file)
     shape = {f"{k}?": _PART for k in values}
     if "run" in values:
-        shape["run"] = {"source": str, "frontend": str, "solver": str, "seed": int}
-        shape.pop("run?")
+        shape["run?"] = {"source?": str, "frontend?": str, "solver?": str, "seed?": int}
     return dict(check_json(values, shape, str(file)))
 
 

@@ -22,6 +22,8 @@ def solve_file(
     out: str | os.PathLike[str] | None = None,
     *,
     noise: Noise = "auto",
+    create_missing: bool = False,
+    max_size: int | None = None,
     certificate: bool = False,
     progress: bool = False,
     **options: Any,
@@ -40,6 +42,10 @@ def solve_file(
         Write the solution as g2o; ``.xz``, ``.gz`` and ``.bz2`` compress.
     noise : str
         Meaning of TORO/iSAM noise columns.
+    create_missing : bool
+        Make vertices that only edges name, instead of refusing the file.
+    max_size : int, optional
+        Bytes of the file that are read at most, after decompression; default 2 GB.
     certificate : bool
         Also say whether the answer is certified to be the global optimum (``"certificate"`` in words, its numbers in
         ``"certificate_numbers"``).
@@ -56,7 +62,7 @@ def solve_file(
     ------
     MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
     """
-    network = read_network(path, noise=noise, repair=repair)
+    network = read_network(path, noise=noise, repair=repair, create_missing=create_missing, max_size=max_size)
     solution = solve_network(network, solver, certificate=certificate, progress=progress, **options)
     if out is not None:
         write_g2o(out, solution.to_network())

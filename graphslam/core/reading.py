@@ -218,6 +218,8 @@ def inside(folder: Path, name: str, where: str) -> Path:
     FormatError
     """
     path = folder / safe_name(name, where)
-    if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
-        raise FormatError("file name leads out of its folder", where=where, got=f"{name} → {path.resolve()}")
+    if path.is_symlink():
+        leads = Path(os.path.realpath(path))
+        if not leads.is_relative_to(os.path.realpath(folder)):
+            raise FormatError("file name leads out of its folder", where=where, got=f"{name} → {leads}")
     return path

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import FormatError, GridError, MissingDataError
+from graphslam.core.errors import FormatError, GridError
+from graphslam.core.reading import read_bytes
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import Pieces, check_reach, find_all_states, grid_of, levels_for
 from graphslam.evidence.cube_kernels import UNSEEN
@@ -98,10 +99,7 @@ def read_octomap(
         The map reaches beyond the pool's addressable cube.
     """
     where = str(path)
-    try:
-        data = Path(path).read_bytes()
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        raise MissingDataError("no such file", where=where) from None
+    data = read_bytes(path)
     head = _read_header(data, where)
     if head.nodes == 0 and len(data) == head.start:
         return EvidenceGrid(head.resolution, model=model, pool=pool)

@@ -17,6 +17,7 @@ from typing import Any
 import graphslam
 from graphslam.core.errors import FormatError, MissingDataError, UnknownNameError
 from graphslam.core.markup import element, items, join, pairs
+from graphslam.core.reading import read_text
 
 CARD_FORMAT = "graphslam.card/1"
 KINDS = ("sensor-log", "submaps", "detections", "pose-graph", "point-clouds", "octree")
@@ -180,8 +181,8 @@ def read_card(path: Path) -> Card:
     """
     where = str(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = tomllib.loads(read_text(path))
+    except (ValueError, RecursionError) as error:  # tomllib's own errors are ValueErrors
         raise FormatError(f"not TOML ({error})", where=where) from None
     if content.pop("format", None) != CARD_FORMAT:
         raise FormatError("unknown format of card", where=where, wanted=repr(CARD_FORMAT))

@@ -39,7 +39,7 @@ _3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
 _SWAP = np.array([3, 4, 5, 0, 1, 2])
 
 
-def read_g2o(path: str | os.PathLike[str], *, repair: bool = False) -> PoseNetwork:
+def read_g2o(path: str | os.PathLike[str], *, repair: bool = False, create_missing: bool = False) -> PoseNetwork:
     """Read a g2o file.
 
     Parameters
@@ -49,6 +49,9 @@ def read_g2o(path: str | os.PathLike[str], *, repair: bool = False) -> PoseNetwo
     repair : bool
         Project indefinite information matrices to positive definite ones instead of refusing them; counted in
         ``PoseNetwork.repaired``.
+    create_missing : bool
+        Make vertices that only edges name, without an initial pose, instead of refusing them. A file of edges alone
+        is read in any case.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def read_g2o(path: str | os.PathLike[str], *, repair: bool = False) -> PoseNetwo
     if in_2d and in_3d:
         line = records.rows[in_3d[0]][0][0]
         raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=records.where(line), wanted="one dimension")
-    build = NetworkBuilder(records.path, 3 if in_3d else 2, repair)
+    build = NetworkBuilder(records.path, 3 if in_3d else 2, repair, create_missing)
     for tag in ("VERTEX_SE2", "VERTEX_SE3:QUAT"):
         for line, (vertex,), pose in records.rows[tag]:
             build.add_vertex(vertex, pose, records.where(line))
@@ -98,7 +101,8 @@ def _read_landmarks(records: Records, build: NetworkBuilder) -> None:
     if cartesian:
         values = np.array([r[2] for r in cartesian])
         pairs = np.array([r[1] for r in cartesian], dtype=np.int64)
-        build.add_observations(pairs, values[:, :2], upper_triangle(values[:, 2:], 2))
+        lines = [records.where(r[0]) for r in cartesian]
+        build.add_observations(pairs, values[:, :2], upper_triangle(values[:, 2:], 2), lines)
     for line, _, (_, distance, sigma_b, sigma_r) in polar:
         if not (distance > 0 and sigma_b > 0 and sigma_r > 0):
             raise FormatError("range and standard deviations must be positive", where=records.where(line))
@@ -107,7 +111,8 @@ def _read_landmarks(records: Records, build: NetworkBuilder) -> None:
         information = np.zeros((len(polar), 2, 2))
         information[:, [0, 1], [0, 1]] = values[:, 2:] ** -2.0
         build.kind = "bearing-range"
-        build.add_observations(np.array([r[1] for r in polar], dtype=np.int64), values[:, :2], information)
+        pairs = np.array([r[1] for r in polar], dtype=np.int64)
+        build.add_observations(pairs, values[:, :2], information, [records.where(r[0]) for r in polar])
 
 
 def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:

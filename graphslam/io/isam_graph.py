@@ -39,7 +39,9 @@ LAYOUTS: dict[str, tuple[int, int]] = {
 _TORO = np.array([0, 1, 4, 2, 5, 3])
 
 
-def read_isam_graph(path: str | os.PathLike[str], *, noise: Noise = "auto", repair: bool = False) -> PoseNetwork:
+def read_isam_graph(
+    path: str | os.PathLike[str], *, noise: Noise = "auto", repair: bool = False, create_missing: bool = False
+) -> PoseNetwork:
     """Read a TORO or iSAM graph.
 
     Parameters
@@ -49,6 +51,8 @@ def read_isam_graph(path: str | os.PathLike[str], *, noise: Noise = "auto", repa
         xx xy xθ yy yθ θθ.
     repair : bool
         Project impossible matrices instead of refusing them.
+    create_missing : bool
+        Make vertices that only edges name, where others are given, instead of refusing them.
 
     Raises
     ------
@@ -57,7 +61,7 @@ def read_isam_graph(path: str | os.PathLike[str], *, noise: Noise = "auto", repa
     if noise not in get_args(Noise):
         raise ConfigError(f"unknown noise format {noise!r}; known: {', '.join(get_args(Noise))}")
     records = Records(path, LAYOUTS)
-    build = NetworkBuilder(records.path, 2, repair)
+    build = NetworkBuilder(records.path, 2, repair, create_missing)
     for line, (vertex,), pose in records.rows["VERTEX2"]:
         build.add_vertex(vertex, pose, records.where(line))
     rows = sorted(records.rows["EDGE2"] + records.rows["ODOMETRY"])
@@ -109,14 +113,15 @@ def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     values = np.array([r[2] for r in rows])
     pairs = np.array([r[1] for r in rows], dtype=np.int64)
     labels = [f"{i} sees {j}" for i, j in pairs]
+    lines = [records.where(r[0]) for r in rows]
     xy, c = values[:, :2], values[:, 2:]
     covariance = upper_triangle(c, 2)
     if noise in ("information", "sqrt-information"):
         R = np.triu(covariance)
-        build.add_observations(pairs, xy, covariance if noise == "information" else np.swapaxes(R, 1, 2) @ R)
+        build.add_observations(pairs, xy, covariance if noise == "information" else np.swapaxes(R, 1, 2) @ R, lines)
         return
     if not np.all((np.abs(c[:, 0] - c[:, 2]) < 1e-4) & (c[:, 1] == 0.0)):
-        build.add_observations(pairs, xy, build.invert(covariance, labels, "landmark covariance matrices"))
+        build.add_observations(pairs, xy, build.invert(covariance, labels, "landmark covariance matrices"), lines)
         return
     distance = np.hypot(xy[:, 0], xy[:, 1])
     bad = np.flatnonzero((distance <= 0.0) | (c[:, 0] <= 0.0))
@@ -126,4 +131,4 @@ def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     information[:, 0, 0] = 10.0 / c[:, 0]  # σ_bearing² = c / 10, "at ten metres"
     information[:, 1, 1] = 1.0 / c[:, 0]
     build.kind = "bearing-range"
-    build.add_observations(pairs, np.stack([np.arctan2(xy[:, 1], xy[:, 0]), distance], axis=1), information)
+    build.add_observations(pairs, np.stack([np.arctan2(xy[:, 1], xy[:, 0]), distance], axis=1), information, lines)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import FormatError, GeometryError, MissingDataError
+from graphslam.core.errors import FormatError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.mesh import Triangles, check_mesh
+from graphslam.core.reading import read_bytes
 
 _VERTEX = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
 _FACE = np.dtype([("count", "u1"), ("rows", "<i4", (3,))])
@@ -66,10 +66,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Triangles]:
         Another kind of PLY, truncated or too long, or a mesh that :func:`write_mesh` would refuse.
     """
     where = str(path)
-    try:
-        data = Path(path).read_bytes()
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        raise MissingDataError("no such file", where=where) from None
+    data = read_bytes(path)
     end = data.find(b"end_header\n", 0, _LONGEST_HEADER)
     if not data.startswith(b"ply\n") or end < 0:
         raise FormatError("no PLY file, or its header is damaged", where=where)

@@ -36,11 +36,15 @@ class NetworkBuilder:
         2 or 3.
     repair : bool
         Project impossible matrices instead of refusing them.
+    create_missing : bool
+        Make vertices that only edges name, where others are given; they have no initial pose.
     """
 
     source: str
     dim: int
     repair: bool = False
+    create_missing: bool = False
+    named: dict[int, str] = field(default_factory=dict)
     vertices: dict[int, Array] = field(default_factory=dict)
     marks: dict[int, Array | None] = field(default_factory=dict)
     fixed: dict[int, str] = field(default_factory=dict)
@@ -79,12 +83,17 @@ class NetworkBuilder:
             raise FormatError(
                 "an edge joins a vertex to itself", where=where[loops[0]], got=f"vertex {pairs[loops[0], 0]}"
             )
+        for (i, j), line in zip(pairs.tolist(), where, strict=True):
+            self.named.setdefault(i, line)
+            self.named.setdefault(j, line)
         labels = [f"{i} -> {j}" for i, j in pairs]
         information = self.sound(information, labels, "edge information matrices")
         self.edges.append((pairs, self._unit(measurements, where), information))
 
-    def add_observations(self, pairs: Ids, values: Array, information: Array) -> None:
+    def add_observations(self, pairs: Ids, values: Array, information: Array, where: list[str]) -> None:
         """Landmark sightings ``(k, 2)`` = (vertex id, landmark id)."""
+        for i, line in zip(pairs[:, 0].tolist(), where, strict=True):
+            self.named.setdefault(i, line)
         labels = [f"{i} sees {j}" for i, j in pairs]
         self.sightings.append((pairs, values, self.sound(information, labels, "landmark information matrices")))
         for j in pairs[:, 1]:
@@ -119,8 +128,16 @@ class NetworkBuilder:
         Raises
         ------
         FormatError
-            No records, or an id that is both a pose and a landmark.
+            No records, an id that is both a pose and a landmark, or an edge to a vertex that is not there.
         """
+        missing = [v for v in self.named if v not in self.vertices] if self.vertices else []
+        if missing and not self.create_missing:
+            more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+            raise FormatError(
+                f"an edge names vertex {missing[0]}, which is not in the file{more}",
+                where=self.named[missing[0]],
+                wanted="a record of every vertex (or of none); --create-missing or create_missing=True makes them",
+            )
         pairs = _stack([e[0] for e in self.edges], (0, 2), np.int64)
         seen = _stack([s[0] for s in self.sightings], (0, 2), np.int64)
         ids = np.unique(np.concatenate([np.array(list(self.vertices), dtype=np.int64), pairs.ravel(), seen[:, 0]]))

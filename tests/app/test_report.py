@@ -259,7 +259,7 @@ def test_text_of_files_is_escaped(copy: Path) -> None:
     rows = json.loads((copy / "metrics.json").read_text())
     rows.append({"key": HOSTILE, "value": 1.0, "unit": HOSTILE, "direction": HOSTILE})
     (copy / "metrics.json").write_text(json.dumps(rows))
-    event = {"event": HOSTILE, HOSTILE: HOSTILE, "bad": "\ud800\u0000"}
+    event = {"event": HOSTILE, HOSTILE: HOSTILE, "bad": "\u0000"}
     match = {"event": "match-not-used", "submap": 1, "target": 0, "fitness": 0.5, "support": 0.1, "why": HOSTILE}
     with (copy / "events.jsonl").open("a") as stream:
         stream.write(f"{json.dumps(event)}\n{json.dumps(match)}\n")

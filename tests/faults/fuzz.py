@@ -159,7 +159,7 @@ def run_reader(name: str, cases: int, seed: int) -> tuple[Counter[str], list[tup
                 assert process.stdout is not None
                 ready = False
                 while True:
-                    waiting, _, _ = select.select([process.stdout], [], [], 120 if not ready else SECONDS + 20)
+                    waiting, _, _ = select.select([process.stdout], [], [], 900 if not ready else SECONDS + 20)
                     line = process.stdout.readline() if waiting else ""
                     if not line:
                         break

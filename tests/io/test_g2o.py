@@ -157,7 +157,7 @@ def test_broken_compression_empty_and_missing_files(tmp_path: Path) -> None:
 
 
 def test_indefinite_edges_are_named_refused_and_repaired_on_request(tmp_path: Path) -> None:
-    text = SE2 + "EDGE_SE2 7 9 1 0 0 1 2 0 1 0 1\nEDGE_SE2 9 0 1 0 0 1 0 0 1 0 1\n"
+    text = SE2 + "VERTEX_SE2 9 0 0 0\nEDGE_SE2 7 9 1 0 0 1 2 0 1 0 1\nEDGE_SE2 9 0 1 0 0 1 0 0 1 0 1\n"
     path = put(tmp_path, text)
     with pytest.raises(CovarianceError, match=r"1 of 3 .*indefinite: 7 -> 9"):
         read_g2o(path)
