@@ -16,6 +16,7 @@ import numpy as np
 from frontends.gaps import refuse_long
 from frontends.motion import Motion, MotionNoise, dead_reckoning, motion_stream
 from frontends.recorded import BRIDGED
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
@@ -104,6 +105,13 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
     """
     stamps = motion.times
     if len(stamps) < 2:
+        if len(stamps) and end - begin > SHORTEST:
+            raise DataError(
+                "the motion stream holds a single record, which tells of no motion",
+                where=where,
+                got=f"one record for {end - begin:.1f} s",
+                wanted=f"records at least every {limit:g} s (frontend.longest_gap)",
+            )
         return []
     usual = float(np.median(np.diff(stamps)))
     if not isinstance(motion, Odometry) and end > stamps[-1]:

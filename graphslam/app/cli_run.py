@@ -99,7 +99,7 @@ def _summary(result: Any, out: Path) -> str:
 
 CAUSES = frozenset(
     {"residuals", "calibration", "sightings-not-used", "motion-gap", "particles", "gps-mirrored", "gps-scale"}
-    | {"gps-correlated", "stuck"}
+    | {"gps-correlated", "ranges-constant", "bearings-degrees", "steering-degrees", "scans-repeated", "ranges-and-way"}
 )
 """Lines of a verdict that name why submaps fit each other badly."""
 

@@ -13,10 +13,11 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
-from graphslam.core.records import Gps, LaserScans, VelocityControls
+from graphslam.core.records import Gps, LandmarkObservations, LaserScans, SteeringControls, VelocityControls
 from graphslam.evaluate.stream_checks_beams import check_beams
 from graphslam.evaluate.stream_checks_gps import check_gps
 from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
+from graphslam.evaluate.stream_checks_sightings import check_sightings, check_steering
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,10 @@ def check_streams(log: SensorLog) -> list[Noticed]:
         found: list[Finding] = []
         if isinstance(stream, LaserScans | RangeScans | PointClouds):
             found = check_beams(stream, name)
+        elif isinstance(stream, LandmarkObservations):
+            found = check_sightings(stream, name, log)
+        elif isinstance(stream, SteeringControls):
+            found = check_steering(stream, name)
         elif isinstance(stream, Gps):
             found = check_gps(stream, name, log)
         elif isinstance(stream, Imu):

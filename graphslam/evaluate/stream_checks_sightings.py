@@ -1,0 +1,146 @@
+"""Sightings of landmarks and the controls of wheels looked at before a run, by what is physically possible.
+
+Nothing here needs a map: angles have ranges, copies of a scan are exact copies, and between two sightings of the same
+landmark its range changes by no more than the robot moves, and by a good part of that as it passes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from frontends.motion import MotionNoise, dead_reckoning
+from graphslam.core.errors import DataError, MissingDataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.records import LandmarkObservations, SteeringControls
+
+APART = 1.0
+"""Sightings of a landmark are compared over at least this time [s], in which a robot moves by more than the noise."""
+LEAST_PAIRS = 20
+LEAST_WAY = 10.0
+"""Way over all pairs below which their ranges say nothing [m]."""
+HARDLY = 0.01
+"""Ranges that change by less than this part of the way are in no unit near a metre: passing a landmark they change by
+half of the way on the average, and only circles about all landmarks at once keep them."""
+COPIES = 0.5
+"""Share of scans that are exact copies of the one before from which on a scan is not a measurement of its own."""
+FEW = 0.25
+"""Share of pairs that wrong identities or slips of the wheels may explain."""
+
+
+def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
+    """Lines on a stream of sightings.
+
+    Parameters
+    ----------
+    z : LandmarkObservations
+    name : str
+        Of the stream.
+    log : SensorLog
+        Its motion tells the way between sightings.
+
+    Raises
+    ------
+    DataError
+        Ranges that hardly change while the robot drives: every map of them is a point.
+    """
+    if len(z.ranges) == 0:
+        return []
+    out = []
+    if len(z.ranges) >= LEAST_PAIRS and np.ptp(z.ranges) == 0.0:
+        text = (
+            f"All {len(z.ranges)} ranges of {name} are {z.ranges[0]:g} m: the sensor is stuck, or ranges were not read."
+        )
+        out.append(Finding("bad", "ranges-constant", text))
+    beyond = int(np.sum(np.abs(z.bearings) > 2.0 * np.pi))
+    if beyond:
+        text = f"{beyond} of {len(z.bearings)} bearings of {name} are beyond a full turn: they are probably in degrees."
+        out.append(Finding("bad", "bearings-degrees", text))
+    copies = sum(_same(z, k) for k in range(1, len(z.times)))
+    if copies > COPIES * len(z.times):
+        text = (
+            f"{copies} of {len(z.times)} scans of {name} are exact copies of the one before: the driver repeats its "
+            "last scan, and every copy counts as new. Keep the first of each."
+        )
+        out.append(Finding("bad", "scans-repeated", text))
+    return out + _ranges_and_way(z, name, log)
+
+
+def check_steering(controls: SteeringControls, name: str) -> list[Finding]:
+    """Lines on the steering of a car."""
+    beyond = int(np.sum(np.abs(controls.steering) > 0.5 * np.pi))
+    if not beyond:
+        return []
+    text = (
+        f"{beyond} of {len(controls.steering)} steering angles of {name} are beyond 90°: they are probably in degrees."
+    )
+    return [Finding("bad", "steering-degrees", text)]
+
+
+def _same(z: LandmarkObservations, k: int) -> bool:
+    a, b = z.scan(k - 1), z.scan(k)
+    if a.stop - a.start != b.stop - b.start or a.stop == a.start:
+        return False
+    return bool(np.array_equal(z.ranges[a], z.ranges[b]) and np.array_equal(z.bearings[a], z.bearings[b]))
+
+
+def _ranges_and_way(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
+    pairs = _pairs(z)
+    if pairs is None:
+        return []
+    first, second = pairs
+    way = _way(log, z.times)
+    if way is None:
+        return []
+    scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
+    moved = np.abs(way[scan[second]] - way[scan[first]])
+    change = np.abs(z.ranges[second] - z.ranges[first])
+    noise = 4.0 * np.sqrt(z.sigmas[first, 0] ** 2 + z.sigmas[second, 0] ** 2)
+    if moved.sum() < LEAST_WAY:
+        return []
+    if change.sum() < HARDLY * moved.sum() and np.ptp(z.ranges) > 0.0:
+        raise DataError(
+            "ranges hardly change while the robot drives: are they in kilometres?",
+            where=f"{log.name}/{name}",
+            got=f"{change.sum():.3g} m in all between sightings of the same landmarks, over {moved.sum():.3g} m of way",
+            wanted="ranges in metres",
+        )
+    too_much = change > moved + noise
+    if np.mean(too_much) <= FEW:
+        return []
+    times = float(np.median(change[too_much] / np.maximum(moved[too_much], 1e-3)))
+    text = (
+        f"In {int(too_much.sum())} of {len(moved)} pairs of sightings the range to the same landmark of {name} changes "
+        f"by more than the robot moves (median {times:.3g} times as much): ranges are too long or in another unit, "
+        "distances of the wheels too short, or identities wrong."
+    )
+    return [Finding("bad", "ranges-and-way", text)]
+
+
+def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:
+    """Rows of sightings of the same landmark, the next one at least :data:`APART` later, not twice as late."""
+    if z.ids is None:
+        return None
+    scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
+    t = z.times[scan]
+    first, second = [], []
+    for i in np.unique(z.ids[z.ids >= 0]):
+        rows = np.flatnonzero(z.ids == i)
+        k = np.searchsorted(t[rows], t[rows] + APART - 1e-9)
+        ok = k < len(rows)
+        ok[ok] &= t[rows[k[ok]]] < t[rows[ok]] + 2.0 * APART
+        first.append(rows[ok])
+        second.append(rows[k[ok]])
+    if not first or sum(map(len, first)) < LEAST_PAIRS:
+        return None
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _way(log: SensorLog, times: Array) -> Array | None:
+    """Metres driven until each of ``times``, by the wheels."""
+    try:
+        steps = dead_reckoning(log, times, MotionNoise(), hold=np.inf)[0].increments
+    except (DataError, MissingDataError):
+        return None
+    return np.cumsum(np.hypot(steps[:, 0], steps[:, 1])) if steps.shape[1] == 3 else None

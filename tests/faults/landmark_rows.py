@@ -1,0 +1,281 @@
+"""Rows of the fault matrix: landmark front ends in the plane, and GPS in any run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Gps, LandmarkObservations
+from tests.faults import inject_landmarks as inject
+
+Outcome = Literal["refused", "dropped and counted", "handled", "reported"]
+KNOWN: Mapping[str, Any] = {"frontend": {"association": "known"}}
+LIKELIHOOD: Mapping[str, Any] = {
+    "frontend": {"association": "likelihood"},
+    "backend": {"associate": True, "merge_every": 4},
+}
+NEAREST: Mapping[str, Any] = {"frontend": {"association": "nearest"}}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: sensor × fault × front end → outcome.
+
+    Parameters
+    ----------
+    sensor, fault : str
+    inject : callable
+    outcome : str
+    shows : str
+        Code of a line of the verdict, or a part of the message where the run is refused.
+    frontend : str
+    log : {"field", "beacons", "gps"}
+        Which clean log the fault goes into.
+    config : mapping
+    dim : int
+    """
+
+    sensor: str
+    fault: str
+    inject: inject.Inject
+    outcome: Outcome
+    shows: str
+    frontend: str = "rbpf-ekf"
+    log: str = "field"
+    config: Mapping[str, Any] = field(default_factory=lambda: KNOWN)
+    dim: int = 2
+
+    @property
+    def name(self) -> str:
+        """Of the front end, with what it is given."""
+        what = {"field": "", "gps": "", "beacons": ", ranges only"}[self.log]
+        how = ", by likelihood" if self.config in (LIKELIHOOD, NEAREST) else ""
+        return f"{self.frontend}{what}{how}"
+
+    @property
+    def id(self) -> str:
+        """Of the test."""
+        return f"{self.name}: {self.sensor}: {self.fault}"
+
+    def cells(self) -> tuple[str, ...]:
+        """Of the table in ``docs/faults.md``."""
+        shows = f"`{self.shows}`" if self.outcome != "refused" else f"“{self.shows}”"
+        return self.sensor, self.fault, self.name, f"{self.dim}-D", self.outcome, shows if self.shows else "—"
+
+
+def _gps(change: Any) -> inject.Inject:
+    return inject.gps(change)
+
+
+def _bursts(g: Gps, rng: np.random.Generator) -> Gps:
+    p = g.positions.copy()
+    for k in range(8, len(p) - 4, 14):
+        p[k : k + 4] += 15.0 * rng.standard_normal(2)
+    return replace(g, positions=p)
+
+
+def _correlated(sigma: float) -> Any:
+    """An error of 3 m that fades over 60 s, on top of the noise."""
+
+    def change(g: Gps, rng: np.random.Generator) -> Gps:
+        keep = float(np.exp(-np.median(np.diff(g.times)) / 60.0))
+        b, p = 3.0 * rng.standard_normal(2), g.positions.copy()
+        for k in range(len(p)):
+            p[k] += b
+            b = keep * b + np.sqrt(1.0 - keep**2) * 3.0 * rng.standard_normal(2)
+        return replace(g, positions=p, sigma=np.full(len(p), sigma))
+
+    return change
+
+
+def _ramp(g: Gps, _: Any) -> Gps:
+    """Off by 7 m within 20 s, and then for good."""
+    return replace(g, positions=g.positions + np.clip((g.times - 10.0) / 20.0, 0.0, 1.0)[:, None] * [6.0, 3.0])
+
+
+def _degrees(g: Gps, _: Any) -> Gps:
+    return replace(g, positions=np.array([11.5, 48.1]) + g.positions / np.array([74000.0, 111200.0]))
+
+
+def _no_sighting(z: LandmarkObservations, _: Any) -> LandmarkObservations:
+    keep = np.zeros(len(z.ranges), dtype=bool)
+    return replace(
+        z,
+        offsets=np.zeros(len(z.times) + 1, dtype=np.int64),
+        ranges=z.ranges[keep],
+        bearings=z.bearings[keep],
+        sigmas=z.sigmas[keep],
+        ids=None if z.ids is None else z.ids[keep],
+    )
+
+
+def _nan(z: LandmarkObservations, _: Any) -> LandmarkObservations:
+    return replace(z, ranges=np.full_like(z.ranges, np.nan))
+
+
+def _twice(z: LandmarkObservations, _: Any) -> LandmarkObservations:
+    return replace(z, times=np.repeat(z.times[::2], 2)[: len(z.times)])
+
+
+def _records(n: int, name: str) -> inject.Inject:
+    def change(log: SensorLog) -> SensorLog:
+        return inject.with_stream(log, name, log[name].take(slice(0, n)))
+
+    return change
+
+
+WHEELS: list[tuple[str, inject.Inject]] = [
+    ("speed × 2", inject.speed(2.0)),
+    ("speed 0", inject.speed(0.0)),
+    ("speed × −1", inject.speed(-1.0)),
+    ("speed in km/h (× 3.6)", inject.speed(3.6)),
+    ("speed × 1.05", inject.speed(1.05)),
+    ("steering to the other side", inject.steering(-1.0)),
+    ("steering in degrees", inject.steering(180.0 / np.pi)),
+]
+SIGHTINGS: list[tuple[str, inject.Inject]] = [
+    ("bearings mirrored", inject.mirrored()),
+    ("bearings off by 10°", inject.bearing_offset(np.deg2rad(10.0))),
+    ("bearings in degrees", inject.bearings_in_degrees()),
+    ("ranges × 2", inject.ranges(2.0)),
+    ("ranges × 1.05", inject.ranges(1.05)),
+    ("ranges constant", inject.constant_ranges(7.0)),
+    ("ranges off by 1 m", inject.ranges(1.0, 1.0)),
+    ("sensor 1 m to the side", inject.mounted(0.0, 1.0, 0.0)),
+    ("sensor 1 m to the side, turned by 10°", inject.mounted(0.0, 1.0, np.deg2rad(10.0))),
+]
+GAPS: list[tuple[str, inject.Inject]] = [
+    ("5 s without wheels", inject.gap(5.0)),
+    ("10 s without wheels", inject.gap(10.0)),
+    ("30 s without wheels", inject.gap(30.0)),
+    ("10 s without any sensor", inject.gap_of_all(10.0)),
+    ("30 s without any sensor", inject.gap_of_all(30.0)),
+]
+
+
+MILLIMETRES = ("ranges × 1000", inject.ranges(1000.0))
+KILOMETRES = ("ranges × 0.001", inject.ranges(0.001))
+HARDLY = "ranges hardly change while the robot drives"
+GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
+    ("another time base", _gps(lambda g, _: replace(g, times=g.times + 1e6)), "reported", "gps-not-used"),
+    (
+        "stuck",
+        _gps(lambda g, _: replace(g, positions=np.tile(g.positions[0], (len(g.times), 1)))),
+        "reported",
+        "gps-stuck",
+    ),
+    ("degrees of longitude and latitude", _gps(_degrees), "reported", "gps-scale"),
+    ("axes swapped", _gps(lambda g, _: replace(g, positions=g.positions[:, ::-1].copy())), "reported", "gps-mirrored"),
+    ("bursts of outliers", _gps(_bursts), "reported", "chi2|consistency-test"),
+    ("slow ramp", _gps(_ramp), "reported", "chi2|consistency-test"),
+    ("lag of 1 s", _gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", "chi2|consistency-test"),
+    ("error that lasts 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", "chi2|consistency-test"),
+    ("error that lasts 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
+    ("only at the start", _gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
+    ("no fix at all", _gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
+]
+FIT = "calibration|residuals|sightings-not-used"
+
+
+def _rows() -> list[Row]:
+    rows: list[Row] = []
+    for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
+        rows += [Row("wheels", f, i, "reported", "calibration|residuals", frontend) for f, i in WHEELS]
+        rows += [Row("sightings", f, i, "reported", "calibration|residuals", frontend) for f, i in SIGHTINGS]
+        rows.append(Row("sightings", *MILLIMETRES, "reported", "sightings-not-used", frontend))
+        rows.append(Row("sightings", *KILOMETRES, "refused", HARDLY, frontend))
+        ids = inject.wrong_identities(0.1)
+        rows += [Row("sightings", "10 % wrong identities", ids, "reported", "residuals", frontend)]
+        rows += [
+            Row(
+                "sightings",
+                "none in any scan",
+                inject.sightings(_no_sighting),
+                "reported",
+                "sightings-not-used",
+                frontend,
+            )
+        ]
+    for f, i in GAPS:
+        rows += [Row("wheels", f, i, "handled", "motion-gap"), Row("wheels", f, i, "handled", "motion-gap", "ekf")]
+        single: Outcome = "reported" if "any sensor" in f else "handled"
+        rows.append(Row("wheels", f, i, single, "motion-gap", "ekf-slam"))
+    short = {"frontend": {"association": "known", "longest_gap": 8.0}}
+    for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
+        beyond = Row(
+            "wheels", "a gap longer than may be bridged", inject.gap(10.0), "refused", "frontend.longest_gap", frontend
+        )
+        rows.append(replace(beyond, config=short))
+    for frontend, config in (("rbpf-ekf", LIKELIHOOD), ("ekf-slam", NEAREST)):
+        rows += [Row("wheels", f, i, "reported", FIT, frontend, config=config) for f, i in WHEELS]
+        rows += [Row("sightings", f, i, "reported", FIT, frontend, config=config) for f, i in [*SIGHTINGS, MILLIMETRES]]
+    # by ranges alone, wheels that turn the other way give the mirror image of everything: a limit, not a row
+    blind = [
+        *(x for x in WHEELS if "other side" not in x[0]),
+        *(x for x in [*SIGHTINGS, MILLIMETRES] if x[0].startswith("ranges")),
+    ]
+    rows += [Row("beacons", f, i, "reported", FIT, log="beacons") for f, i in blind]
+    rows.append(Row("beacons", *KILOMETRES, "refused", HARDLY, log="beacons"))
+    rows += [Row("beacons", "10 % wrong identities", inject.wrong_identities(0.1), "reported", FIT, log="beacons")]
+    used = {"gps": {"use": "all"}}
+    rows += [Row("GPS", f, i, o, s, log="gps", config=used) for f, i, o, s in GPS]
+    half = {"gps": {"use": "every-second"}}
+    rows += [
+        Row(
+            "GPS",
+            f"{GPS[8][0]}, half of the fixes kept back",
+            GPS[8][1],
+            "reported",
+            "gps-correlated",
+            log="gps",
+            config=half,
+        )
+    ]
+    rows += [Row("GPS", f, i, o, s, "ekf-slam", log="gps", config=used) for f, i, o, s in (GPS[0], GPS[1], GPS[3])]
+    rows += [
+        Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT),
+        Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),
+        Row("sightings", "all ranges NaN", inject.sightings(_nan), "refused", "is not finite"),
+        Row("sightings", "stamps that repeat", inject.sightings(_twice), "refused", "time does not increase"),
+        Row("sightings", "log without a record", _records(0, "landmarks"), "refused", "no scan to work on"),
+        Row("sightings", "log of one scan", _records(1, "landmarks"), "handled", ""),
+        Row("wheels", "log without a record", _records(0, "controls"), "refused", "motion stream is empty"),
+        Row("wheels", "log of one record", _records(1, "controls"), "refused", "a single record"),
+        Row(
+            "settings",
+            "one particle",
+            inject.clean,
+            "reported",
+            "particles",
+            config={**LIKELIHOOD, "frontend": {"association": "likelihood", "particles": 1}},
+        ),
+        Row(
+            "settings",
+            "noise of the sightings stated four times too small",
+            inject.clean,
+            "reported",
+            "residuals",
+            config={"frontend": {"noise": {"range_sigma": 0.05, "bearing_sigma": 0.009}}},
+        ),
+    ]
+    return rows
+
+
+ROWS: list[Row] = _rows()
+
+
+def table() -> str:
+    """The rows as ``docs/faults.md`` shows them: front ends with the same outcome share a line."""
+    seen: dict[tuple[str, ...], list[str]] = {}
+    for row in ROWS:
+        sensor, fault, name, dim, outcome, shows = row.cells()
+        seen.setdefault((sensor, fault, dim, outcome, shows), []).append(name)
+    lines = ["| Sensor | Fault | Front end | World | Outcome | A user sees |", "|---|---|---|---|---|---|"]
+    for (sensor, fault, dim, outcome, shows), names in seen.items():
+        front = "; ".join(dict.fromkeys(names))
+        lines.append(f"| {sensor} | {fault} | {front} | {dim} | {outcome} | {shows.replace('|', '` or `')} |")
+    return "\n".join(lines)
