@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
+from graphslam.app.studies import STUDIES
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint, source_digest
 from graphslam.app.study_folder import StudyFolder
 from graphslam.app.threads import hold_one_thread, one_blas_thread
@@ -250,8 +251,15 @@ def study(
     return result
 
 
-def open_study(folder: str | Path) -> Study:
+def open_study(folder: str | Path, definition: StudyDefinition | str | None = None) -> Study:
     """Read a study from its folder, finished or not, without running anything.
+
+    Parameters
+    ----------
+    folder : path
+    definition : StudyDefinition or str, optional
+        A study of your own: itself, or ``module:object``. A folder names its study, too, but a folder that somebody
+        gave you must not choose what is imported: without this argument only the registered studies are opened.
 
     Raises
     ------
@@ -261,7 +269,12 @@ def open_study(folder: str | Path) -> Study:
         A study that is not registered.
     """
     opened = StudyFolder(folder)
-    return Study.read(find_study(str(opened.identity()["name"])), opened)
+    if definition is None:
+        name = str(opened.identity()["name"])
+        if name not in STUDIES:
+            raise UnknownNameError("study", name, [*STUDIES, "your own, with open_study(folder, definition)"])
+        definition = name
+    return Study.read(find_study(definition) if isinstance(definition, str) else definition, opened)
 
 
 def write_results(result: Study, *, figures: bool = True) -> list[Path]:

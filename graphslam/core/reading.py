@@ -62,6 +62,11 @@ def set_size_limit(max_size: int) -> None:
     _limit.set(int(max_size))
 
 
+def most_bytes() -> int:
+    """The limit in force."""
+    return _limit.get()
+
+
 def check_size(size: int, where: str) -> None:
     """Refuse more bytes than the limit.
 

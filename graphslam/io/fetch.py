@@ -7,15 +7,20 @@ import logging
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
+from urllib.parse import urljoin, urlsplit
 
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError, FormatError, MissingDataError
+from graphslam.core.reading import most_bytes
 from graphslam.io.cards import Card, CardArchive, CardFile, card
 from graphslam.io.catalog import cache_folder, check_file, data_roots
 
 log = logging.getLogger(__name__)
 TIMEOUT = 60.0
 """Seconds without an answer before a download fails."""
+SCHEMES = ("https",)
+"""Of addresses that are asked, those of redirects included."""
+MOST_REDIRECTS = 5
 
 
 def fetch(data: Card | str, *, progress: bool = False) -> Path:
@@ -72,7 +77,7 @@ def fetch(data: Card | str, *, progress: bool = False) -> Path:
         else:
             log.info("%s: %s has no direct download; it is not needed", c.name, f.path)
     for url, wanted in unpack.items():
-        packed = _download(c, url, target, f".{PurePosixPath(url).name}", archives[url].sha256, progress)
+        packed = _download(c, url, target, f".{PurePosixPath(url).name}", archives[url].sha256, most_bytes(), progress)
         try:
             _unpack(packed, wanted, target)
         finally:
@@ -83,16 +88,17 @@ def fetch(data: Card | str, *, progress: bool = False) -> Path:
 def _fetch_file(c: Card, f: CardFile, target: Path, progress: bool) -> None:
     """Download a file, or its content where that is what the link gives."""
     assert f.url is not None
-    name, digest = (f.plain_path, f.content_sha256) if f.plain_path else (f.path, f.sha256)
-    assert name is not None
+    name, digest, size = f.path, f.sha256, f.bytes
+    if f.plain_path and f.content_bytes is not None:
+        name, digest, size = f.plain_path, f.content_sha256 or "", f.content_bytes
     folder = target / PurePosixPath(name).parent
     folder.mkdir(parents=True, exist_ok=True)
     if f.plain_path:
         (target / f.path).unlink(missing_ok=True)  # a spoilt packed file would hide the good plain one
-    _download(c, f.url, folder, PurePosixPath(name).name, digest, progress)
+    _download(c, f.url, folder, PurePosixPath(name).name, digest, size, progress)
 
 
-def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, progress: bool) -> Path:
+def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, most: int, progress: bool) -> Path:
     import pooch
     import requests
 
@@ -107,7 +113,7 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, pr
                 known_hash=None if digest is None else f"sha256:{digest}",
                 fname=name,
                 path=folder,
-                downloader=pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT),
+                downloader=lambda address, file, _: _stream(address, file, most, progress),
             )
         )
     except requests.exceptions.RequestException as error:
@@ -122,6 +128,42 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, pr
             where=url,
             wanted=f"sha256 {digest}",
         ) from None
+
+
+def _stream(url: str, file: str, most: int, progress: bool) -> None:
+    """Write what an address gives, no more than ``most`` bytes of it; every redirect must be to an allowed scheme.
+
+    Raises
+    ------
+    DataError
+        Another scheme, too many redirects, or more data than the card says.
+    """
+    import requests
+    from tqdm import tqdm
+
+    with requests.Session() as session:
+        at = url
+        for _ in range(MOST_REDIRECTS + 1):
+            scheme = urlsplit(at).scheme
+            if scheme not in SCHEMES:
+                raise DataError("address of another scheme; nothing was asked", where=at, got=scheme, wanted=SCHEMES[0])
+            with session.get(at, stream=True, timeout=TIMEOUT, allow_redirects=False) as answer:
+                if answer.is_redirect:
+                    at = urljoin(at, answer.headers["location"])
+                    continue
+                answer.raise_for_status()
+                size = 0
+                with open(file, "wb") as out, tqdm(total=most, unit="B", unit_scale=True, disable=not progress) as bar:
+                    for part in answer.iter_content(1 << 16):
+                        size += len(part)
+                        if size > most:
+                            raise DataError(
+                                "more data than the card says; it was thrown away", where=at, wanted=f"{most} bytes"
+                            )
+                        out.write(part)
+                        bar.update(len(part))
+                return
+    raise DataError("too many redirects", where=url, wanted=f"{MOST_REDIRECTS} at most")
 
 
 def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:

@@ -325,7 +325,7 @@ def test_trial_files_hold_no_pickles_and_keep_odd_numbers(tmp_path: Path) -> Non
 
 
 def test_a_study_is_read_back_shows_itself_and_draws(serial: Study, tmp_path: Path) -> None:
-    opened = open_study(serial.folder.path)
+    opened = open_study(serial.folder.path, serial.definition)
     pd.testing.assert_frame_equal(opened.table, serial.table)
     assert repr(opened) == "Study('small': runs near: 4, fine: 4; 0 failed)"
     page = opened._repr_html_()

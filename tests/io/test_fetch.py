@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from graphslam.core.errors import DataError, FormatError, MissingDataError
+from graphslam.io import fetch as fetching
 from graphslam.io.cards import Card, CardArchive, CardFile
 from graphslam.io.catalog import check, locate
 from graphslam.io.fetch import fetch
@@ -42,6 +43,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[st
     monkeypatch.delenv("GRAPHSLAM_DATA", raising=False)
     monkeypatch.setenv("GRAPHSLAM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setattr(fetching, "SCHEMES", ("https", "http"))  # the server here has no certificate
     Quiet.served = []
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(root))) as httpd:
         thread = threading.Thread(target=httpd.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
@@ -213,3 +215,69 @@ def test_optional_file_may_be_missing_from_the_archive(server: tuple[str, Path])
     folder = fetch(replace(c, archives=(archive,)))
     assert not (folder / "note.txt").exists()
     assert isinstance(c.files[2], CardFile)
+
+
+class Elsewhere(http.server.BaseHTTPRequestHandler):
+    """Sends everybody to another address."""
+
+    to = ""
+    asked = 0
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        type(self).asked += 1
+        self.send_response(302)
+        self.send_header("Location", self.to)
+        self.end_headers()
+
+
+@pytest.fixture
+def elsewhere(server: tuple[str, Path]) -> Iterator[str]:
+    Elsewhere.asked = 0
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Elsewhere) as httpd:
+        threading.Thread(target=httpd.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield f"http://127.0.0.1:{httpd.server_address[1]}"
+        httpd.shutdown()
+
+
+def test_only_https_is_asked(server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    url, root = server
+    serve(root)
+    monkeypatch.setattr(fetching, "SCHEMES", ("https",))
+    for address in (url, "ftp://127.0.0.1", f"file://{root}"):
+        with pytest.raises(DataError, match="address of another scheme"):
+            fetch(linked(address))
+    assert Quiet.served == []
+    assert not list((tmp_path / "cache").rglob("*.txt"))
+
+
+@pytest.mark.parametrize("to", ["file:///etc/passwd", "ftp://127.0.0.1/a"])
+def test_redirects_to_another_scheme_are_refused(elsewhere: str, to: str) -> None:
+    Elsewhere.to = to
+    with pytest.raises(DataError, match="address of another scheme"):
+        fetch(linked(elsewhere))
+    assert Elsewhere.asked == 1
+
+
+def test_redirects_are_followed_and_not_for_ever(elsewhere: str, server: tuple[str, Path]) -> None:
+    url, root = server
+    serve(root)
+    Elsewhere.to = f"{url}/a.txt"
+    a = linked(elsewhere).files[0]
+    folder = fetch(toy_card(files=(a,)))
+    assert (folder / "a.txt").read_bytes() == CONTENT
+    (folder / "a.txt").unlink()
+    Elsewhere.to = f"{elsewhere}/again"
+    with pytest.raises(DataError, match="too many redirects"):
+        fetch(toy_card(files=(a,)))
+
+
+def test_a_download_that_does_not_end_is_cut(server: tuple[str, Path], tmp_path: Path) -> None:
+    url, root = server
+    serve(root)
+    (root / "b.bin").write_bytes(b"abc" + bytes(1_000_000))
+    with pytest.raises(DataError, match="more data than the card says"):
+        fetch(linked(url))
+    assert not list((tmp_path / "cache").rglob("*b.bin*"))

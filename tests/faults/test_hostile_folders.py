@@ -1,0 +1,117 @@
+"""Folders that somebody else made choose neither what is imported, nor which other files are read."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from graphslam.app.outputs import open_run
+from graphslam.app.study import open_study
+from graphslam.core.errors import FormatError, GraphSlamError, UnknownNameError
+from graphslam.io.log_store import load_log
+from graphslam.io.submap_store import read_submaps
+from tests.faults.readers import a_log_folder, run_folder, study_folder, submap_store
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])
+TRAP = "from pathlib import Path\nPath(__file__).with_name('sprung').touch()\n"
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module that can be imported and tells if it was; the file is what it leaves behind."""
+    (tmp_path / "a_trap.py").write_text(TRAP)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path / "sprung"
+    sys.modules.pop("a_trap", None)
+
+
+def test_a_study_folder_imports_nothing(tmp_path: Path, trap: Path) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    study_folder(folder)
+    facts = json.loads((folder / "study.json").read_text())
+    for name in ("a_trap:study", "a_trap", "os:system"):
+        (folder / "study.json").write_text(json.dumps({**facts, "name": name}))
+        with pytest.raises(UnknownNameError, match="unknown study"):
+            open_study(folder)
+    assert not trap.exists()
+    with pytest.raises(GraphSlamError):
+        open_study(folder, "a_trap:study")  # what the user names is imported, and is no study
+    assert trap.exists()
+
+
+def test_a_run_folder_imports_nothing(tmp_path: Path, trap: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    run_folder(folder)
+    file = (folder / "run.json").resolve()
+    facts = json.loads(file.read_text())
+    file.write_text(json.dumps({**facts, "frontend": "a_trap:Front", "source": "a_trap:log"}))
+    assert open_run(folder).name == "a_trap:log"
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("name", ["../secret.npz", "/etc/passwd", "..", "", "a/b.npz", "a\\\\b.npz", "\u202eb.npz"])
+def test_names_lead_nowhere_else(tmp_path: Path, name: str) -> None:
+    (tmp_path / "log").mkdir()
+    a_log_folder(tmp_path / "log")
+    submap_store(tmp_path / "run")
+    for file, key, read in (
+        (tmp_path / "log/log.json", "streams", lambda: load_log(tmp_path / "log")),
+        (tmp_path / "run/submaps/index.json", "submaps", lambda: read_submaps(tmp_path / "run")),
+    ):
+        facts = json.loads(file.read_text())
+        facts[key][0]["file"] = name
+        file.write_text(json.dumps(facts))
+        with pytest.raises(FormatError, match="leads out of its folder"):
+            read()
+
+
+def test_links_lead_nowhere_else(tmp_path: Path) -> None:
+    for place, file, read in (
+        ("log", "log/gps.npz", lambda: load_log(tmp_path / "log")),
+        ("run", "run/submaps/000001.npz", lambda: read_submaps(tmp_path / "run")),
+    ):
+        (tmp_path / place).mkdir()
+        (a_log_folder if place == "log" else submap_store)(tmp_path / place)
+        read()
+        moved = tmp_path / f"outside-{place}.npz"
+        os.rename(tmp_path / file, moved)
+        (tmp_path / file).symlink_to(moved)
+        with pytest.raises(FormatError, match="leads out of its folder"):
+            read()
+
+
+# name of a call, or of a module -> why it stands nowhere in the package
+FORBIDDEN = {
+    "pickle", "pickle.load", "pickle.loads", "pickle.Unpickler", "cPickle",
+    "dill", "shelve", "marshal", "joblib", "cloudpickle", "eval", "exec", "compile", "os.system",
+    "yaml.load", "pd.read_pickle", "pandas.read_pickle", "np.loadtxt", "np.genfromtxt", "np.fromfile", "__import__",
+}  # fmt: skip
+
+
+# it asks whether a trial can be sent to another process; it loads none
+DUMPS = {"executors.py": {"pickle"}}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_nothing_is_unpickled_or_evaluated(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            assert not FORBIDDEN & {a.name.split(".")[0] for a in node.names} - DUMPS.get(path.name, set()), path
+        elif isinstance(node, ast.ImportFrom):
+            assert (node.module or "").split(".")[0] not in FORBIDDEN, path
+        elif isinstance(node, ast.Call):
+            assert ast.unparse(node.func) not in FORBIDDEN, f"{path}:{node.lineno}"
+            for k in node.keywords:
+                allowed = k.arg not in ("allow_pickle", "shell") or ast.unparse(k.value) == "False"
+                assert allowed, f"{path}:{node.lineno}"
+            if ast.unparse(node.func) in ("np.load", "np.lib.format.read_array"):
+                assert any(k.arg == "allow_pickle" for k in node.keywords), f"{path}:{node.lineno}"
