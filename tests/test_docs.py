@@ -19,6 +19,7 @@ PAGES = [
     "combined-slam.md",
     "concepts.md",
     "evidence-grids.md",
+    "faults.md",
     "how-to.md",
     "imu.md",
     "limits.md",
