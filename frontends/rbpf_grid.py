@@ -20,9 +20,9 @@ from frontends.ancestry import Ancestry
 from frontends.drift import DriftModel
 from frontends.grid_config import GridFilterConfig
 from frontends.grid_filter import GridFilter, GridParticles, Tally
-from frontends.scan_use import require_returns, uncorrected, uncorrected_covariance, with_findings
+from frontends.scan_use import checked_steps, uncorrected, uncorrected_covariance, with_findings
 from frontends.segslam.covariance import Drift, exit_covariance
-from frontends.steps import StepConfig, Steps, make_steps
+from frontends.steps import StepConfig, Steps
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -261,11 +261,7 @@ class RbpfGrid:
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
-            count = DropCounter()
-            steps = make_steps(log, self.config.steps, drops=count)
-            if drops is not None:
-                drops.counts.update(count.counts)
-            require_returns(steps, count)
+            steps = checked_steps(log, self.config.steps, drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))
             drift = replace(self.config.drift, dim=steps.dim)
             submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)

@@ -12,18 +12,48 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from frontends.steps import Steps
+from frontends.motion_check import check_motion, motion_findings, spin_of
+from frontends.scan_matching import match_neighbours
+from frontends.step_config import StepConfig
+from frontends.steps import Steps, make_steps
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
-from graphslam.core.log import DropCounter
+from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of, level
+from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
 
 FEW = 10
 """Returns below which a step's scan does not hold a pose: a wall takes some beams to be a line."""
 LONG = 2.0
 """Stretches without a correction that are shorter are what the filter's own walks are for [s]."""
+
+
+def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
+    """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : StepConfig
+    drops : DropCounter, optional
+
+    Raises
+    ------
+    GraphSlamError
+        As :func:`frontends.steps.make_steps`; a DataError if no beam of any scan met anything.
+    """
+    count = DropCounter()
+    steps = make_steps(log, replace(config, match_scans=False), drops=count)
+    if drops is not None:
+        drops.counts.update(count.counts)
+    require_returns(steps, count)
+    spins = [spin_of(s.spin_rate) for s in log.streams.values() if isinstance(s, RangeScans)]
+    found = tuple(motion_findings(check_motion(steps, max(spins, default=0.0))))
+    if config.match_scans:  # after the check: what is fused with the scans agrees with them
+        steps = match_neighbours(steps, drops=drops)
+    return replace(steps, findings=found)
 
 
 def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:

@@ -8,14 +8,13 @@ from typing import ClassVar
 
 from frontends.filter_drift import FilterDrift
 from frontends.grid_config import GridFilterConfig
-from frontends.scan_use import require_returns, with_findings
+from frontends.scan_use import checked_steps, with_findings
 from frontends.segslam.config import SegSlamConfig
 from frontends.segslam.progress import Watch
 from frontends.segslam.result import SegSlamResult
 from frontends.segslam.segslam import run_segslam
 from frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from frontends.step_config import StepConfig
-from frontends.steps import make_steps
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
@@ -54,11 +53,7 @@ class SegSlam:
     ) -> Iterator[Submap]:
         """See :class:`frontends.base.FrontEnd`: the settled chain of the best particle, segment by segment."""
         c = self.config
-        count = DropCounter()
-        steps = make_steps(log, c.steps, drops=count)
-        if drops is not None:
-            drops.counts.update(count.counts)
-        require_returns(steps, count)
+        steps = checked_steps(log, c.steps, drops)
         result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=self.watch)
         for submap in settled(result, c.drift, c.segslam):
             if submap.key == 0:
