@@ -35,6 +35,8 @@ class BeamSource(Protocol):
     dim: int
     max_range: float
     sigma: float
+    skipped: Array
+    """Stamps of the scans that were left out as repeats: the robot drove on meanwhile [s]."""
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Origins ``(k, dim)``, ends ``(k, dim)`` in the base at the beam's own time, and whether they met something;
@@ -61,6 +63,7 @@ class _Spinning:
     times: Array
     max_range: float
     sigma: float
+    skipped: Array
     dim: int = 3
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
@@ -80,6 +83,7 @@ class _Planar:
     times: Array
     max_range: float
     sigma: float
+    skipped: Array
     dim: int = 2
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
@@ -98,6 +102,7 @@ class _Clouds:
     times: Array
     max_range: float
     sigma: float
+    skipped: Array
     dim: int = 3
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
@@ -147,8 +152,8 @@ def beam_source(
 
     Left out and counted: beams without a reading, what is nearer than ``min_range``, and scans that are the one before
     number for number: a sensor that measures never repeats itself, and a map that is shown the same scan from one place
-    after the other believes that nothing moves. Scans in which no beam met
-    anything are kept, for they say that space is free, and counted.
+    after the other believes that nothing moves. Scans in which no beam met anything are kept, for they say that space
+    is free, and counted.
     """
     if isinstance(stream, PointClouds):
         return _list_clouds(stream, name, min_range, range_sigma, cloud_range, drops)
@@ -166,14 +171,15 @@ def beam_source(
     record, beam = (a.astype(np.int64) for a in np.nonzero(good & ~again[:, None]))
     if isinstance(stream, RangeScans):
         times = stream.times[record] + stream.beam_times[beam]
-        return _Spinning(stream, record, beam, times, stream.max_range, stream.sigma)
-    return _Planar(stream, record, beam, stream.times[record], stream.max_range, range_sigma)
+        return _Spinning(stream, record, beam, times, stream.max_range, stream.sigma, stream.times[again])
+    return _Planar(stream, record, beam, stream.times[record], stream.max_range, range_sigma, stream.times[again])
 
 
 def _list_clouds(
     clouds: PointClouds, name: str, min_range: float, sigma: float, max_range: float, drops: DropCounter
 ) -> BeamSource:
-    rows, near, empty, again = [], 0, 0, 0
+    rows, near, empty = [], 0, 0
+    again: list[int] = []
     before: Array | None = None
     for k in range(len(clouds)):
         cloud = clouds.cloud(k)
@@ -182,15 +188,16 @@ def _list_clouds(
         near += len(length) - len(good)
         empty += len(good) == 0
         if before is not None and len(cloud) and np.array_equal(before, cloud):
-            again, good = again + 1, good[:0]
+            again.append(k)
+            good = good[:0]
         before = cloud
         rows.append(good)
-    drops.drop(name, "scan is the one before, number for number", again)
+    drops.drop(name, "scan is the one before, number for number", len(again))
     drops.drop(name, f"nearer than {min_range:g} m", near)
     drops.drop(name, "scan without a reading", empty)
     record = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
     row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-    return _Clouds(clouds, record, row.astype(np.int64), clouds.times[record], max_range, sigma)
+    return _Clouds(clouds, record, row.astype(np.int64), clouds.times[record], max_range, sigma, clouds.times[again])
 
 
 def spread(n: int, most: int) -> Index:

@@ -190,7 +190,9 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
             wanted=f"{source.begin:.3f} to {source.end:.3f} s, as {', '.join(source.names)}",
         )
     count.drop(", ".join(names), "beam outside the motion", outside)
-    times, begin = _stamps(log[names[0]], beam_times[inside], source, config)
+    skipped = np.concatenate([s.skipped for s in sources])
+    skipped = skipped[(skipped >= source.begin) & (skipped <= source.end)]
+    times, begin = _stamps(log[names[0]], np.append(beam_times[inside], skipped), source, config)
     motion = source.solve(times, np.unique(np.append(beam_times[inside], begin)), count)
 
     step = assign(beam_times, times, begin)

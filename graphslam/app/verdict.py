@@ -28,6 +28,8 @@ IN_WORDS = {
     "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
     "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
 }
+EXACT = 1e-12
+"""χ²/dof below which all measurements are met to the last digit, as in a chain that never closes."""
 SMALL_GAP = 1e-6
 """Of the objective: an objective above the optimum by less is at it."""
 FLAGGED = 0.05
@@ -190,6 +192,8 @@ def _chi2(figures: Figures) -> Finding:
         text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
         return Finding("", "chi2", text)
     chi2, dof = found
+    if chi2 < EXACT * dof:
+        return Finding("", "chi2", "χ² of the whole graph is 0: nothing in it is redundant that could contradict.")
     text, level = bounded(chi2 / dof, dof)
     return Finding(level, "chi2", f"χ²/dof of the whole graph: {text}.")
 

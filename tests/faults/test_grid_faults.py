@@ -1,0 +1,47 @@
+"""The fault matrix of the front ends on grids: every fault is refused, dropped and counted, handled, or said."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+
+from tests.faults.grid_rows import FRONT_ENDS, ROWS, Row
+from tests.faults.grid_trial import ERROR_MARGIN, Seen, trial
+from tests.faults.grid_worlds import world
+
+CASES = [(row, dim, front) for row in ROWS for dim in row.dims for front in FRONT_ENDS]
+
+
+@functools.cache
+def clean(dim: int, frontend: str) -> Seen:
+    return trial(None, world(dim), frontend)
+
+
+@pytest.mark.parametrize("frontend", FRONT_ENDS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_sound_log_is_not_reproached(dim: int, frontend: str) -> None:
+    seen = clean(dim, frontend)
+    assert not seen.said(), seen.lines
+    assert not seen.confident
+    assert seen.error < 0.5
+
+
+@pytest.mark.parametrize(
+    ("row", "dim", "frontend"), CASES, ids=[f"{front}-{dim}d-{row.name}" for row, dim, front in CASES]
+)
+def test_every_fault_has_its_outcome(row: Row, dim: int, frontend: str) -> None:
+    seen, sound = trial(row, world(dim), frontend), clean(dim, frontend)
+    assert not seen.silently_wrong(sound), seen
+    if row.outcome == "refused":
+        assert seen.refused, seen
+        assert row.sign in seen.refused
+        return
+    assert not seen.refused
+    if row.outcome == "reported":
+        assert seen.said() & set(row.sign.split("|")), seen.lines
+    elif row.outcome == "dropped":
+        assert any(row.sign in reason and n > 0 for reason, n in seen.dropped.items()), seen.dropped
+        assert not seen.confident
+    else:
+        assert not seen.confident or seen.error < ERROR_MARGIN[0] * sound.error + ERROR_MARGIN[1], seen
