@@ -35,6 +35,16 @@ class Noticed:
     finding: Finding
 
 
+def check_speeds(wheels: VelocityControls, name: str) -> list[Finding]:
+    """Wheels that never turn: a robot that is to map something moves."""
+    if len(wheels.times) < 2 or wheels.speed.any():
+        return []
+    text = (
+        f"{name} says that the robot never moved: the speed is 0 in all {len(wheels.times)} records. Is it connected?"
+    )
+    return [Finding("bad", "wheels-still", text)]
+
+
 def check_streams(log: SensorLog) -> list[Noticed]:
     """Look at every stream of a log.
 
@@ -63,5 +73,7 @@ def check_streams(log: SensorLog) -> list[Noticed]:
             found = check_imu(stream, name)
             if wheels is not None:
                 found += check_turns(stream, wheels, name)
+        elif isinstance(stream, VelocityControls):
+            found = check_speeds(stream, name)
         out += [Noticed(name, f) for f in found]
     return out

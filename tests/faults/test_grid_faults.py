@@ -12,6 +12,7 @@ from tests.faults.grid_rows import FRONT_ENDS, ROWS, Row
 from tests.faults.grid_trial import ERROR_MARGIN, Seen, trial
 from tests.faults.grid_worlds import world
 
+
 def cases() -> list[tuple[Row, int, str]]:
     """Rows with their dimensions: refusals by both front ends; the others by one each, in turns, for they take time.
 

@@ -1,0 +1,98 @@
+"""Raw streams: what cannot be right is said with its figure, and sound ones are left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.core.imu import GRAVITY
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import ArrayClouds, PointClouds
+from graphslam.core.records import VelocityControls
+from graphslam.evaluate.stream_checks import check_streams
+from graphslam.evaluate.stream_checks_beams import check_beams
+from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
+from tests.faults import inject_grid as put
+from tests.faults.grid_worlds import ring_log
+from tests.reference.imu_drive import drive
+
+
+@pytest.fixture(scope="module")
+def robot() -> SensorLog:
+    """Turns this way and that for 40 s, with an IMU and wheels that tell the turn."""
+    d = drive(np.random.default_rng(2))
+    t = d.wheels.times
+    turn = np.interp(t, d.imu.times, d.imu.angular_rate[:, 2])
+    wheels = VelocityControls(times=t, speed=d.wheels.speed, yaw_rate=turn)
+    return SensorLog(name="robot", streams={"imu": d.imu, "wheels": wheels})
+
+
+def codes(log: SensorLog) -> list[str]:
+    return [n.finding.code for n in check_streams(log)]
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_sound_streams_are_left_alone(seed: int, robot: SensorLog) -> None:
+    assert codes(ring_log(seed)) == []
+    assert [c for c in codes(robot) if c != "imu-gravity"] == []
+
+
+@pytest.mark.parametrize(
+    ("inject", "code", "word"),
+    [
+        (put.every(np.nan), "scans-silent", "no reading"),
+        (put.ranges(lambda r: 1000.0 * r), "scans-silent", "millimetres"),
+        (put.ranges(lambda r: 0.001 * r), "scans-unit", "kilometres"),
+        (put.every(3.0), "scans-constant", "3 m"),
+        (put.twice, "scans-repeated", "100 of 200"),
+        (put.stuck, "scans-repeated", "number for number"),
+        (put.blind(10.0), "scans-silent", "from 12.20 s"),
+        (put.no_scan, "scans-missing", "no scan"),
+        (put.speed(0.0), "wheels-still", "never moved"),
+    ],
+)
+def test_scans_and_wheels(inject: put.Inject, code: str, word: str) -> None:
+    found = [n.finding for n in check_streams(inject(ring_log(21))) if n.finding.code == code]
+    assert found
+    assert word in found[0].text
+    assert found[0].level in ("bad", "look")
+
+
+def test_imu_units_limits_and_axes(robot: SensorLog) -> None:
+    imu, wheels = robot["imu"], robot["wheels"]
+    # gravity belongs to a unit that stands level; the reference drive is rolled and pitched widely
+    level = replace(imu, specific_force=np.tile([0.0, 0.0, GRAVITY], (len(imu.times), 1)))
+    assert check_imu(level, "imu") == []
+    in_g = check_imu(replace(level, specific_force=level.specific_force / GRAVITY), "imu")
+    assert [f.code for f in in_g] == ["imu-gravity"]
+    assert "in g" in in_g[0].text
+    limit = 0.6 * np.abs(imu.angular_rate[:, 2]).max()
+    cut = check_imu(replace(level, angular_rate=np.clip(imu.angular_rate, -limit, limit)), "imu")
+    assert {f.code for f in cut} == {"imu-saturated"}
+    rows = np.arange(len(imu.times))
+    rows[(imu.times > 10.0) & (imu.times < 12.0)] = int(np.searchsorted(imu.times, 10.0))
+    held = replace(level, angular_rate=imu.angular_rate[rows])
+    assert [f.code for f in check_imu(held, "imu")] == ["imu-stuck"]
+    degrees = check_turns(replace(imu, angular_rate=np.rad2deg(imu.angular_rate)), wheels, "imu")
+    assert "57." in degrees[0].text
+    assert "degrees" in degrees[0].text
+    late = check_turns(replace(imu, times=imu.times + 0.5), wheels, "imu")
+    assert "s after those of the wheels" in late[0].text
+    other = check_turns(imu, replace(wheels, yaw_rate=-wheels.yaw_rate), "imu")
+    assert "swapped" in other[0].text
+
+
+def test_clouds() -> None:
+    rng = np.random.default_rng(4)
+    points = 5.0 * rng.standard_normal((400, 3))
+    offsets = np.arange(0, 401, 100)
+    times = np.arange(4.0)
+    assert check_beams(PointClouds(times=times, source=ArrayClouds(points, offsets)), "lidar") == []
+    again = np.concatenate([points[:100]] * 4)
+    assert [f.code for f in check_beams(PointClouds(times=times, source=ArrayClouds(again, offsets)), "lidar")] == [
+        "scans-repeated"
+    ]
+    empty = PointClouds(times=times, source=ArrayClouds(points[:0], np.zeros(5, dtype=np.int64)))
+    assert [f.code for f in check_beams(empty, "lidar")] == ["scans-silent"]
