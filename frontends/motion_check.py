@@ -50,9 +50,9 @@ LEAST_POINTS = 40
 """Returns of a scan that is matched."""
 LEAST_PAIRS = 8
 """Pairs that a regression needs, and a share of those tried that tells anything."""
-UNLIKE = 0.25
-"""Share of the pairs of a sound scanner that match at least: 0.8 to 1 on simulated and planar recorded logs, 0.33
-to 0.7 of lidars with a narrow field of view that are carried by hand."""
+UNLIKE, UNLIKE_NARROW = 0.5, 0.25
+"""Share of the pairs of a sound scanner that match at least: 0.8 to 1 on simulated and planar recorded logs; the other is
+for clouds as they come, 0.33 to 0.7 of lidars with a narrow field of view that are carried by hand."""
 STEP = 0.02
 """σ that every matched motion has at least, besides its own [m, and a third of it in rad]."""
 
@@ -73,6 +73,8 @@ class MotionCheck:
     ----------
     tried, matched : int
         Pairs.
+    least_share : float
+        Of the pairs tried, for scans to be alike.
     fits : dict of str to Fit
         ``distance`` and ``turn`` (scans over odometry); where the scanner really is, as against its mounting: ``yaw``,
         ``pitch``, ``tilt`` [rad], ``ahead``, ``left`` [m]; ``lag`` [s]. What the drive does not show is not there.
@@ -83,6 +85,7 @@ class MotionCheck:
     tried: int
     matched: int
     fits: dict[str, Fit]
+    least_share: float = UNLIKE
     moved: tuple[float, float] = (0.0, 0.0)
     turned: tuple[float, float] = (0.0, 0.0)
 
@@ -98,6 +101,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
         Length of a scan: that of half a turn of a head that spins; 0: every step is a scan of its own.
     """
     pairs = _pairs(steps, seconds)
+    share = UNLIKE if seconds > 0 or steps.dim == 2 else UNLIKE_NARROW
     group = group_of(steps.odometry.increments)
     path = chain(steps.odometry)
     rows: list[tuple[float, float, Array, Array, Array]] = []
@@ -112,7 +116,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
             times = float(steps.times[a1 - 1]), float(steps.times[b1 - 1])
             rows.append((*times, group.log(T), group.log(found.T_target_source), found.covariance))
     if len(rows) < LEAST_PAIRS:
-        return MotionCheck(len(pairs), len(rows), {})
+        return MotionCheck(len(pairs), len(rows), {}, share)
     begin, end = np.array([r[:2] for r in rows]).T
     o, m = (np.array([r[k] for r in rows]) for k in (2, 3))
     var = np.array([np.diag(r[4]) for r in rows])
@@ -141,8 +145,8 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
             across = [_regress([turn], m[:, k] - o[:, k], var[:, k], STEP / 3.0)[0] for k in (0, 1)]
             worst = max(across, key=lambda f: abs(f.value) - SURE * f.sigma)
             fits["tilt"] = worst
-        if seconds > 0 and (share := _mirrored(steps, pairs)) is not None:
-            fits["turn"] = Fit(-1.0, share)
+        if seconds > 0 and (sigma := _mirrored(steps, pairs)) is not None:
+            fits["turn"] = Fit(-1.0, sigma)
         lag = _lag(path.times, _headings(steps), begin, end, m[:, heading], var[:, heading])
         if lag is not None and abs(fits["turn"].value - 1.0) < 0.5:
             fits["lag"] = lag
@@ -152,7 +156,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
 
     size = [rms(np.linalg.norm(v[:, group.position], axis=1)) for v in (o, m)]
     return MotionCheck(
-        len(pairs), len(rows), fits, (size[0], size[1]), (rms(turn), rms(m[:, heading]))
+        len(pairs), len(rows), fits, share, (size[0], size[1]), (rms(turn), rms(m[:, heading]))
     )  # fmt: skip
 
 
@@ -331,7 +335,7 @@ def _lag(times: Array, heading: Array, begin: Array, end: Array, turn: Array, va
 def motion_findings(found: MotionCheck) -> list[Finding]:
     """Lines of the verdict on what scans say of the motion."""
     out: list[Finding] = []
-    if found.tried >= LEAST_PAIRS and found.matched < UNLIKE * found.tried:
+    if found.tried >= LEAST_PAIRS and found.matched < found.least_share * found.tried:
         text = (
             f"Only {found.matched} of {found.tried} pairs of neighbouring scans could be matched: scans that do not "
             "look alike from one moment to the next make no map. Look at the ranges, the order of the beams and the "
