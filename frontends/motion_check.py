@@ -51,8 +51,8 @@ LEAST_POINTS = 40
 LEAST_PAIRS = 8
 """Pairs that a regression needs, and a share of those tried that tells anything."""
 UNLIKE, UNLIKE_NARROW = 0.5, 0.25
-"""Share of the pairs of a sound scanner that match at least: 0.8 to 1 on simulated and planar recorded logs; the other is
-for clouds as they come, 0.33 to 0.7 of lidars with a narrow field of view that are carried by hand."""
+"""Share of the pairs of a sound scanner that match at least: 0.8 to 1 on simulated and planar recorded logs; the other
+is for clouds as they come, 0.33 to 0.7 of lidars with a narrow field of view that are carried by hand."""
 STEP = 0.02
 """σ that every matched motion has at least, besides its own [m, and a third of it in rad]."""
 
