@@ -24,6 +24,7 @@ from frontends.scan_use import checked_steps, uncorrected, uncorrected_covarianc
 from frontends.segslam.covariance import Drift, exit_covariance
 from frontends.steps import StepConfig, Steps
 from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of
@@ -215,7 +216,8 @@ def rbpf_submap(
     }
     path = result.trajectory(lambda s: drift_scale * np.asarray(drift(s)))
     added = np.zeros_like(exit.total)
-    if steps is not None and (stretches := uncorrected(steps)):
+    alone = len(result.particles) == 1  # nobody to choose from: the path is dead reckoning, whatever scans there are
+    if steps is not None and (stretches := [(1, len(path) - 1)] if alone else uncorrected(steps)):
         assert path.covariances is not None
         more = [uncorrected_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
         path = Trajectory(path.times, path.poses, path.covariances + np.array(more))
@@ -265,4 +267,7 @@ class RbpfGrid:
             result = run_rbpf(steps, self.config.filter, seed.child(0))
             drift = replace(self.config.drift, dim=steps.dim)
             submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)
+            if len(result.particles) == 1:
+                text = "A single particle corrects nothing: the path is dead reckoning, and its covariance says so."
+                steps = replace(steps, findings=(*steps.findings, Finding("look", "one-particle", text)))
             yield with_findings(submap, steps)
