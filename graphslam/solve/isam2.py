@@ -12,13 +12,16 @@ that replaces the old object only when it succeeded.
 from __future__ import annotations
 
 import logging
+import re
 import time
 
 import gtsam
 import numpy as np
+import scipy.sparse as sp
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gtsam_factors import gtsam_factor
 from graphslam.graph.gtsam_values import from_gtsam, insert_value
 from graphslam.graph.pose_graph import PoseGraph
@@ -28,6 +31,10 @@ from graphslam.solve.batch import linearisation_gap, optimise_graph, state_of
 from graphslam.solve.solution import Solution, make_solution
 
 log = logging.getLogger(__name__)
+
+
+_FAILURES = (RuntimeError, IndexError, ValueError, SolverError)
+"""What GTSAM throws, or we on what it returns."""
 
 
 class FactorRejectedError(SolverError):
@@ -177,6 +184,9 @@ class Isam2Solver:
         parameters.setRelinearizeThreshold(thresholds)
         parameters.relinearizeSkip = self.relinearize_skip
         parameters.findUnusedFactorSlots = True
+        # Cholesky squares the condition number: an open chain of 900 poses with a centimetre of noise each is
+        # "indeterminate" to it. QR costs about the same here.
+        parameters.setFactorization("QR")
         self._isam = gtsam.ISAM2(parameters)
         self._held = {}
         self._known = set()
@@ -198,9 +208,11 @@ class Isam2Solver:
         try:
             self._feed(gtsam.ISAM2(self._isam), new, gone)
             self._write_back()
-        except (RuntimeError, IndexError, ValueError, SolverError) as error:
+        except _FAILURES as error:
             self._isam, self._held, self._known = previous
-            self._blame(new, gone, error)
+            # what fails step by step may be sound as a whole: a factor is blamed only if that fails, too
+            self._rebuild(cause=error)
+            return
         self.updates += 1
 
     def _difference(self) -> tuple[list[Record], list[int]]:
@@ -239,28 +251,37 @@ class Isam2Solver:
             raise SolverError("iSAM2 returned values that are not finite")
         self.graph.set_values(estimate)
 
-    def _rebuild(self) -> None:
-        """Make iSAM2 again from the graph's record, linearised at the graph's values."""
+    def _rebuild(self, cause: Exception | None = None) -> None:
+        """Make iSAM2 again from the graph's record, linearised at the graph's values.
+
+        ``cause`` is what an update step by step failed with.
+        """
         old = (self._isam, self._held, self._known)
+        new, gone = self._difference()
         self._forget()
-        new = list(self.graph.records.values())
         try:
-            self._feed(self._isam, new, [])
+            self._feed(self._isam, list(self.graph.records.values()), [])
+            if cause is not None:
+                self._check_normal_equations()
             self._write_back()
-        except (RuntimeError, IndexError, ValueError, SolverError) as error:
+        except _FAILURES as error:
             self._isam, self._held, self._known = old
-            self._blame([r for r in new if r.factor_id not in old[1]], [], error)
+            self._blame(new, gone, cause or error)
         self.rebuilds += 1
         self.updates += 1
 
     def _check_finite(self, new: list[Record]) -> None:
         """Refuse a factor whose residual is not finite before GTSAM sees it (its own message would mislead)."""
-        flat = self.graph.flat()
-        chi2 = flat.evaluate(self.graph.values, hessian=False).chi2
-        fresh = {r.factor_id for r in new}
-        for record, value in zip(flat.records, chi2):
-            if record.factor_id in fresh and not np.isfinite(value):
+        chi2 = FlatGraph(new, self.graph.flat().layout).evaluate(self.graph.values, hessian=False).chi2
+        for record, value in zip(new, chi2):
+            if not np.isfinite(value):
                 self._reject(record, f"its residual is {value}")
+
+    def _check_normal_equations(self) -> None:
+        """Refuse what QR alone can solve: covariances and the batch optimum are made from squares of the Jacobian."""
+        A = self.graph.flat().evaluate(self.graph.values).A
+        if not np.all(np.isfinite(A.data if sp.issparse(A) else A)):
+            raise SolverError("the squares of its Jacobian overflow")
 
     def _blame(self, new: list[Record], gone: list[int], error: Exception) -> None:
         """The update failed and iSAM2 is rolled back: find out why, and say it."""
@@ -273,14 +294,14 @@ class Isam2Solver:
                 try:
                     self._feed(gtsam.ISAM2(self._isam), [record], [])
                     self._isam.calculateEstimate()
-                except (RuntimeError, IndexError, ValueError) as cause:
+                except _FAILURES as cause:
                     self._isam, self._held, self._known = isam, held, known
                     self.graph.diagnose().raise_if_bad()
-                    self._reject(record, _first_line(cause))
+                    self._reject(record, _in_words(cause))
         finally:
             self._isam, self._held, self._known = isam, held, known
         self.graph.diagnose().raise_if_bad()
-        raise SolverError(f"iSAM2 update failed ({_first_line(error)}); the solver is as it was before") from error
+        raise SolverError(f"iSAM2 update failed ({_in_words(error)}); the solver is as it was before") from error
 
     def _reject(self, record: Record, why: str) -> None:
         self.graph.remove(record.factor_id, reason=f"rejected by iSAM2: {why}")
@@ -291,8 +312,11 @@ class Isam2Solver:
         )
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _in_words(error: Exception) -> str:
+    """GTSAM's message on one line, up to the variable that it names; the advice behind that is for programmers."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    found = re.search(r"(?<=near variable )\d+ \(Symbol: (\w+)\)\.?", text)
+    return text if found is None else f"{text[: found.start()]}{found[1]}"
 
 
 def _distance(a: Values, b: Values) -> float:

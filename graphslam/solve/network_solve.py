@@ -62,7 +62,8 @@ class NetworkSolution:
     decrement : float
         Predicted further fall of the objective (gnc: of the inliers' objective).
     gap : float
-        Objective minus the lowest that any start reached in this run. For gnc it is what leaving out outliers costs
+        Objective minus the lowest that any start reached in this run; nan where the start that reached it did not
+        converge, because then no optimum is known to measure against. For gnc it is what leaving out outliers costs
         in the objective of all measurements, against what a few steps of least squares from there reach (or the
         starts that were asked for); nan if so much is left out that this was not tried.
     start : str
@@ -109,7 +110,8 @@ class NetworkSolution:
         return self.network.with_poses(self.poses, self.landmarks)
 
     def __repr__(self) -> str:
-        state = "converged" if self.converged else f"NOT converged (gap {self.gap:.6g})"
+        gap = f"gap {self.gap:.6g}" if np.isfinite(self.gap) else f"about {self.decrement:.2g} above a minimum"
+        state = "converged" if self.converged else f"NOT converged ({gap})"
         return (
             f"NetworkSolution({self.solver}: {self.objective_initial:.8g} -> {self.objective:.8g}, {state}, from "
             f"{self.start}, {self.iterations} iterations, {self.seconds:.2f} s)"
@@ -181,10 +183,15 @@ def solve_network(
     answer = run(network, starts, options, progress)
     poses, landmarks = answer.arrays
     value = objective(network, poses, landmarks)
-    gap = value - answer.optimum.best.objective
-    decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
-    stationary = is_converged(network, value if answer.minimum is None else answer.minimum, decrement)
-    at_optimum = gap <= SAME * abs(answer.optimum.best.objective) + 1e-12 * network.residuals
+    best = answer.optimum.best
+    gap = value - best.objective
+    if answer.values is best.values and best.status == "converged":
+        # judged where the descent ended: evaluated again one step on, a decrement at the limit may lie beyond it
+        decrement, stationary = best.decrement, True
+    else:
+        decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
+        stationary = is_converged(network, value if answer.minimum is None else answer.minimum, decrement)
+    at_optimum = gap <= SAME * abs(best.objective) + 1e-12 * network.residuals
     shown = None
     if certificate:
         judged = network if answer.inliers is None else subnetwork(network, answer.inliers)
@@ -200,7 +207,7 @@ def solve_network(
         seconds=time.perf_counter() - begin,
         converged=bool(stationary and (at_optimum or answer.minimised is not None)),
         decrement=decrement,
-        gap=max(gap, 0.0),
+        gap=max(gap, 0.0) if best.status == "converged" or answer.minimised is not None else float("nan"),
         start=answer.start,
         starts=answer.optimum.reports,
         details=answer.details,
