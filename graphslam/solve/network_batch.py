@@ -157,7 +157,7 @@ class BatchProblem:
         lm = gtsam.LevenbergMarquardtParams()
         lm.setLinearSolverType(f"MULTIFRONTAL_{self.factorization}")
         lm.setlambdaUpperBound(1e12)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, values, lm)
+        optimizer: Any = gtsam.LevenbergMarquardtOptimizer(self.graph, values, lm)
         values, taken, steps = _downhill(optimizer, values, objective, min(10, budget), LITTLE)
         if steps < min(10, budget) or not taken:
             leg = gtsam.DoglegParams()
