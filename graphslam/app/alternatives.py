@@ -18,7 +18,7 @@ from scipy import stats
 
 from graphslam.app.back_end import BackEnd
 from graphslam.app.config import BackEndConfig, GpsConfig
-from graphslam.app.run_folder import RunFolder
+from graphslam.app.output_files import OutputFiles
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -303,7 +303,7 @@ def write_choice(
         write_g2o(folder / files[1], to_network(j.alternative.graph))
         table.append({**row, "files": files})
     value = {"why": choice.why(), "scale": choice.scale, "left_out": left_out, "candidates": table}
-    RunFolder(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})
+    OutputFiles(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})
     return [*made, folder / "clearest.tum", folder / "clearest.json"]
 
 

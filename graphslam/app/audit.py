@@ -47,21 +47,31 @@ def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints
     return np.where(rows >= 0, published.ids[rows], -1)
 
 
-def audit_association(out: Metrics, log: SensorLog, front: Any, observation: Ints, landmark: Ints) -> None:
-    """Pair precision and recall of the run's association, where a reference exists.
+def reference_identities(log: SensorLog, front: Any) -> Ints | None:
+    """Identity of every observation that a front end read ``(q,)``, by a reference that it never saw; None = nowhere.
 
     Parameters
     ----------
+    log : SensorLog
+    front : front end
+        One without ``observations`` sees no landmarks.
+    """
+    return reference_labels(log, front.observations(log)[1]) if hasattr(front, "observations") else None
+
+
+def audit_association(out: Metrics, reference: Ints, observation: Ints, landmark: Ints) -> None:
+    """Pair precision and recall of the run's association.
+
+    Parameters
+    ----------
+    reference : (q,)
+        True identity of every observation of the stream; -1 = none.
     observation, landmark : (s,)
         Index of an observation in the stream, and the landmark of the map that it saw.
     """
-    if not hasattr(front, "observations") or len(observation) == 0:
+    if len(observation) == 0:
         return
-    _, observations = front.observations(log)
-    reference = reference_labels(log, observations)
-    if reference is None:
-        return
-    labels = np.full(len(observations.ranges), -1, dtype=np.int64)
+    labels = np.full(len(reference), -1, dtype=np.int64)
     labels[observation] = landmark
     agreement = pair_agreement(labels, reference)
     out.add("association_observations", agreement.observations)

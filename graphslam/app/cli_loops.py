@@ -23,7 +23,6 @@ def loops(
     every: bool = typer.Option(False, "--all", help="Also what the registration refused."),
     undo: int | None = typer.Option(None, help="Take this loop out, solve again, and write the run anew."),
     redo: int | None = typer.Option(None, help="Take in again a loop that was undone."),
-    source: str | None = typer.Option(None, help="Log of the run, for --undo and --redo, where it is no card."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
@@ -34,9 +33,9 @@ def loops(
     if undo is not None and redo is not None:
         raise ConfigError("--undo and --redo together; give one of them")
     if undo is not None:
-        ledger = undo_loop(run, undo, source=source, progress=not as_json)
+        ledger = undo_loop(run, undo, progress=not as_json)
     elif redo is not None:
-        ledger = redo_loop(run, redo, source=source, progress=not as_json)
+        ledger = redo_loop(run, redo, progress=not as_json)
     else:
         ledger = loops_of_run(run)
     frame = ledger.table(history=history)

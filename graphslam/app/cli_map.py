@@ -36,24 +36,14 @@ def make_map(
     as_json: bool = JSON,
 ) -> None:
     """The fused map of a run, made again from its folder: no scan is read."""
-    from graphslam.app.report import report_beside
-    from graphslam.app.run_folder import RunFolder
-    from graphslam.app.run_maps import draw_run_map, map_of_folder, with_heights, write_run_map
+    from graphslam.app.remake_map import remake_map
 
-    result, made = map_of_folder(run, heights=lambda c: with_heights(c, low, high))
-    files = write_run_map(run, made)
-    if grid:
-        made.fused.grid.save(run / "map.grid.npz")
-        files.append(run / "map.grid.npz")
-    figures = draw_run_map(made, result.map.trajectory, RunFolder(run).figures, name=result.name)
-    value: dict[str, Any] = made.facts()
+    made = remake_map(run, grid=grid, minimum_entropy=minimum_entropy, low=low, high=high, progress=not as_json)
+    value: dict[str, Any] = made.map.facts()
     rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
     text = table(rows)
-    if minimum_entropy:
-        from graphslam.app.run_hypotheses import clearest_of_run, write_clearest
-
-        found = clearest_of_run(result, made, progress=not as_json)
-        files += write_clearest(run, found, bands=made.bands)
+    found = made.clearest
+    if found is not None:
         value |= {"candidates": found.rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
         text += f"\n\n{table(found.rows, CANDIDATES)}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
@@ -61,7 +51,7 @@ def make_map(
         text += f"\npaths and graphs of all: {run / 'alternatives'}"
         if found.left_out:
             text += f"\n{found.left_out} more choices were not solved"
-    report_beside(run)  # the page of the run shows the pictures and the choices
-    value |= {"out": str(run), "files": [str(p) for p in files], "figures": [str(p) for p in figures]}
-    text += f"\n\nwritten: {', '.join(p.name for p in files)}; figures: {', '.join(p.name for p in figures)}"
+    value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
+    value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
+    text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; figures: {', '.join(p.name for p in made.figures)}"
     emit(value, text, as_json=as_json)

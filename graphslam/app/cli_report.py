@@ -23,10 +23,9 @@ def report(
     as_json: bool = JSON,
 ) -> None:
     """One self-contained HTML page of a run: verdict, figures, metrics, graph, loops and why, evidence, events."""
-    from graphslam.app.report import PAGE, make_report, save_report
+    from graphslam.app.report import report_and_file
 
-    made = make_report(run)
-    file = save_report(made, run / PAGE if out is None else out)
+    made, file = report_and_file(run, out)
     size = file.stat().st_size
     lines = [f"{file}: {size / 1e6:.2f} MB"]
     lines += [f"missing: {name} {why}" for name, why in sorted(made.problems.items())]

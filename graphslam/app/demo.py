@@ -14,6 +14,7 @@ from frontends.segslam.progress import Progress
 from graphslam.app.pipeline import run
 from graphslam.app.run import Run
 from graphslam.app.worlds import simulate
+from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.log import SensorLog
@@ -118,7 +119,7 @@ class DemoProgress:
             truth = truth.transformed(group_of(truth.poses).inverse(level(truth.poses[0])))
         title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closed yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
-        part = self.picture.with_name(f".{self.picture.name}.part.png")
+        part = part_path(self.picture, ".png")
         save(ax, part)
         part.replace(self.picture)
 

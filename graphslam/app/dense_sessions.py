@@ -10,10 +10,12 @@ import numpy as np
 
 from graphslam.app import config as cfg
 from graphslam.app.config import BackEndConfig, GpsConfig
+from graphslam.app.generations import consistent
 from graphslam.app.run import Run
-from graphslam.app.run_files import read_options
+from graphslam.app.run_files import read_options, read_report
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -164,10 +166,9 @@ def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
     if run.graph is not None:
         rows = [r for r in run.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
         return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
-    file = None if run.folder is None else Path(run.folder) / "graph.g2o"
-    if file is None or not file.is_file():
+    net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
+    if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
-    net = read_g2o(file)
     kernel = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
     out, chained = [], set()
     for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
@@ -176,6 +177,16 @@ def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
             continue
         out.append(InnerTie(i, j, T, _inverse(info), kernel))
     return out
+
+
+def _graph_of(run: Run, root: Path) -> PoseNetwork | None:
+    """The graph of the state that a run was read in."""
+    if not (root / "graph.g2o").is_file():
+        return None
+    now, then = read_report(root).get("generation"), run.report.get("generation")
+    if now != then:
+        raise DataError("the run was changed since it was read", where=str(run.folder), got=now, wanted=then)
+    return read_g2o(root / "graph.g2o")
 
 
 def _inverse(information: Array) -> Array:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from graphslam.app.folder_lock import locked
+from graphslam.app.generations import name_inside, new_generation
 from graphslam.app.outputs import open_run
 from graphslam.app.run import Run
 from graphslam.core.errors import ConfigError, UnknownNameError
@@ -128,9 +130,19 @@ def export(
     if format not in WRITERS:
         raise UnknownNameError("format", format, WRITERS)
     opened = run if isinstance(run, Run) else open_run(run)
-    if out is None and opened.folder is None:
+    home = opened.folder
+    if out is None and home is None:
         raise ConfigError("a run without a folder needs a file name to be exported to")
-    target = Path(out) if out is not None else Path(opened.folder or ".") / f"map.{format}"
-    content = geographic_map(opened, datum, heading=heading, confidence=confidence)
-    WRITERS[format](target, content)
-    return target
+    name = f"map.{format}" if out is None else None if home is None else name_inside(home, out)
+    if home is None or name is None:
+        target = Path(out or "")
+        WRITERS[format](target, geographic_map(opened, datum, heading=heading, confidence=confidence))
+        return target
+    with locked(home):
+        if not isinstance(run, Run):
+            opened = open_run(home)  # as it is now that nobody else changes it
+        content = geographic_map(opened, datum, heading=heading, confidence=confidence)
+        with new_generation(home) as new:
+            WRITERS[format](new.path / name, content)
+            new.adopt()
+    return home / name

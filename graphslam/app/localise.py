@@ -13,6 +13,7 @@ import numpy as np
 from graphslam.app.dense_sessions import DenseSession, back_end_config, is_dense, put, session_of, with_grids
 from graphslam.app.dense_ties import attach
 from graphslam.app.front_ends import make_front_end
+from graphslam.app.generations import outputs
 from graphslam.app.outputs import open_run
 from graphslam.app.pipeline import load_log_source
 from graphslam.app.run import Run
@@ -132,7 +133,7 @@ def source_of(
         Keys that are not there, or not in a row; a stretch without records.
     """
     path = Path(source)
-    if (path / "run.json").is_file():
+    if (outputs(path) / "run.json").is_file():
         run = open_run(path)
         known = [s.key for s in run.submaps]
         rows = [known.index(k) for k in keys if k in known]

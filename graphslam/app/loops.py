@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from graphslam.app.run_files import read_events, read_options
+from graphslam.app.folder_lock import locked
+from graphslam.app.generations import consistent, outputs
+from graphslam.app.run_files import read_events
 from graphslam.core.errors import DataError
-from graphslam.core.json_file import check_json
 from graphslam.graph.loop_candidates import FRONT_END
 from graphslam.graph.loop_ledger import Decision, LoopLedger
 from graphslam.graph.loop_ties import ties_entries
@@ -25,7 +26,8 @@ def loops_of_run(folder: str | Path) -> LoopLedger:
     ------
     RunFolderError, DataError, FormatError
     """
-    return ledger_of_events(read_events(folder), where=str(Path(folder) / "events.jsonl"))
+    events = consistent(folder, lambda root: read_events(root, home=folder))
+    return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
 
 
 def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
@@ -81,7 +83,7 @@ def undone_of_run(folder: str | Path) -> list[Decision]:
     DataError, FormatError
         The folder's events are damaged.
     """
-    if not (Path(folder) / "events.jsonl").is_file():
+    if not (outputs(folder) / "events.jsonl").is_file():
         return []
     return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]
 
@@ -100,9 +102,9 @@ def _identity(d: Decision) -> tuple[str, int, int, int, int]:
     return d.source, d.submap_i, d.submap_j, d.i, d.j
 
 
-def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
-    """Take a loop out of a finished run: its graph is made again from the stored submaps, solved without the loop, and
-    everything in the folder is written anew.
+def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLedger:
+    """Take a loop out of a finished run: its graph is made again from what the folder holds, solved without the loop,
+    and everything in the folder is written anew.
 
     Loops that were undone before stay so, as this one does whenever the run is resumed (:func:`redo_loop` takes it in
     again). What was found with the loop in the graph stays too.
@@ -112,57 +114,52 @@ def undo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None
     folder : path
     loop : int
         Number in the ledger.
-    source : path, optional
-        The log of the run, where that is no card.
     progress : bool
 
     Raises
     ------
     RunFolderError, DataError
-        No run, or no loop of that number in its graph.
+        No run, or no loop of that number in its graph; or another process is writing into the folder.
     MissingDataError
-        The log is not to be found: say where with ``source``.
+        An older version wrote the folder, which does not hold what the graph was made of.
     """
-    before = loops_of_run(folder)
-    d = before.of(loop)
-    if d.verdict != "accepted":
-        raise DataError(f"loop {loop} is not in the graph", where=str(folder), got=d.verdict, wanted="an accepted loop")
-    return _without(folder, [*undone_of_run(folder), d], source, progress)
+
+    def without(before: LoopLedger, undone: list[Decision]) -> list[Decision]:
+        d = before.of(loop)
+        if d.verdict != "accepted":
+            raise DataError(
+                f"loop {loop} is not in the graph", where=str(folder), got=d.verdict, wanted="an accepted loop"
+            )
+        return [*undone, d]
+
+    return _again(folder, without, progress)
 
 
-def redo_loop(folder: str | Path, loop: int, *, source: str | Path | None = None, progress: bool = True) -> LoopLedger:
+def redo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLedger:
     """Take in again a loop that :func:`undo_loop` took out, a match with its ties; others that were undone stay so.
 
     Parameters and errors are those of :func:`undo_loop`.
     """
-    before = loops_of_run(folder)
-    d = before.of(loop)
-    if d.verdict != "undone":
-        raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
-    entry = (d.submap_i, d.submap_j)
-    gone = [x for x in undone_of_run(folder) if x.loop != loop]
-    if d.source == FRONT_END:
-        gone = [x for x in gone if entry not in ties_entries(x.gates)]
-    return _without(folder, gone, source, progress)
+
+    def without(before: LoopLedger, undone: list[Decision]) -> list[Decision]:
+        d = before.of(loop)
+        if d.verdict != "undone":
+            raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
+        entry = (d.submap_i, d.submap_j)
+        gone = [x for x in undone if x.loop != loop]
+        return [x for x in gone if entry not in ties_entries(x.gates)] if d.source == FRONT_END else gone
+
+    return _again(folder, without, progress)
 
 
-def _without(folder: str | Path, undone: Sequence[Decision], source: str | Path | None, progress: bool) -> LoopLedger:
-    """Make a run again from its submaps without these loops, and write its folder anew."""
-    from graphslam.app.pipeline import run
+def _again(
+    folder: str | Path, without: Callable[[LoopLedger, list[Decision]], list[Decision]], progress: bool
+) -> LoopLedger:
+    """Make a run again without the loops that are chosen from its ledger and from those that are undone."""
+    from graphslam.app.pipeline import again
 
-    ordered = sorted(undone, key=lambda x: x.loop)
-    options = read_options(Path(folder))
-    wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
-    said = check_json(options, wanted, str(Path(folder) / "config.toml")).pop("run")
-    run(
-        source or said["source"],
-        frontend=said["frontend"],
-        solver=said["solver"],
-        seed=int(said["seed"]),
-        out=folder,
-        config=options,
-        resume=True,
-        progress=progress,
-        undo=ordered,
-    )
+    without(loops_of_run(folder), [])  # a folder that is no run is not locked, nor made
+    with locked(folder):  # from the look at the ledger on
+        undone = without(loops_of_run(folder), undone_of_run(folder))
+        again(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
     return loops_of_run(folder)

@@ -125,6 +125,7 @@ def merge(
     identity_gate: float = IDENTITY_GATE,
     tolerance: float = 0.5,
     out: str | Path | None = None,
+    anew: bool = False,
 ) -> MergedMap | MergedSubmaps:
     """Merge runs into one map: align them by common landmarks, then solve all their submaps together.
 
@@ -147,34 +148,40 @@ def merge(
         Landmarks of two maps within this distance after alignment agree [m].
     out : path, optional
         Folder for the merged map.
+    anew : bool
+        ``out`` may hold a merged map already: then this is its new state.
 
     Raises
     ------
     ConfigError
         Fewer than two runs, or an unknown option.
+    RunFolderError
+        ``out`` holds something already, or is being written by another process.
     DataError
         Runs that share fewer than two landmarks, or whose landmarks do not say how they lie; names the run.
     """
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:
         raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
-    from graphslam.app.merge_outputs import write_merged, write_merged_dense
+    if out is None:
+        return _merged(opened, by, solver, identity_gate, tolerance)
+    from graphslam.app.merge_outputs import merged_folder, write_merged
 
-    if all(is_dense(r) for r in opened):
-        with one_blas_thread():
-            dense = merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
-        if out is not None:
-            write_merged_dense(Path(out), dense)
-        return dense
-    if by not in ("auto", "identity", "constellation"):
-        raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
-    if by == "auto":
-        by = "identity" if all(r.report.get("identities") == "truth" for r in opened) else "constellation"
-    with one_blas_thread():
-        merged = _merge(opened, by, solver, identity_gate, tolerance)
-    if out is not None:
-        write_merged(Path(out), merged)
+    with merged_folder(out, anew=anew) as folder:
+        merged = _merged(opened, by, solver, identity_gate, tolerance)
+        write_merged(folder, merged)
     return merged
+
+
+def _merged(opened: list[Run], by: By, solver: str, gate: float, tolerance: float) -> MergedMap | MergedSubmaps:
+    with one_blas_thread():
+        if all(is_dense(r) for r in opened):
+            return merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
+        if by not in ("auto", "identity", "constellation"):
+            raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
+        if by == "auto":
+            by = "identity" if all(r.report.get("identities") == "truth" for r in opened) else "constellation"
+        return _merge(opened, by, solver, gate, tolerance)
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

@@ -1,19 +1,23 @@
-"""What a merge leaves on disk; every file is whole or not there, ``merge.json`` last."""
+"""What a merge leaves on disk: one state, written and replaced as a whole."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from graphslam.app.folder_lock import locked, make_folder
+from graphslam.app.generations import Generation, is_empty, new_generation, outputs
 from graphslam.app.graph_facts import graph_facts
 from graphslam.app.merge import MergedMap
 from graphslam.app.merge_dense import MergedSubmaps
 from graphslam.app.outputs import landmarks_csv
 from graphslam.app.report import report_beside
 from graphslam.app.run_files import MERGED_DENSE_FORMAT, MERGED_FORMAT
-from graphslam.app.run_folder import RunFolder
 from graphslam.core.atomic import write_npz
+from graphslam.core.errors import RunFolderError
 from graphslam.evaluate.without_truth import class_consistency
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
@@ -22,15 +26,56 @@ MOST_STATES = 6000
 """Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
 
 
-def write_merged(path: Path, merged: MergedMap) -> None:
-    """Write ``merged.npz``, ``landmarks.csv``, one ``trajectory_<session>.tum`` each, metrics, events and a picture.
+SAME_BYTES = (
+    *("merge.json", "merged.npz", "landmarks.csv", "trajectory_*.tum", "events.jsonl", "metrics.json", "ledger.csv"),
+    "figures/map.png",
+)
+"""Files of a merged folder that are the same bytes whenever the same runs are merged."""
+
+
+@contextmanager
+def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
+    """Make the folder of a merge, or take one that is empty; no other process writes into it until the block ends.
+
+    Parameters
+    ----------
+    path : path
+    anew : bool
+        One that holds a merge already is taken too.
 
     Raises
     ------
     RunFolderError
-        The folder holds something already, or cannot be made.
+        The folder holds something already, cannot be made, or is being written by another process.
     """
-    folder = RunFolder.new(path)
+    folder = make_folder(path)
+
+    def check() -> None:
+        if not (anew and (outputs(folder) / "merge.json").is_file()) and not is_empty(folder):
+            raise RunFolderError(f"{folder}: not empty; choose another --out")
+
+    check()  # before a lock is put into somebody's folder
+    with locked(folder):
+        check()
+        yield folder
+
+
+def write_merged(path: Path, merged: MergedMap | MergedSubmaps) -> None:
+    """Write a merge, by landmarks or of dense submaps, as a new state of its folder.
+
+    ``merged.npz``, ``landmarks.csv`` of one by landmarks, one ``trajectory_<session>.tum`` each, metrics, events, a
+    picture, ``merge.json``.
+    """
+    with new_generation(path) as new:
+        if isinstance(merged, MergedMap):
+            _write_landmarks(new, merged)
+        else:
+            _write_dense(new, merged)
+        _finish(new, merged)
+
+
+def _write_landmarks(folder: Generation, merged: MergedMap) -> None:
+    path = folder.path
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.map.trajectory)
     folder.write_text("landmarks.csv", landmarks_csv(merged.sessions[0].map))
@@ -48,18 +93,10 @@ def write_merged(path: Path, merged: MergedMap) -> None:
             "landmark_sessions": merged.landmark_sessions,
         },
     )
-    _finish(folder, merged)
 
 
-def write_merged_dense(path: Path, merged: MergedSubmaps) -> None:
-    """Write ``merged.npz``, one ``trajectory_<session>.tum`` each, metrics, events, a picture; ``merge.json`` last.
-
-    Raises
-    ------
-    RunFolderError
-        The folder holds something already, or cannot be made.
-    """
-    folder = RunFolder.new(path)
+def _write_dense(folder: Generation, merged: MergedSubmaps) -> None:
+    path = folder.path
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.trajectory)
     nodes = merged.solution.base_nodes
@@ -77,15 +114,17 @@ def write_merged_dense(path: Path, merged: MergedSubmaps) -> None:
             "nodes": merged.solution.poses,
         },
     )
-    _finish(folder, merged)
 
 
-def _finish(folder: RunFolder, merged: MergedMap | MergedSubmaps) -> None:
-    """What both kinds of merged maps have; ``merge.json`` last."""
+def _finish(folder: Generation, merged: MergedMap | MergedSubmaps) -> None:
+    """What both kinds of merged maps have."""
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
     save(merged.plot(), folder.figures / "map.png")
     folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
     classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
-    folder.write_json("merge.json", {**merged.report, "graph": graph_facts(merged.graph, classes)})
-    report_beside(folder.path)
+    report = dict(merged.report)
+    seconds = float(report.pop("seconds"))
+    folder.write_json("timings.json", [{"key": "seconds_merge", "value": seconds, "unit": "s", "direction": "lower"}])
+    folder.write_json("merge.json", {**report, "graph": graph_facts(merged.graph, classes)})
+    report_beside(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,9 +31,18 @@ TRUTH_GAP = 0.5
 """Between records of truth farther apart than this the true pose is unknown [s]."""
 
 
+TIMES = re.compile(r"^seconds_|_seconds$|^times_real_time$|^frontend_ms_per_scan$|^frontend_last_to_first_quarter$")
+"""Metrics that are measured with a clock: no run repeats them, and they have a file of their own."""
+
+
+def is_time(key: object) -> bool:
+    """Is it the key of a metric that was measured with a clock?"""
+    return TIMES.search(str(key)) is not None
+
+
 @dataclass
 class Metrics:
-    """Rows of ``metrics.json``."""
+    """Rows of ``metrics.json`` and ``timings.json``."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import numpy as np
 from tqdm import tqdm
 
 from graphslam.app import config as cfg
-from graphslam.app.audit import audit_association
+from graphslam.app.audit import audit_association, reference_identities
 from graphslam.app.back_end import BackEnd
+from graphslam.app.folder_lock import locked
 from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.front_to_back import FrontEndWork, front_to_back
+from graphslam.app.generations import consistent
 from graphslam.app.gps_use import split, used_fixes
 from graphslam.app.graph_facts import graph_facts
 from graphslam.app.imu_use import ImuPart, imu_metrics, imus_of
@@ -37,16 +41,18 @@ from graphslam.app.metrics_space import truth_metrics_in_space
 from graphslam.app.outputs import write_outputs
 from graphslam.app.reckoning import dead_reckoning
 from graphslam.app.run import GlobalMap, Run
-from graphslam.app.run_folder import RunFolder
+from graphslam.app.run_files import read_options
+from graphslam.app.run_folder import CONFIG, RunFolder
 from graphslam.app.run_maps import RunMap, has_grids, make_run_map, sensor_reach
 from graphslam.app.stream_use import stream_use
+from graphslam.app.taken import Taken, read_taken, take
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.verdict import Figures, observed, verdict
 from graphslam.app.versions import versions
 from graphslam.app.without_truth import check_without_truth
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.findings import verdict_json
-from graphslam.core.geometry import Array
+from graphslam.core.json_file import check_json
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
@@ -57,6 +63,8 @@ from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.loop_ledger import Decision
 from graphslam.io.catalog import load
+from graphslam.io.log_digest import log_digest
+from graphslam.io.submap_store import read_submaps
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -129,30 +137,114 @@ def _run(
         front = replace(front, watch=watch)
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     noticed = check_streams(log)
-    folder = None if out is None else RunFolder.start(out, effective, resume=resume)
+    back = _back_end(log, settings, solver)
+    if out is None:
+        return _made(log, front, back, settings, effective, None, seconds, begin, progress, undo or (), noticed)
+    effective["run"]["log"] = log_digest(log)
+    effective = tomllib.loads(cfg.dump_toml(effective))  # as it comes back from the folder, order and all
+    with RunFolder.start(out, effective, resume=resume) as folder:
+        if undo is None:  # what was taken out of a run stays out when it is gone on with
+            undo = undone_of_run(folder.path) if resume else ()
+        result = _made(log, front, back, settings, effective, folder, seconds, begin, progress, undo, noticed)
+        return write_outputs(folder.path, result)
 
+
+def _made(
+    log: SensorLog,
+    front: Any,
+    back: BackEnd,
+    settings: cfg.RunConfig,
+    effective: dict[str, Any],
+    folder: RunFolder | None,
+    seconds: dict[str, float],
+    begin: float,
+    progress: bool,
+    undo: Sequence[int | Decision],
+    noticed: Sequence[Noticed],
+) -> Run:
+    """Submaps of the front end, in the graph of the back end, solved and judged."""
+    drops = DropCounter()
+    tree, grids = SeedTree(effective["run"]["seed"]), _with_grids(settings)
+    submaps, work = front_to_back(log, front, back, tree, folder, drops, progress, grids)
+    if not submaps:
+        raise MissingDataError("the log gave no submap", where=log.name)
+    taken = take(log, drops.counts, reference_identities(log, front), noticed)
+    result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
+    return replace(result, log=log)
+
+
+def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
+    """Make a finished run again from what its folder holds, without these loops, and write its files anew.
+
+    No log is read, and no submap made.
+
+    Parameters
+    ----------
+    folder : path
+    undo : sequence of Decision
+        Loops that are taken out.
+    progress : bool
+        Show a progress bar on stderr.
+
+    Raises
+    ------
+    RunFolderError
+        No finished run, or another process is writing into it.
+    MissingDataError
+        An older version wrote the folder, which does not hold enough.
+    FormatError
+        What it holds is damaged.
+    """
+    root = Path(folder)
+    begin = time.perf_counter()
+    with one_blas_thread(), locked(root):
+        taken, _ = consistent(root, read_taken)
+        effective = read_options(root)
+        wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
+        said = check_json(effective, wanted, str(root / CONFIG))["run"]
+        settings: cfg.RunConfig = cfg.build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+        back = _back_end(taken.log, settings, said["solver"])
+        submaps = read_submaps(root, load_grid=load_npz if _with_grids(settings) else None)
+        seconds = {"load": time.perf_counter() - begin}
+        for s in tqdm(submaps, desc=str(said["source"]), unit="submap", disable=not progress, leave=False):
+            back.add(s)
+        work = FrontEndWork(0.0, len(submaps), np.zeros(0))
+        result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
+        return write_outputs(root, result)
+
+
+def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str) -> BackEnd:
+    """A back end that has its IMUs, and the fixes that are to be used."""
     back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu))
     gps = gps_stream(log)
     if gps is not None and settings.gps.use != "none":
         back.add_gps(split(gps, settings.gps)[0], settings.gps)
+    return back
 
-    drops = DropCounter()
-    submaps, work = _front_to_back(log, front, back, SeedTree(seed), folder, drops, progress)
-    if not submaps:
-        raise MissingDataError("the log gave no submap", where=log.name)
-    if undo is None:  # what was taken out of a run stays out when it is gone on with
-        undo = undone_of_run(folder.path) if folder is not None and resume else ()
+
+def _with_grids(settings: cfg.RunConfig) -> bool:
+    """Are the grids of stored submaps needed?"""
+    return bool(settings.backend.loops or settings.map.fuse)
+
+
+def _solved(
+    taken: Taken,
+    settings: cfg.RunConfig,
+    submaps: list[Submap],
+    back: BackEnd,
+    seconds: dict[str, float],
+    begin: float,
+    work: FrontEndWork,
+    effective: dict[str, Any],
+    undo: Sequence[int | Decision],
+) -> Run:
+    """The run of a back end that has all submaps."""
     solution = back.finish(undo)
     seconds["frontend"] = work.seconds
     seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}
     seconds["backend"] = sum(back.seconds.values())
     seconds["total"] = time.perf_counter() - begin
-
-    result = _judge(log, front, gps, settings, submaps, back, solution, seconds, work, drops, effective, noticed)
-    if folder is None:
-        return result
-    write_outputs(folder, result)
-    return replace(result, folder=folder.path)
+    return _judge(taken, settings, submaps, back, solution, seconds, work, effective)
 
 
 def load_log_source(source: str | Path | SensorLog, **options: Any) -> SensorLog:
@@ -188,81 +280,19 @@ def effective_config(
     }
 
 
-@dataclass(frozen=True, slots=True)
-class FrontEndWork:
-    """What the front end did in this session.
-
-    Parameters
-    ----------
-    seconds : float
-    resumed : int
-        Submaps that were there already.
-    per_scan : (k,)
-        Seconds a scan of each submap but the first, which may have compiled.
-    """
-
-    seconds: float
-    resumed: int
-    per_scan: Array
-
-
-def _front_to_back(
-    log: SensorLog,
-    front: Any,
-    back: BackEnd,
-    seed: SeedTree,
-    folder: RunFolder | None,
-    drops: DropCounter,
-    progress: bool,
-) -> tuple[list[Submap], FrontEndWork]:
-    """Feed every submap to the back end as soon as it is finished and stored."""
-    store = None if folder is None else folder.submaps_with(load_npz if back.config.loops else None)
-    submaps = store.complete_prefix() if store is not None else []
-    if store is not None and len(submaps) < len(store):
-        store.truncate(len(submaps))
-    t_first, t_last = log.interval
-    bar = tqdm(total=round(t_last - t_first, 1), unit="s", desc=log.name, disable=not progress, leave=False)
-    for s in submaps:
-        back.add(s)
-    if submaps:
-        logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
-        bar.update(submaps[-1].interval[1] - t_first)
-    bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
-    front_s, resumed, cost = 0.0, len(submaps), []
-    stream = front.submaps(log, seed=seed.child("frontend"), after=submaps[-1] if submaps else None, drops=drops)
-    while True:
-        start = time.perf_counter()
-        submap = next(stream, None)
-        spent = time.perf_counter() - start
-        front_s += spent
-        if submap is None:
-            break
-        if store is not None:
-            store.append(submap)
-        back.add(submap)
-        submaps.append(submap)
-        cost.append(spent / max(int(submap.report.get("scans", 1)), 1))
-        bar.update(submap.interval[1] - submap.interval[0])
-        bar.set_postfix(submaps=len(submaps), landmarks=len(back.graph.values.landmarks))
-    bar.close()
-    return submaps, FrontEndWork(front_s, resumed, np.array(cost[1:]))
-
-
 def _judge(
-    log: SensorLog,
-    front: Any,
-    gps: Gps | None,
+    taken: Taken,
     settings: cfg.RunConfig,
     submaps: list[Submap],
     back: BackEnd,
     solution: Solution,
     seconds: dict[str, float],
     work: FrontEndWork,
-    drops: DropCounter,
     effective: dict[str, Any],
-    noticed: Sequence[Noticed],
 ) -> Run:
     """Metrics, residuals, and the value that the user gets."""
+    log, drops = taken.log, DropCounter()
+    gps = gps_stream(log)
     hits = back.landmark_hits(submaps)
     global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
     out = Metrics()
@@ -294,7 +324,8 @@ def _judge(
         else:
             truth_metrics_in_space(out, solution, truth, path=true_path)
         identities = "truth" if known else "run"
-    audit_association(out, log, front, *back.observation_labels(submaps))
+    if taken.identities is not None:
+        audit_association(out, taken.identities, *back.observation_labels(submaps))
     report = {
         "format": "graphslam.run/1",
         **effective["run"],
@@ -306,7 +337,7 @@ def _judge(
         "seconds": seconds,
         "resumed_submaps": work.resumed,
         "flagged_submaps": flag_counts(submaps),
-        "records_read": dict(log.read) or {k: len(s.times) for k, s in log.streams.items()},
+        "records_read": dict(log.read),
         "records_dropped": {**log.dropped, **drops.counts},
         "source_meta": dict(log.meta),
         "identities": identities,
@@ -324,7 +355,7 @@ def _judge(
     figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
     reports = [s.report for s in submaps]
     seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
-    report["verdict"] = verdict_json([*observed(streams, noticed, submaps), *seen, *verdict(figures)])
+    report["verdict"] = verdict_json([*observed(streams, taken.noticed, submaps), *seen, *verdict(figures)])
     return Run(
         name=log.name,
         submaps=identified,
@@ -335,7 +366,7 @@ def _judge(
         ledger=back.graph.ledger.table(),
         gps=residuals,
         fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
-        log=log,
+        taken=taken,
         truth=truth,
         truth_path=true_path,
         dead_reckoning=reckoned,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from graphslam.app.generations import Generation, consistent, name_inside, new_generation
 from graphslam.app.markup import note, page
 from graphslam.app.report_figures import figures
 from graphslam.app.report_folder import Kind, read_folder
@@ -68,7 +68,11 @@ def make_report(folder: str | Path) -> Report:
     RunFolderError
         Neither a run folder nor a merged one. What is missing inside one, or damaged, is said in the page.
     """
-    found = read_folder(folder)
+    return consistent(folder, lambda root: _page(Path(folder), root))
+
+
+def _page(home: Path, root: Path) -> Report:
+    found = read_folder(home, root)
     title = f"{_TITLES[found.kind]}: {found.name}"
     head = [element("h1", title), verdict_lines(found)]
     links = element("nav", *(element("a", name, href=f"#{name}") for name in _PARTS))
@@ -94,11 +98,24 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     RunFolderError
         No run folder, or the page cannot be written.
     """
-    return save_report(make_report(folder), Path(folder) / PAGE if out is None else Path(out))
+    return report_and_file(folder, out)[1]
 
 
-def save_report(report: Report, file: Path) -> Path:
-    """Write a page, whole or not at all."""
+def report_and_file(folder: str | Path, out: str | Path | None = None) -> tuple[Report, Path]:
+    """Write the page of a folder; the page, and its file. See :func:`write_report`."""
+    home, report = Path(folder), make_report(folder)
+    name = PAGE if out is None else name_inside(home, out)
+    if name is None:
+        assert out is not None
+        return report, _save(report, Path(out))
+    with new_generation(home) as new:
+        new.adopt(drop=[name])
+        report = _page(home, new.path)
+        _save(report, new.path / name)
+    return report, home / name
+
+
+def _save(report: Report, file: Path) -> Path:
     try:
         with atomic_open(file, "w") as stream:
             stream.write(report.html)
@@ -107,10 +124,9 @@ def save_report(report: Report, file: Path) -> Path:
     return file
 
 
-def report_beside(folder: str | os.PathLike[str]) -> Path | None:
-    """Write the page of what was just finished; its failure is said, and undoes nothing."""
+def report_beside(new: Generation) -> None:
+    """Write the page of a state that is being written; its failure is said, and undoes nothing."""
     try:
-        return write_report(Path(folder))
+        _save(_page(new.home, new.path), new.path / PAGE)
     except GraphSlamError as error:
         logger.warning("no report: %s", error)
-        return None

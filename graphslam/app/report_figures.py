@@ -104,7 +104,7 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
 
 def _said(folder: ReportFolder, error: Exception) -> str:
     """An error without the place of the folder: the page may be moved, and says the same wherever it was made."""
-    return " ".join(str(error).replace(f"{folder.path}/", "").split())
+    return " ".join(str(error).replace(f"{folder.path}/", "").replace(f"{folder.home}/", "").split())
 
 
 def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Markup]:

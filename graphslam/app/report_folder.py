@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 import pandas as pd
 
 from graphslam.app.loops import ledger_of_events
+from graphslam.app.metrics import is_time
 from graphslam.app.run_files import (
     read_events,
     read_ledger,
@@ -37,11 +38,15 @@ class ReportFolder:
     Parameters
     ----------
     path : Path
+        Where the files of its present state are.
+    home : Path
+        The folder itself: configuration, submaps.
     kind : {"run", "interrupted", "merged"}
         A finished run, one that has no ``run.json`` yet, or several runs merged.
     """
 
     path: Path
+    home: Path
     kind: Kind
     config: dict[str, Any] = field(default_factory=dict)
     """``config.toml``."""
@@ -90,7 +95,9 @@ class ReportFolder:
     def figures(self) -> list[tuple[str, bytes]]:
         """Name and bytes of every picture, in the order of their names."""
         out = []
-        for file in sorted((self.path / "figures").glob("*.png")):
+        found = {f.name: f for f in (self.home / "figures").glob("progress.png")}  # drawn while the run went on
+        found |= {f.name: f for f in (self.path / "figures").glob("*.png")}
+        for _, file in sorted(found.items()):
             if file.name.startswith("."):
                 continue
             try:
@@ -107,47 +114,49 @@ class ReportFolder:
         return out
 
 
-def read_folder(path: str | Path) -> ReportFolder:
-    """Read what there is.
+def read_folder(path: str | Path, root: Path) -> ReportFolder:
+    """Read what there is, of one state of the folder, whose files are in ``root``.
 
     Raises
     ------
     RunFolderError
         Neither a run folder nor a merged one.
     """
-    root = Path(path)
+    home = Path(path)
     if (root / "merge.json").is_file():
         kind: Kind = "merged"
     elif (root / "run.json").is_file():
         kind = "run"
-    elif (root / "config.toml").is_file():
+    elif (home / "config.toml").is_file():
         kind = "interrupted"
     else:
         raise RunFolderError(
-            f"{root}: no run folder (neither config.toml nor merge.json); give one that run, demo or merge wrote"
+            f"{home}: no run folder (neither config.toml nor merge.json); give one that run, demo or merge wrote"
         )
-    out = ReportFolder(root, kind)
+    out = ReportFolder(root, home, kind)
 
     def attempt(name: str, read: Callable[[], T], otherwise: T) -> T:
         try:
             return read()
         except (GraphSlamError, OSError) as error:
-            known = " ".join(str(error).replace(f"{root}/", "").split())
-            out.problems[name] = known if (root / name).exists() else "is not there"
+            known = " ".join(str(error).replace(f"{root}/", "").replace(f"{home}/", "").split())
+            out.problems[name] = known if (root / name).exists() or (home / name).exists() else "is not there"
             return otherwise
 
     if kind == "merged":
         out.report = attempt("merge.json", lambda: read_merge_report(root), {})
     else:
-        out.config = attempt("config.toml", lambda: _options(root), {})
-        out.submaps = attempt("submaps/index.json", lambda: _index(root), [])
+        out.config = attempt("config.toml", lambda: _options(home), {})
+        out.submaps = attempt("submaps/index.json", lambda: _index(home), [])
     if kind == "run":
         out.report = attempt("run.json", lambda: read_report(root), {})
     if kind == "interrupted":
         for name in ("run.json", "metrics.json", "events.jsonl", "ledger.csv"):
             out.problems[name] = "is not there: it is written when a run is finished"
         return out
-    out.metrics = attempt("metrics.json", lambda: _metrics(root), [])
+    out.metrics = attempt("metrics.json", lambda: _metrics(root, "metrics.json"), [])
+    if not any(is_time(r.get("key")) for r in out.metrics):  # an older version kept them there
+        out.metrics += attempt("timings.json", lambda: _metrics(root, "timings.json"), [])
     out.events = attempt("events.jsonl", lambda: read_events(root), None)
     if out.events is not None:
         events = out.events
@@ -167,9 +176,9 @@ def _options(root: Path) -> dict[str, Any]:
     return read_options(root)
 
 
-def _metrics(root: Path) -> list[dict[str, Any]]:
+def _metrics(root: Path, name: str) -> list[dict[str, Any]]:
     """Rows of the metrics; what is no number has no value."""
-    rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root).to_dict("records")]
+    rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root, name).to_dict("records")]
     return [r if r["value"] == r["value"] else {**r, "value": None} for r in rows]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,8 @@ import pandas as pd
 
 from graphslam.app.config import dump_toml
 from graphslam.app.markup import compact, folded, missing, note, section
+from graphslam.app.metrics import is_time
+from graphslam.app.outputs import RESUMED
 from graphslam.app.report_folder import ReportFolder
 from graphslam.app.report_verdict import figures_of, stopped
 from graphslam.app.verdict import CONFIDENCE, class_rows
@@ -22,7 +23,6 @@ BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is
 ROUTINE = frozenset(
     {"submap", "attitude", "between", "loop", "match-not-used", "hypothesis", "hypothesis-chosen"}
 )  # told elsewhere in the page, or once a submap
-_TIMES = re.compile(r"^seconds_|_seconds$|^times_real_time$|^frontend_ms_per_scan$|^frontend_last_to_first_quarter$")
 _UNFINISHED = "the run was not finished."
 
 
@@ -89,7 +89,7 @@ def _use(stream: str, ledger: pd.DataFrame | None) -> str:
 
 def metrics(folder: ReportFolder) -> Markup:
     """Every figure but times, with its unit, which way is better, and bounds where it has some."""
-    rows = [r for r in folder.metrics if not _TIMES.search(str(r.get("key")))]
+    rows = [r for r in folder.metrics if not is_time(r.get("key")) and r.get("key") != RESUMED]
     if not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
         return section("metrics", "Metrics", missing("metrics; ", said))
@@ -136,18 +136,21 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
 
 def times(folder: ReportFolder) -> Markup:
     """Seconds of each stage: the one part of the page that differs when the same run is made again."""
-    seconds = folder.part("seconds")
-    if not seconds and is_figure(folder.report.get("seconds")):
+    timed = [r for r in folder.metrics if is_time(r.get("key"))]
+    seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
+    seconds = seconds or folder.part("seconds")
+    if not seconds and is_figure(folder.report.get("seconds")):  # of a merge by an older version
         seconds = {"merge": folder.report["seconds"]}
-    rows = [r for r in folder.metrics if _TIMES.search(str(r.get("key"))) and not str(r["key"]).startswith("seconds_")]
+    rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else "the folder does not say."
         return section("times", "Times", missing("seconds of the stages; ", said))
     parts: list[Any] = [table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
     if rows:
         parts.append(table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
-    if folder.report.get("resumed_submaps"):
-        parts.append(note(f"{folder.report['resumed_submaps']} submaps were there already: the run was resumed."))
+    resumed = folder.values().get(RESUMED, folder.report.get(RESUMED))
+    if is_figure(resumed) and resumed:
+        parts.append(note(f"{resumed:.0f} submaps were there already: the run was resumed."))
     return section("times", "Times", *parts)
 
 

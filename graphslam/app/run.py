@@ -23,6 +23,7 @@ from graphslam.evaluate.gps import GpsResiduals
 
 if TYPE_CHECKING:
     from graphslam.app.run_maps import RunMap
+    from graphslam.app.taken import Taken
     from graphslam.app.without_truth import WithoutTruth
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.solution import Solution
@@ -90,7 +91,7 @@ class Run:
     metrics : DataFrame
         ``key, value, unit, direction``.
     report : dict
-        ``run.json``: versions, seed, times, counts of records read, used and dropped.
+        ``run.json``: versions, seed, counts of records read, used and dropped; and the seconds of ``timings.json``.
     events : list of dict
     ledger : DataFrame or None
         Which factor spent which stream when.
@@ -100,6 +101,8 @@ class Run:
         What of GPS became factors.
     folder : Path or None
     log : SensorLog or None
+    taken : Taken or None
+        What of the log the graph and the figures were made of; None for a run read back from disk.
     truth : MapTruth or None
         Ends of the submaps and landmarks.
     truth_path, dead_reckoning : Trajectory or None
@@ -123,6 +126,7 @@ class Run:
     fixes: Gps | None = None
     folder: Path | None = None
     log: SensorLog | None = None
+    taken: Taken | None = None
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
     dead_reckoning: Trajectory | None = None

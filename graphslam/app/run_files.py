@@ -16,18 +16,21 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.config import read_toml
+from graphslam.app.generations import check_same
 from graphslam.app.run import GlobalMap
 from graphslam.core.atomic import read_json, read_npz
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.core.geometry import Array
 from graphslam.core.json_file import check_json, parse_json, read_json_lines
-from graphslam.core.npz import Field, floats, ints, texts
+from graphslam.core.npz import Field, floats, ints, read_arrays, texts
 from graphslam.core.reading import LARGEST, read_text
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 from graphslam.graph.loop_ledger import EVENT
 
+GENERATION_EVENT = "generation"
+"""First line of ``events.jsonl``: which state of the folder it is of."""
 RUN_FORMAT = "graphslam.run/1"
 MERGE_FORMAT = "graphslam.merge/1"
 MAP_FORMAT = "graphslam.map/1"
@@ -248,14 +251,15 @@ def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
     return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
 
 
-def read_metrics(root: Path) -> pd.DataFrame:
-    """``metrics.json`` as a table ``key, value, unit, direction``; a value that was not a number is NaN.
+def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
+    """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a value that was
+    not a number is NaN.
 
     Raises
     ------
     MissingDataError, FormatError
     """
-    file = root / "metrics.json"
+    file = root / name
     rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
     table = pd.DataFrame(rows, columns=["key", "value", "unit", "direction"])
     table["value"] = [np.nan if r.get("value") is None else float(r["value"]) for r in rows]
@@ -264,8 +268,8 @@ def read_metrics(root: Path) -> pd.DataFrame:
     return table
 
 
-def read_events(root: str | Path) -> list[dict[str, Any]]:
-    """``events.jsonl`` of a run folder.
+def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dict[str, Any]]:
+    """``events.jsonl`` of the files of a run; ``home`` is the folder that errors name.
 
     Raises
     ------
@@ -276,7 +280,7 @@ def read_events(root: str | Path) -> list[dict[str, Any]]:
     """
     file = Path(root) / "events.jsonl"
     if not file.is_file():
-        raise RunFolderError(f"{root}: has no events.jsonl; give a folder of a finished run")
+        raise RunFolderError(f"{home or root}: has no events.jsonl; give a folder of a finished run")
     events = read_json_lines(file)
     for number, event in enumerate(events, start=1):
         where = f"{file}, line {number}"
@@ -284,7 +288,32 @@ def read_events(root: str | Path) -> list[dict[str, Any]]:
         check_json(event, EVENTS.get(event["event"], {}), where)
         if event["event"] == EVENT:
             _check_decision(event, where)
-    return events
+    return events[1:] if events and events[0]["event"] == GENERATION_EVENT else events
+
+
+def check_state(root: Path) -> None:
+    """Hold the ids of generations in plain files of a run against each other; files of older versions have none.
+
+    Raises
+    ------
+    FormatError
+        Names two files that are not of one state.
+    """
+    known = read_report(root).get("generation")
+    for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "taken.npz")):
+        if file.is_file():
+            check_same((root / "run.json", known), (file, generation_of(read_arrays(file))))
+    for file in sorted(root.glob("gps_*.npz")):
+        check_same((root / "run.json", known), (file, generation_of(read_arrays(file))))
+    if (root / "events.jsonl").is_file():
+        first = next(iter(read_json_lines(root / "events.jsonl")), {})
+        found = first.get("generation") if first.get("event") == GENERATION_EVENT else None
+        check_same((root / "run.json", known), (root / "events.jsonl", found))
+
+
+def generation_of(arrays: Mapping[str, Any]) -> str | None:
+    """Id of the generation in a file's arrays; None in files of older versions."""
+    return str(arrays["generation"]) if "generation" in arrays else None
 
 
 def _check_decision(event: Mapping[str, Any], where: str) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from graphslam.app.config import MapConfig
 from graphslam.app.metrics import Metrics
+from graphslam.app.output_files import OutputFiles
 from graphslam.app.run import GlobalMap, Run
 from graphslam.app.run_files import read_options
 from graphslam.core.errors import DataError, MissingDataError
@@ -83,7 +84,6 @@ class RunMap:
             "level_nodes": self.divided.level_nodes,
             "bands": {name: list(band) for name, band in self.bands.items()},
             "bytes": f.nbytes,
-            "seconds": {"divide": self.divide_s, "fuse": self.fuse_s, "move": self.move_s},
         }
 
     def metrics(self, out: Metrics) -> None:
@@ -187,13 +187,11 @@ def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, f
     return {f"level{k}": (z + config.low, z + config.high) for k, z in enumerate(heights)}
 
 
-def write_run_map(folder: Path, run_map: RunMap) -> list[Path]:
-    """Write ``map.ply``, ``map.bt``, floor plans and ``fused_map.json``; returns the files."""
-    from graphslam.app.run_folder import RunFolder
-
-    made = save_maps(run_map.fused.grid, folder, bands=run_map.bands)
-    RunFolder(folder).write_json("fused_map.json", run_map.facts())
-    return [*made, folder / "fused_map.json"]
+def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None = None) -> list[Path]:
+    """Write ``map.ply``, ``map.bt``, floor plans and ``fused_map.json``, of that generation; returns the files."""
+    made = save_maps(run_map.fused.grid, folder.path, bands=run_map.bands)
+    folder.write_json("fused_map.json", {**run_map.facts(), "generation": generation})
+    return [*made, folder.path / "fused_map.json"]
 
 
 def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str) -> list[Path]:

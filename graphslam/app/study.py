@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
+from graphslam.app.generations import new_generation
 from graphslam.app.studies import STUDIES
 from graphslam.app.study_definition import StudyDefinition, find_study, fingerprint, source_digest
 from graphslam.app.study_folder import StudyFolder
@@ -21,7 +22,7 @@ from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import heeded_interrupts
 from graphslam.core.markup import element, frame, join, table
 from graphslam.evaluate.executors import Executor, Job, execute
-from graphslam.evaluate.montecarlo import check_measurements, trial_seed
+from graphslam.evaluate.montecarlo import Measurement, check_measurements, trial_seed
 
 logger = logging.getLogger(__name__)
 
@@ -201,7 +202,6 @@ def study(
         raise ConfigError(f"{count} trials; wanted at least 1")
     if cluster is not None and workers is not None:
         raise ConfigError("either workers or a cluster, not both: the cluster has workers of its own")
-    executor: Executor = "dask" if cluster else "serial" if workers is None else "processes"
     functions = {w: definition.trial(w, quick) for w in known}
     identity = {
         "name": name,
@@ -210,10 +210,25 @@ def study(
         "worlds": {w: fingerprint(f) for w, f in functions.items()},
         "versions": {k: v for k, v in versions().items() if k not in _NOT_COMPUTING},
     }
-    folder = StudyFolder.start(out if out is not None else f"study-{definition.name}", identity)
+    with StudyFolder.start(out if out is not None else f"study-{definition.name}", identity) as folder:
+        # run by run through all worlds, so that a study that is stopped has as many runs of each
+        wanted = [(w, k) for k in range(count) for w in chosen]
+        return _run(definition, folder, functions, wanted, seed, workers, cluster, progress)
+
+
+def _run(
+    definition: StudyDefinition,
+    folder: StudyFolder,
+    functions: Mapping[str, Callable[[int], Iterable[Measurement]]],
+    wanted: Sequence[tuple[str, int]],
+    seed: int,
+    workers: int | None,
+    cluster: str | None,
+    progress: bool,
+) -> Study:
+    """Run the trials ``(world, number)`` that are not in the folder yet, and write what follows from all of them."""
+    executor: Executor = "dask" if cluster else "serial" if workers is None else "processes"
     there, source = folder.finished(), source_digest()
-    # run by run through all worlds, so that a study that is stopped has as many runs of each
-    wanted = [(w, k) for k in range(count) for w in chosen]
     jobs = {
         f"{w}/{k}": (w, k, Job(f"{w}/{k}", functions[w], trial_seed(seed, k)))
         for w, k in wanted
@@ -278,36 +293,38 @@ def open_study(folder: str | Path, definition: StudyDefinition | str | None = No
 
 
 def write_results(result: Study, *, figures: bool = True) -> list[Path]:
-    """Write ``table.csv``, ``timings.csv``, ``report.md`` and ``figures/``; paths of the figures.
+    """Write ``table.csv``, ``timings.csv``, ``report.md`` and ``figures/`` as a new state; paths of the figures.
 
-    The tables are written first: whatever a report or figure cannot say with so few runs, no trial is lost.
+    Whatever a report or figure cannot say with so few runs, no trial is lost: the trials are there.
     """
     folder = result.folder
-    folder.write_table("table.csv", result.table)
-    folder.write_table("timings.csv", result.timings)
     made: list[Path] = []
     tables: dict[str, pd.DataFrame] = {}
     problems = []
     if len(result.sources) > 1:
         problems.append(f"the code was changed between trials: they were run by {len(result.sources)} versions of it")
-    if len(result.table):
-        try:
-            tables = result.report()
-        except GraphSlamError as error:
-            problems.append(f"no tables: {error}")
-        if figures:
+    with new_generation(folder.path) as new:
+        new.write_table("table.csv", result.table)
+        new.write_table("timings.csv", result.timings)
+        if len(result.table):
             try:
-                made = list(result.definition.figures(result.table, result.timings, folder.figures))
+                tables = result.report()
             except GraphSlamError as error:
-                problems.append(f"no figures: {error}")
-    for problem in problems:
-        logger.warning("%s: %s", result.definition.name, problem)
-    folder.write_text("report.md", _report(result, tables, made, problems))
-    return made
+                problems.append(f"no tables: {error}")
+            if figures:
+                try:
+                    made = list(result.definition.figures(result.table, result.timings, new.figures))
+                except GraphSlamError as error:
+                    problems.append(f"no figures: {error}")
+        for problem in problems:
+            logger.warning("%s: %s", result.definition.name, problem)
+        made = [p.relative_to(new.path) for p in made]
+        new.write_text("report.md", _report(result, tables, made, problems))
+    return [folder.path / p for p in made]
 
 
 def _report(result: Study, tables: dict[str, pd.DataFrame], figures: list[Path], problems: list[str]) -> str:
-    """The report as Markdown."""
+    """The report as Markdown; ``figures`` as they lie in the folder."""
     d, identity = result.definition, result.identity
     counts = pd.DataFrame(
         [(w, n, int((result.failures["world"] == w).sum())) for w, n in result.runs.items()],
@@ -327,7 +344,7 @@ def _report(result: Study, tables: dict[str, pd.DataFrame], figures: list[Path],
     for title, found in tables.items():
         parts += [f"## {title}", markdown_table(found)]
     if figures:
-        parts += ["## Figures", *[f"![{p.stem}]({p.relative_to(result.folder.path).as_posix()})" for p in figures]]
+        parts += ["## Figures", *[f"![{p.stem}]({p.as_posix()})" for p in figures]]
     return "\n\n".join(parts) + "\n"
 
 

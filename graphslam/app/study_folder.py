@@ -2,7 +2,8 @@
 
 ``study.json``, ``trials/<world>/000012.npz``, ``table.csv``, ``timings.csv``, ``report.md``, ``figures/``. The folder
 only grows: the tables hold every finished trial in it, whichever call made it, so they do not depend on how often the
-study was stopped, nor on what ran the trials.
+study was stopped, nor on what ran the trials. Tables, report and figures are one state, replaced as a whole
+(:mod:`graphslam.app.generations`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import logging
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.app.run_folder import make_folder, sweep
-from graphslam.core.atomic import atomic_open, read_json, read_npz, write_json, write_npz
+from graphslam.app.folder_lock import locked, make_folder
+from graphslam.app.generations import is_empty, sweep
+from graphslam.core.atomic import read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.npz import flags, floats, ints, texts
 from graphslam.evaluate.montecarlo import Measurement
@@ -38,6 +41,9 @@ _TRIAL = {
     "value": floats("n", finite=False),
     "timing": flags("n"),
 }
+SAME_BYTES = ("study.json", "table.csv")
+"""Files of a study that are the same bytes however often it was stopped; trials, timings and what is made of them hold
+times."""
 TABLE_COLUMNS = ("world", "run", "algorithm", "submap", "quantity", "value")
 
 
@@ -101,8 +107,9 @@ class StudyFolder:
         self.path = Path(path)
 
     @classmethod
-    def start(cls, path: str | os.PathLike[str], identity: Mapping[str, Any]) -> StudyFolder:
-        """Make a new folder, or go on with one of the same study.
+    @contextmanager
+    def start(cls, path: str | os.PathLike[str], identity: Mapping[str, Any]) -> Iterator[StudyFolder]:
+        """Make a new folder, or go on with one of the same study; no other process writes into it until the block ends.
 
         Parameters
         ----------
@@ -113,20 +120,24 @@ class StudyFolder:
         Raises
         ------
         RunFolderError
-            The folder holds something else or another study, or cannot be made.
+            The folder holds something else or another study, cannot be made, or is being written by another process.
         FormatError
             Its ``study.json`` is damaged.
         """
         folder = cls(path)
         make_folder(folder.path)
-        sweep(folder.path)
-        if (folder.path / "study.json").is_file():
-            folder._check_same(identity)
-        elif any(folder.path.iterdir()):
+        marker = folder.path / "study.json"
+        if not marker.is_file() and not is_empty(folder.path):  # before a lock is put there
             raise RunFolderError(f"{folder.path}: not empty and not a study; choose another --out")
-        else:
-            write_json(folder.path / "study.json", {"format": STUDY_FORMAT, **identity})
-        return folder
+        with locked(folder.path):
+            if marker.is_file():
+                folder._check_same(identity)
+            else:
+                write_json(marker, {"format": STUDY_FORMAT, **identity})
+            sweep(folder.path)
+            for trials in (folder.path / "trials").glob("*"):
+                sweep_parts(trials)
+            yield folder
 
     def identity(self) -> dict[str, Any]:
         """What the folder's ``study.json`` says.
@@ -258,23 +269,6 @@ class StudyFolder:
             failures=pd.DataFrame(failures, columns=["world", "run", "seed", "error"]),
             sources=frozenset(sources),
         )
-
-    def write_table(self, name: str, table: pd.DataFrame) -> None:
-        """Write a table as CSV: the shortest digits that read back as the same number, with pandas' ``round_trip``."""
-        with atomic_open(self.path / name, "w") as stream:
-            table.to_csv(stream, index=False, na_rep="nan", lineterminator="\n")
-
-    def write_text(self, name: str, text: str) -> None:
-        """Write a text file atomically."""
-        with atomic_open(self.path / name, "w") as stream:
-            stream.write(text)
-
-    @property
-    def figures(self) -> Path:
-        """Folder for PNG files, made when asked for."""
-        folder = self.path / "figures"
-        folder.mkdir(exist_ok=True)
-        return folder
 
 
 def _tidy(frames: list[pd.DataFrame]) -> pd.DataFrame:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.app.generations import consistent
 from graphslam.app.outputs import identified_submaps
 from graphslam.app.run import Run
 from graphslam.app.run_files import read_options
@@ -69,9 +70,12 @@ def submap_source(source: Run | SubmapSource | str | Path | Sequence[Submap]) ->
     if (path / "submaps").is_dir() or (path / "index.json").is_file():
         root = path if (path / "submaps").is_dir() else path.parent
         scale, identities = _run_facts(root)
-        truth = read_truth(root)
-        where = root if (root / "association.npz").is_file() else path
-        return SubmapSource(identified_submaps(where), truth if identities != "run" else poses_only(truth), scale)
+
+        def read(files: Path) -> tuple[MapTruth | None, list[Submap]]:
+            return read_truth(files), identified_submaps(root if (files / "association.npz").is_file() else path)
+
+        truth, submaps = consistent(root, read)
+        return SubmapSource(submaps, truth if identities != "run" else poses_only(truth), scale)
     loaded: Any = load(source)
     if not (isinstance(loaded, list) and loaded and isinstance(loaded[0], Submap)):
         raise MissingDataError(

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from graphslam.app.run_folder import finite
+from graphslam.app.output_files import finite
 from graphslam.core.findings import Finding, headline
 
 

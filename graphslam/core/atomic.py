@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,41 @@ from graphslam.core.json_file import check_json, parse_json
 from graphslam.core.npz import Field, check_arrays, read_arrays
 from graphslam.core.reading import read_text
 
+_PART = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.[a-z]+)?")
+
+
+def part_path(target: Path, ending: str = "") -> Path:
+    """A temporary name beside ``target`` that nobody else has; ``ending`` is for writers that look at it (``.npz``)."""
+    return target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.part{ending}")
+
+
+def is_part(name: str) -> bool:
+    """Is it a name that :func:`part_path` gives?"""
+    return _PART.fullmatch(name) is not None
+
+
+def sweep_parts(folder: str | os.PathLike[str]) -> None:
+    """Remove the halves of files that a killed process left directly in a folder.
+
+    The caller knows that the folder is ours and that nobody else is writing into it.
+    """
+    if Path(folder).is_dir():
+        for path in Path(folder).iterdir():
+            if is_part(path.name) and (path.is_symlink() or path.is_file()):
+                path.unlink(missing_ok=True)
+
+
+def sync(path: str | os.PathLike[str]) -> None:
+    """Ask the system to bring a file, or the names in a folder, to the disk."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:  # a folder, on systems that cannot open one
+        return
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
 
 @contextmanager
 def atomic_open(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
@@ -27,7 +63,7 @@ def atomic_open(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -
     A reader, or a run that was killed, sees the old file or the new one, never half of one.
     """
     target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    temporary = part_path(target)
     text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
     try:
         with open(temporary, mode, **text) as stream:  # type: ignore[call-overload]

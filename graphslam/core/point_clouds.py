@@ -32,6 +32,10 @@ class CloudSource(Protocol):
         """Points ``(m, 3)`` of scan ``k`` [m], sensor frame, all finite; m may be less than ``counts[k]``."""
         ...
 
+    def packed(self) -> bytes:
+        """Bytes that tell these points from others, without decoding them."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class ArrayClouds:
@@ -71,6 +75,10 @@ class ArrayClouds:
     def cloud(self, k: int) -> Array:
         """See :class:`CloudSource`."""
         return self.points[self.offsets[k] : self.offsets[k + 1]]
+
+    def packed(self) -> bytes:
+        """See :class:`CloudSource`."""
+        return self.points.tobytes()
 
 
 def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:

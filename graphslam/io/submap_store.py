@@ -11,12 +11,13 @@ from __future__ import annotations
 import itertools
 import logging
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
+from graphslam.core.atomic import part_path, read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.npz import check_arrays, floats, ints
@@ -29,6 +30,8 @@ logger = logging.getLogger(__name__)
 INDEX_FORMAT = "graphslam.submaps/1"
 INDEX = "index.json"
 TRUTH = "truth.npz"
+
+_NAME = re.compile(r"\d{6,}(\.grid)?\.npz")
 
 GridLoader = Callable[[Path], DensePayload]
 
@@ -113,7 +116,7 @@ class SubmapStore:
         file = self.path / entry["file"]
         if submap.grid is not None:
             final = file.with_suffix(".grid.npz")
-            temporary = final.with_name(f".{final.stem}.part.npz")
+            temporary = part_path(final, ".npz")
             submap.grid.save(temporary)
             temporary.replace(final)
         write_npz(file, submap_arrays(submap))
@@ -134,15 +137,19 @@ class SubmapStore:
         return whole
 
     def truncate(self, count: int) -> None:
-        """Forget all but the first ``count`` submaps, and remove what else lies in the folder from a killed run."""
+        """Forget all but the first ``count`` submaps, and remove what else lies in the folder from a killed run.
+
+        The index goes first: after a kill it names submaps that are all there.
+        """
         kept = self.entries[:count]
         if not self.path.is_dir():
             return
         if len(kept) < len(self.entries):
             self._write_index(kept, self._dim())
         names = {e["file"] for e in kept} | {e["file"].replace(".npz", ".grid.npz") for e in kept}
-        for stray in [*self.path.glob("*.npz"), *self.path.glob(".*.part"), *self.path.glob(".*.part.npz")]:
-            if stray.name not in names:
+        sweep_parts(self.path)
+        for stray in self.path.glob("*.npz"):
+            if stray.name not in names and _NAME.fullmatch(stray.name):
                 stray.unlink(missing_ok=True)
 
     def _dim(self) -> int:

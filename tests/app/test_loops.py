@@ -14,7 +14,7 @@ from graphslam.app.back_end import BackEnd
 from graphslam.app.cli import app
 from graphslam.app.config import BackEndConfig
 from graphslam.app.loops import ledger_of_events, loops_of_run, undo_loop
-from graphslam.app.run_folder import RunFolder
+from graphslam.app.output_files import OutputFiles
 from graphslam.core import se3
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.core.submap import Match, Submap
@@ -141,7 +141,7 @@ def test_submaps_without_maps_cannot_be_searched() -> None:
 @pytest.fixture
 def folder(finished: tuple, tmp_path: Path) -> Path:
     back = finished[0]
-    RunFolder(tmp_path).write_lines("events.jsonl", back.graph.events)
+    OutputFiles(tmp_path).write_lines("events.jsonl", back.graph.events)
     return tmp_path
 
 
@@ -171,14 +171,14 @@ def test_front_ends_matches_are_listed_too(tmp_path: Path) -> None:
     back = BackEnd(BackEndConfig(), "batch")
     for x in (*submaps[:2], replace(s, matches=matches)):
         back.add(x)
-    RunFolder(tmp_path).write_lines("events.jsonl", back.graph.events)
+    OutputFiles(tmp_path).write_lines("events.jsonl", back.graph.events)
     taken, left = loops_of_run(tmp_path).current()
     assert (taken.verdict, taken.source, taken.why, taken.submap_i, taken.submap_j) == (
         "accepted", "front-end", "support 0.90", 0, 2,
     )  # fmt: skip
     assert (left.verdict, left.why, left.factor_id) == ("rejected", "support 0.10 is too little", -1)
     back.graph.remove(taken.factor_id, reason="wrong")
-    RunFolder(tmp_path).write_lines("events.jsonl", back.graph.events)
+    OutputFiles(tmp_path).write_lines("events.jsonl", back.graph.events)
     assert loops_of_run(tmp_path).current()[0].verdict == "undone"
 
 

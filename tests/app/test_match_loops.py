@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from graphslam.app import loops as app_loops
+from graphslam.app import pipeline
 from graphslam.app.back_end import BackEnd
 from graphslam.app.config import BackEndConfig
 from graphslam.app.loops import ledger_of_events
@@ -79,7 +80,7 @@ def test_a_match_is_undone_with_its_ties(
     asked: list[Decision] = []
     monkeypatch.setattr(app_loops, "loops_of_run", lambda folder: ledger_of_events(back.graph.events))
     monkeypatch.setattr(app_loops, "undone_of_run", lambda folder: undone)
-    monkeypatch.setattr(app_loops, "_without", lambda folder, gone, source, progress: asked.extend(gone))
+    monkeypatch.setattr(pipeline, "again", lambda folder, gone, progress: asked.extend(gone))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
     tie = next(d.loop for d in undone if d.source == "tie")

@@ -20,7 +20,8 @@ from graphslam.io.tum import read_tum
 FILES = {
     *("config.toml", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "nodes.tum", "trajectory.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("submaps", "figures", "gps_all.npz", "report.html"),
+    *("submaps", "figures", "gps_all.npz", "report.html", "timings.json", "taken.npz", "inputs"),
+    *("generations", "current", ".lock"),
 }
 
 
@@ -53,6 +54,15 @@ def test_run_folder_is_complete(result):
     assert config["frontend"]["particles"] == 100
     rows = json.loads((result.folder / "metrics.json").read_text())
     assert {"key", "value", "unit", "direction"} == set(rows[0])
+    timings = json.loads((result.folder / "timings.json").read_text())
+    assert {"key", "value", "unit", "direction"} == set(timings[0])
+    keys = {r["key"] for r in timings}
+    assert {"seconds_total", "times_real_time", "resumed_submaps"} <= keys
+    assert not keys & {r["key"] for r in rows}
+    assert not {"seconds", "resumed_submaps"} & set(report)
+    again = gs.open_run(result.folder)
+    assert set(again.metrics["key"]) == set(result.metrics["key"])
+    assert again.report["seconds"]["total"] == again.metric("seconds_total") > 0
 
 
 def test_map_is_accurate_and_honest_on_this_world(result):
@@ -112,7 +122,7 @@ def test_resume_after_any_submap_gives_the_same_run(log, result, tmp_path):
         index = json.loads((out / "submaps" / "index.json").read_text())
         index["submaps"], index["count"] = index["submaps"][:keep], keep
         (out / "submaps" / "index.json").write_text(json.dumps(index))
-        (out / "submaps" / ".000009.npz.1-ab.part").write_bytes(b"half a file")
+        (out / "submaps" / ".000009.npz.1-0123abcd.part").write_bytes(b"half a file")
         again = gs.run(log, seed=5, out=out, resume=True, progress=False)
         assert submap_bytes(out) == submap_bytes(result.folder)
         assert again.report["resumed_submaps"] == keep

@@ -283,7 +283,7 @@ def test_the_command_line(copy: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert said.exit_code == 0, said.output
     assert str(copy / PAGE) in said.stdout
     assert (copy / PAGE).read_bytes() == before
-    (copy / "ledger.csv").unlink()
+    (copy / "current" / "ledger.csv").unlink()
     out = tmp_path / "page.html"
     told = json.loads(CliRunner().invoke(app, ["report", str(copy), "--out", str(out), "--json"]).stdout)
     assert told["page"] == str(out)

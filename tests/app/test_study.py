@@ -249,13 +249,17 @@ def test_a_folder_refuses_another_study(serial: Study, change: dict, says: str) 
 
 def test_a_changed_configuration_or_library_is_refused(serial: Study, tmp_path: Path) -> None:
     identity = serial.identity
-    StudyFolder.start(tmp_path, identity)
-    StudyFolder.start(tmp_path, identity)
+    for _ in range(2):
+        with StudyFolder.start(tmp_path, identity):
+            pass
     other = fingerprint(small_study.LONGER.trial("near", False))
-    with pytest.raises(RunFolderError, match=r"worlds\.near was"):
-        StudyFolder.start(tmp_path, {**identity, "worlds": {**identity["worlds"], "near": other}})
-    with pytest.raises(RunFolderError, match=r"versions\.numpy was '[\d.]+' and is '0.1'"):
-        StudyFolder.start(tmp_path, {**identity, "versions": {**identity["versions"], "numpy": "0.1"}})
+    changed = {**identity, "worlds": {**identity["worlds"], "near": other}}
+    with pytest.raises(RunFolderError, match=r"worlds\.near was"), StudyFolder.start(tmp_path, changed):
+        pass
+    changed = {**identity, "versions": {**identity["versions"], "numpy": "0.1"}}
+    says = r"versions\.numpy was '[\d.]+' and is '0.1'"
+    with pytest.raises(RunFolderError, match=says), StudyFolder.start(tmp_path, changed):
+        pass
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
@@ -309,7 +313,8 @@ def test_fingerprints_follow_the_configuration_and_nothing_else() -> None:
 
 
 def test_trial_files_hold_no_pickles_and_keep_odd_numbers(tmp_path: Path) -> None:
-    folder = StudyFolder.start(tmp_path, {"name": "x"})
+    with StudyFolder.start(tmp_path, {"name": "x"}) as folder:
+        pass
     odd = [np.nan, np.inf, -np.inf, 5e-324, -0.0, 1e308, 0.1 + 0.2]
     folder.write_trial("w", 3, 2**62 + 1, [Measurement("α", "q", v, k) for k, v in enumerate(odd)])
     with np.load(folder.trial_path("w", 3), allow_pickle=False) as arrays:

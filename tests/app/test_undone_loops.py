@@ -15,7 +15,6 @@ from graphslam.app.pipeline import run
 from graphslam.app.run import Run
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
-from graphslam.io.log_store import save_log
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -35,15 +34,14 @@ def go_on(log: SensorLog, folder: Path, *, resume: bool = True) -> Run:
 
 
 def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp_path: Path) -> None:
-    folder, source = tmp_path / "run", tmp_path / "log"
-    save_log(log, source)
+    folder = tmp_path / "run"
     whole = go_on(log, folder, resume=False)
     (loop,) = [d for d in loops_of_run(folder).current() if d.verdict == "accepted"]
     assert undone_of_run(folder) == []
     with pytest.raises(DataError, match="was not undone"):
-        redo_loop(folder, loop.loop, source=source, progress=False)
+        redo_loop(folder, loop.loop, progress=False)
 
-    undo_loop(folder, loop.loop, source=source, progress=False)
+    undo_loop(folder, loop.loop, progress=False)
     without = open_run(folder).map.node_poses
     assert np.abs(without - whole.map.node_poses).max() > 1e-3
     for _ in range(2):  # and again when what was resumed is resumed
@@ -56,7 +54,7 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
         np.testing.assert_allclose(resumed.map.node_poses, without, atol=1e-9)
         assert any(e["event"] == "removed" and e["reason"] == "undone" for e in resumed.events)
 
-    redo_loop(folder, undone.loop, source=source, progress=False)
+    redo_loop(folder, undone.loop, progress=False)
     assert undone_of_run(folder) == []
     np.testing.assert_allclose(open_run(folder).map.node_poses, whole.map.node_poses, atol=1e-9)
 

@@ -1,0 +1,99 @@
+"""One writer at a time: a folder held against other processes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from graphslam.core.errors import RunFolderError
+
+try:
+    import fcntl
+except ImportError:  # not of this system: there two writers are not kept apart
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".lock"
+_HEAD = "graphslam: this folder is written by process"
+_guard = threading.Lock()
+_held: dict[str, int] = {}
+
+
+def make_folder(folder: str | os.PathLike[str]) -> Path:
+    """Make a folder and those above it, unless it is there.
+
+    Raises
+    ------
+    RunFolderError
+        It cannot be made.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"{path}: cannot be made ({error.strerror})") from None
+    return path
+
+
+@contextmanager
+def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold a folder against other processes that would write into it; made if missing.
+
+    The system gives the lock back when a process ends, however it ends. A thread may lock a folder again that it holds.
+
+    Raises
+    ------
+    RunFolderError
+        Another process, or another thread of this one, is writing into it; or it cannot be made.
+    """
+    home = make_folder(folder)
+    real = os.path.realpath(home)
+    me = threading.get_ident()
+    with _guard:
+        if real in _held:
+            if _held[real] != me:
+                raise RunFolderError(f"{home}: process {os.getpid()}, this one, is writing into it in another thread")
+            handle = None
+        else:
+            handle = _take(home)
+            _held[real] = me
+    try:
+        yield
+    finally:
+        if handle is not None:
+            with _guard:
+                del _held[real]
+                handle.close()
+
+
+def _take(home: Path) -> Any:
+    try:
+        handle = os.fdopen(os.open(home / LOCK, os.O_RDWR | os.O_CREAT, 0o666), "r+", encoding="utf-8")
+    except OSError as error:
+        raise RunFolderError(f"{home}: cannot be written ({error.strerror})") from None
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lines = handle.read().splitlines()
+        handle.close()
+        said = lines[0].removeprefix(_HEAD).strip() if lines else "unknown"
+        raise RunFolderError(f"{home}: process {said} is writing into it; wait until it has ended") from None
+    except OSError:  # a file system without locks
+        pass
+    handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")  # never empty again: is_empty() reads it
+    handle.truncate()
+    handle.flush()
+    return handle
+
+
+def is_lock(file: Path) -> bool:
+    """Is it a file that :func:`locked` made?"""
+    with contextlib.suppress(OSError), open(file, "rb") as stream:
+        return stream.read(len(_HEAD)) == _HEAD.encode()
+    return False

@@ -1,0 +1,70 @@
+"""Files that a verb writes, each whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from graphslam.core.atomic import atomic_open
+
+
+class OutputFiles:
+    """Writes files of a folder, each whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    @property
+    def figures(self) -> Path:
+        """Folder for PNG files, made when asked for."""
+        folder = self.path / "figures"
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write a JSON file; not-a-number becomes null."""
+        with atomic_open(self.path / name, "w") as stream:
+            stream.write(json.dumps(finite(value), indent=1, allow_nan=False) + "\n")
+
+    def write_lines(self, name: str, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Write JSON lines."""
+        with atomic_open(self.path / name, "w") as stream:
+            stream.write(json_lines(rows))
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file."""
+        with atomic_open(self.path / name, "w") as stream:
+            stream.write(text)
+
+    def write_table(self, name: str, table: pd.DataFrame) -> None:
+        """Write a table as CSV: the shortest digits that read back as the same number, with pandas' ``round_trip``."""
+        with atomic_open(self.path / name, "w") as stream:
+            table.to_csv(stream, index=False, na_rep="nan", lineterminator="\n")
+
+
+def finite(value: Any) -> Any:
+    """The value with NumPy scalars as Python numbers and non-finite numbers as None (JSON has none)."""
+    if isinstance(value, Mapping):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    if hasattr(value, "tolist"):
+        return finite(value.tolist())
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value
+
+
+def json_lines(rows: Iterable[Mapping[str, Any]]) -> str:
+    """One JSON object a line."""
+    return "".join(json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)

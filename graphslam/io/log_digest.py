@@ -1,0 +1,71 @@
+"""Digest of what a log holds, stream by stream: tells two logs of one name apart."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.digest import Digest
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.io.log_kinds import KINDS
+
+META = ("T_world_frame",)
+"""Of a log's ``meta``, what figures are computed with."""
+
+
+def log_digest(log: SensorLog) -> dict[str, str]:
+    """One line a stream: its records and a digest of all its arrays, mounting and noise included; and of the truth.
+
+    Nothing is decoded: a lidar stream whose points are still packed is told by its packed bytes, so that the same scans
+    in memory have another digest. Counts of records and the rest of ``meta`` do not matter.
+
+    Parameters
+    ----------
+    log : SensorLog
+
+    Returns
+    -------
+    dict of str to str
+        ``{"controls": "7249 records, blake2b 0123…", …}``; ``truth`` and ``meta`` where there are any.
+    """
+    out = {}
+    for name, stream in log.streams.items():
+        d = Digest()
+        d.add("kind", type(stream).__name__)
+        d.add_all(_arrays(stream))
+        out[name] = f"{len(stream.times)} records, blake2b {d.text()}"
+    if log.truth is not None:
+        d, t = Digest(), log.truth
+        path = {f.name: getattr(t.trajectory, f.name) for f in dataclasses.fields(t.trajectory)}
+        d.add_all({**path, "landmark_ids": t.landmark_ids, "landmarks": t.landmarks})
+        out["(truth)"] = f"{len(t.trajectory.times)} records, blake2b {d.text()}"
+    known = {k: np.asarray(log.meta[k], dtype=np.float64) for k in META if k in log.meta}
+    if known:
+        d = Digest()
+        d.add_all(known)
+        out["(meta)"] = f"blake2b {d.text()}"
+    return out
+
+
+def _arrays(stream: Any) -> dict[str, Any]:
+    if isinstance(stream, PointClouds):
+        own = {"times": stream.times, "index": stream.index, "origin": stream.origin, "mount": stream.T_base_sensor}
+        return {**own, "counts": stream.source.counts, "packed": stream.source.packed()}
+    kind = next((k for k in KINDS.values() if type(stream) is k.cls), None)
+    if kind is not None:
+        return kind.arrays(stream)
+    return _fields("", stream)  # a stream of somebody's own
+
+
+def _fields(where: str, value: Any) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for f in dataclasses.fields(value):
+        name, v = f"{where}{f.name}", getattr(value, f.name)
+        if dataclasses.is_dataclass(v):
+            out |= _fields(f"{name}.", v)
+        elif v is None or np.asarray(v).dtype.kind in "biufcSU":
+            out[name] = v
+    return out
