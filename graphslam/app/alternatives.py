@@ -18,6 +18,7 @@ from scipy import stats
 
 from graphslam.app.back_end import BackEnd
 from graphslam.app.config import BackEndConfig, GpsConfig
+from graphslam.app.imu_use import ImuPart
 from graphslam.app.output_files import OutputFiles
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
@@ -165,7 +166,12 @@ class Choice:
 
 
 def built(
-    submaps: Sequence[Submap], config: BackEndConfig, *, fixes: Gps | None = None, gps: GpsConfig | None = None
+    submaps: Sequence[Submap],
+    config: BackEndConfig,
+    *,
+    fixes: Gps | None = None,
+    gps: GpsConfig | None = None,
+    imu: ImuPart | None = None,
 ) -> BackEnd:
     """A back end with a graph of submaps, not yet at its optimum.
 
@@ -176,8 +182,10 @@ def built(
     fixes : Gps, optional
         Those that count.
     gps : GpsConfig, optional
+    imu : ImuPart, optional
+        Of this graph alone.
     """
-    back = BackEnd(config, "batch")
+    back = BackEnd(config, "batch", imu=imu)
     if fixes is not None:
         back.add_gps(fixes, GpsConfig() if gps is None else gps)
     for s in submaps:

@@ -20,10 +20,14 @@ from tqdm import tqdm
 from graphslam.app import config as cfg
 from graphslam.app.alternatives import Alternative, Choice, built, choose, write_choice
 from graphslam.app.back_end import BackEnd
+from graphslam.app.generations import check_same, consistent
+from graphslam.app.imu_use import ImuPart, imus_of
 from graphslam.app.loops import ledger_of_events
 from graphslam.app.run import Run
 from graphslam.app.run_maps import RunMap, folder_options, solved_poses
+from graphslam.app.taken import read_taken
 from graphslam.core.errors import MissingDataError
+from graphslam.core.imu import Imu
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.loop_candidates import FRONT_END, TIE
@@ -126,6 +130,7 @@ def solve_choice(
     decided: Sequence[Decision] = (),
     fixes: Gps | None = None,
     gps: cfg.GpsConfig | None = None,
+    imu: ImuPart | None = None,
 ) -> BackEnd:
     """The graph of submaps with some of their matches and loops, solved to its optimum.
 
@@ -139,7 +144,7 @@ def solve_choice(
         With their measurements; those that are chosen become factors as they were in the run.
     decided : sequence of Decision
         Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
-    fixes, gps
+    fixes, gps, imu
         See :func:`graphslam.app.alternatives.built`.
     """
     bare = []
@@ -155,7 +160,7 @@ def solve_choice(
             else:
                 taken.append(loop)
         bare.append(replace(s, matches=tuple(kept), grid=None))
-    back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps)
+    back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
     back.solver.solve_to_optimum()
     if taken:
         graph = GraphLoops(back.graph, back.solver)
@@ -181,7 +186,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     Raises
     ------
     MissingDataError
-        The graph of the run held GPS or an IMU, whose records are not in its folder.
+        The graph of the run held GPS or an IMU, whose records are not in its folder: an older version wrote it.
     """
     values: Mapping[str, Any] = folder_options(run.folder) if run.folder is not None else {}
     gps: cfg.GpsConfig = cfg.build(cfg.GpsConfig, values.get("gps", {}), "gps")
@@ -190,11 +195,12 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
             f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
-    if values.get("imu", {}).get("use", "none") != "none":
-        raise MissingDataError(
-            f"{run.folder}: the graph of this run holds an IMU, whose readings are not in the folder",
-            wanted="a run without IMU factors (imu.use = none)",
-        )
+    imu: cfg.ImuConfig = cfg.build(cfg.ImuConfig, values.get("imu", {}), "imu")
+    imus: dict[str, Imu] = {}
+    if imu.use != "none" and run.folder is not None:
+        taken, generation = consistent(run.folder, read_taken)
+        check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
+        imus = imus_of(taken.log)
     config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
@@ -206,7 +212,10 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
         logger.warning("%d of %d choices of matches and loops are solved", MOST, len(every))
     alternatives = []
     for name, chosen in tqdm(choices.items(), desc="choices", unit="graph", disable=not progress):
-        back = solve_choice(run.submaps, chosen, config, loops=loops, decided=decided, fixes=run.fixes, gps=gps)
+        part = ImuPart(imus, imu) if imus else None
+        back = solve_choice(
+            run.submaps, chosen, config, loops=loops, decided=decided, fixes=run.fixes, gps=gps, imu=part
+        )
         solution = back.finish()
         poses = solved_poses(made.divided, _nodes(run, solution))
         alternatives.append(Alternative(name, back.graph, solution, Candidate(made.divided.pieces, poses, name)))

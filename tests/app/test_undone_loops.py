@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.loops import loops_of_run, redo_loop, undo_loop, undone_of_run
-from graphslam.app.outputs import open_run
+from graphslam.app.outputs import SAME_BYTES, open_run
 from graphslam.app.pipeline import run
 from graphslam.app.run import Run
 from graphslam.core.errors import DataError
@@ -19,6 +19,7 @@ from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from tests.app.test_cli import graphslam
+from tests.faults.kills import snapshot
 
 OPTIONS: dict[str, Any] = {"frontend": {"filter": {"particles": 3}}, "backend": {"loops": True}, "map": {"fuse": False}}
 
@@ -41,7 +42,9 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
     with pytest.raises(DataError, match="was not undone"):
         redo_loop(folder, loop.loop, progress=False)
 
+    before = snapshot(folder, SAME_BYTES)
     undo_loop(folder, loop.loop, progress=False)
+    assert snapshot(folder, SAME_BYTES)["run.json"] != before["run.json"]
     without = open_run(folder).map.node_poses
     assert np.abs(without - whole.map.node_poses).max() > 1e-3
     for _ in range(2):  # and again when what was resumed is resumed
@@ -55,6 +58,8 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
         assert any(e["event"] == "removed" and e["reason"] == "undone" for e in resumed.events)
 
     redo_loop(folder, undone.loop, progress=False)
+    after = snapshot(folder, SAME_BYTES)
+    assert [n for n in {*before, *after} if before.get(n) != after.get(n)] == []
     assert undone_of_run(folder) == []
     np.testing.assert_allclose(open_run(folder).map.node_poses, whole.map.node_poses, atol=1e-9)
 
