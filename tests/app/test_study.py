@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 import graphslam as gs
+from graphslam.app.output_files import OutputFiles
 from graphslam.app.study import Study, markdown_table, open_study, study
 from graphslam.app.study_definition import find_study, fingerprint, source_digest
 from graphslam.app.study_folder import TABLE_COLUMNS, StudyFolder
@@ -323,7 +324,7 @@ def test_trial_files_hold_no_pickles_and_keep_odd_numbers(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.table["value"], odd)
     (t,) = folder.trials()
     assert (t.world, t.run, t.seed, t.error) == ("w", 3, 2**62 + 1, None)
-    folder.write_table("t.csv", found.table)
+    OutputFiles(tmp_path).write_table("t.csv", found.table)
     read = pd.read_csv(tmp_path / "t.csv", float_precision="round_trip")
     np.testing.assert_array_equal(read["value"], odd)
     assert read["algorithm"].tolist() == ["α"] * len(odd)

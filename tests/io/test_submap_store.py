@@ -280,7 +280,7 @@ def test_resume_keeps_the_complete_prefix_and_sweeps_the_rest(tmp_path: Path, su
     write_submaps(tmp_path / "whole", submaps)
     write_submaps(tmp_path / "cut", submaps[:2])
     folder = tmp_path / "cut" / "submaps"
-    (folder / ".000002.npz.77-ab.part").write_bytes(b"half")
+    (folder / ".000002.npz.77-0123abcd.part").write_bytes(b"half")
     (folder / "000002.npz").write_bytes(b"written, but the index does not name it yet")
     store = SubmapStore(folder)
     prefix = store.complete_prefix()
