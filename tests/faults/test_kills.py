@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-QUICK = {"run-2d": 4, "study": 3, "merge": 4, "report": 4, "undo": 2, "map": 2}
+QUICK = {"run-2d": 3, "study": 2, "merge": 2, "report": 2, "undo": 1, "map": 1}
 """Kills of each verb; a run in space goes through the same writers as "undo", and is left to the command."""
 
 
