@@ -22,11 +22,11 @@ import scipy.sparse as sp
 
 from graphslam.app.config import read_toml
 from graphslam.app.loops import loops_of_run
+from graphslam.app.output_files import OutputFiles
 from graphslam.app.outputs import open_run
 from graphslam.app.report import make_report
 from graphslam.app.report_folder import read_folder
 from graphslam.app.run_files import read_merged_dense
-from graphslam.app.run_folder import RunFolder
 from graphslam.app.study import open_study
 from graphslam.app.study_folder import StudyFolder
 from graphslam.app.submap_sources import submap_source
@@ -283,7 +283,7 @@ def just_config(root: Path) -> None:
 
 
 def merged_folder(root: Path) -> None:
-    folder = RunFolder(root)
+    folder = OutputFiles(root)
     path = np.column_stack([np.arange(5.0), np.zeros((5, 2))])
     write_tum(root / "trajectory_a.tum", Trajectory(TIMES[:5], path))
     arrays = {
@@ -307,7 +307,7 @@ def merged_folder(root: Path) -> None:
 
 
 def read_merged(root: Path) -> Any:
-    found = read_folder(root)
+    found = read_folder(root, root)
     return found.values(), read_merged_dense(root), read_tum(root / "trajectory_a.tum")
 
 
