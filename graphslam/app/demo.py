@@ -25,8 +25,9 @@ from graphslam.plots.segments import plot_segments
 
 logger = logging.getLogger(__name__)
 
-PRESETS = {"garage": 20, "quick": 5}
-"""Sizes of the demo, and their particles: the garage of two levels, 305 m; or a court, 51 m, in seconds."""
+PRESETS = {"garage": None, "quick": 5}
+"""Sizes of the demo, and their particles: the garage of two levels, 305 m, with those of its preset; or a court, 51 m, in
+seconds."""
 
 
 def demo_log(preset: str, seed: int) -> SensorLog:
@@ -55,7 +56,8 @@ def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool
     ``figures/progress.png`` is drawn anew whenever a segment ends: the first thing to look at.
     """
     log = demo_log(preset, seed)
-    options = {"frontend": {"filter": {"particles": PRESETS[preset]}}}
+    particles = PRESETS[preset]
+    options = {} if particles is None else {"frontend": {"filter": {"particles": particles}}}
     truth = None if log.truth is None else log.truth.trajectory
     with DemoProgress(out / "figures" / "progress.png", truth, shown=progress) as watch:
         return run(

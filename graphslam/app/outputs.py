@@ -126,7 +126,7 @@ def _write_files(new: Generation, run: Run) -> None:
     save_figures(run, new.figures)
     if run.fused is not None:
         write_run_map(new, run.fused, mark["generation"])
-        draw_run_map(run.fused, m.trajectory, new.figures, name=run.name)
+        draw_run_map(run.fused, m.trajectory, new.figures, name=run.name, truth=run.truth_path)
     new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
 
 

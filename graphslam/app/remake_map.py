@@ -73,7 +73,7 @@ def remake_map(
             if grid:
                 made.fused.grid.save(new.path / "map.grid.npz")
                 files.append(new.path / "map.grid.npz")
-            figures = draw_run_map(made, run.map.trajectory, new.figures, name=run.name)
+            figures = draw_run_map(made, run.map.trajectory, new.figures, name=run.name, truth=run.truth_path)
             old = ["map.ply", "map.bt", "map*.pgm", "map*.yaml", "map.grid.npz", "figures/fused*.png"]
             if found is not None:
                 files += write_clearest(new.path, found, bands=made.bands)

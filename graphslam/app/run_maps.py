@@ -194,7 +194,7 @@ def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None =
     return [*made, folder.path / "fused_map.json"]
 
 
-def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str) -> list[Path]:
+def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth: Any = None) -> list[Path]:
     """Pictures of the fused map: from above, each storey, and cut from the side.
 
     Parameters
@@ -206,6 +206,8 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str) -> lis
         Folder that is there.
     name : str
         Of the run.
+    truth : Trajectory, optional
+        The true path, drawn beside the solved one.
     """
     from graphslam.plots.evidence import plot_heights, plot_section
     from graphslam.plots.fused_map import plot_cut, plot_storey
@@ -214,16 +216,22 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str) -> lis
     grid = run_map.fused.grid
     if grid.dim == 2:
         ax = plot_section(grid, title=f"{name}: fused map")
-        ax.plot(*path.positions.T, color="tab:red", lw=0.8)
+        if truth is not None:
+            ax.plot(*truth.positions.T, color="tab:blue", lw=0.8, label="truth")
+        ax.plot(*path.positions.T, color="tab:red", lw=0.8, label="path")
+        ax.legend(fontsize="small")
         return [save(ax, figures / "fused.png")]
     made = []
     for k, (band, (low, high)) in enumerate(run_map.bands.items()):
         title = f"{name}: level {k}, {low:.1f} to {high:.1f} m"
-        made.append(save(plot_storey(grid, low, high, path=path, title=title), figures / f"fused_{band}.png"))
+        made.append(
+            save(plot_storey(grid, low, high, path=path, truth=truth, title=title), figures / f"fused_{band}.png")
+        )
     top = max(high for _, high in run_map.bands.values())
     ax = plot_heights(grid, below=top, title=f"{name}: fused map from above, cut at {top:.1f} m")
     made.append(save(ax, figures / "fused_above.png"))
-    made.append(save(plot_cut(grid, path, title=f"{name}: fused map, cut from the side"), figures / "fused_cut.png"))
+    ax = plot_cut(grid, path, truth=truth, title=f"{name}: fused map, cut from the side")
+    made.append(save(ax, figures / "fused_cut.png"))
     return made
 
 

@@ -14,6 +14,7 @@ from graphslam.maps.export import floor_plan
 from graphslam.plots import style
 from graphslam.plots.evidence import plot_section, probability, voxel_bounds
 
+# Walls are black here, which in other figures is the colour of the truth: that is light blue in these.
 BELOW = 1.5
 """A path is drawn on a storey's plan from this far below its band [m]."""
 
@@ -25,6 +26,7 @@ def plot_storey(
     ax: Axes | None = None,
     *,
     path: Trajectory | None = None,
+    truth: Trajectory | None = None,
     title: str | None = None,
 ) -> Axes:
     """What stands in a band of heights: of columns the most occupied voxel; white free, black occupied, grey unknown.
@@ -38,6 +40,8 @@ def plot_storey(
     ax : Axes or None
     path : Trajectory, optional
         ``T_world_body``; drawn where it is in the band, or less than 1.5 m below.
+    truth : Trajectory, optional
+        The true path in the same frame, drawn in the same way.
     title : str, optional
 
     Raises
@@ -46,11 +50,13 @@ def plot_storey(
         A 2-D grid, or an empty band.
     """
     ax = plot_section(floor_plan(grid, low, high), ax, title=title or f"{low:.1f} to {high:.1f} m")
-    if path is not None:
-        p = path.positions
-        here = (p[:, 2] > low - BELOW) & (p[:, 2] < high)
-        line = np.where(here[:, None], p, np.nan)
-        ax.plot(line[:, 0], line[:, 1], color=style.VERMILION, lw=0.9, label="path")
+    for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path")):
+        if way is not None:
+            p = way.positions
+            here = (p[:, 2] > low - BELOW) & (p[:, 2] < high)
+            line = np.where(here[:, None], p, np.nan)
+            ax.plot(line[:, 0], line[:, 1], color=color, lw=0.9, label=label)
+    if path is not None or truth is not None:
         style.legend(ax)
     return ax
 
@@ -117,6 +123,7 @@ def plot_cut(
     *,
     thickness: float = 2.0,
     stretch: float = 2.0,
+    truth: Trajectory | None = None,
     title: str | None = None,
 ) -> Axes:
     """A slab of the map from the side, along the longer way of the path and through where it climbs.
@@ -132,6 +139,8 @@ def plot_cut(
         Of the slab [m].
     stretch : float
         Of heights in the picture.
+    truth : Trajectory, optional
+        The true path in the same frame.
     title : str, optional
 
     Raises
@@ -148,8 +157,10 @@ def plot_cut(
     ax.set_facecolor("0.72")
     if p.size:
         ax.imshow(p, cmap="gray_r", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest")
-    q = path.positions
-    ax.plot(q[:, 1 - axis], q[:, 2], color=style.VERMILION, lw=0.9, label="path, all of it")
+    for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path, all of it")):
+        if way is not None:
+            q = way.positions
+            ax.plot(q[:, 1 - axis], q[:, 2], color=color, lw=0.9, label=label)
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero((p >= 0.5).any(axis=1))  # the sky is known, too, and says nothing
     if len(rows):
