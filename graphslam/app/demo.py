@@ -26,7 +26,7 @@ from graphslam.plots.segments import plot_segments
 logger = logging.getLogger(__name__)
 
 PRESETS = {"garage": None, "quick": 5}
-"""Sizes of the demo, and their particles: the garage of two levels, 305 m, with those of its preset; a court of 51 m."""
+"""Sizes of the demo, and their particles: the garage of two levels, 305 m, with its preset's; a court of 51 m."""
 
 
 def demo_log(preset: str, seed: int) -> SensorLog:
