@@ -4,6 +4,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.ready
 EXTRAS ?= dev,notebooks,lidar
+# Processes that run tests at one time; the tests of a file stay together.
+WORKERS ?= 2
 
 # Kernels are small and many; two threads that spin cost more than they give (see docs/how-to.md).
 export NUMBA_THREADING_LAYER ?= workqueue
@@ -26,7 +28,7 @@ demo: $(STAMP)
 	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
