@@ -78,6 +78,14 @@ def test_cast_ranges_are_as_unsure_as_the_voxel_they_end_in() -> None:
     assert c.voxel_size / np.sqrt(3) < c.cast_sigma < c.voxel_size * np.sqrt(3)
 
 
+def test_a_cast_beam_is_no_worse_where_it_rather_has_nothing_to_do_with_the_map() -> None:
+    """A share of the beams has nothing to do with the map and may be of any length; the others are normal about the
+    expected range. Both densities are equal at this many standard deviations."""
+    c = GridFilterConfig(likelihood="cast")
+    stray, normal = c.floor / CrawlerConfig().max_range, (1.0 - c.floor) / (c.cast_sigma * np.sqrt(2.0 * np.pi))
+    assert 0.75 < c.cast_clip / np.sqrt(2.0 * np.log(normal / stray)) < 1.33
+
+
 # --- what is left at the end of a segment -------------------------------------------------------------------------
 
 

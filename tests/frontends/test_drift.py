@@ -85,15 +85,42 @@ def test_a_fit_to_covariances_of_a_model_is_that_model() -> None:
         assert model.bend == pytest.approx(true.bend, abs=0.02)
 
 
-def test_calibrated_on_planar_odometry() -> None:
-    """Straight drive, white noise of heading and distance, a constant yaw rate error: every parameter comes back."""
+def test_errors_a_tenth_as_large_give_parameters_a_tenth_as_large(rng: np.random.Generator) -> None:
+    """What each path weighs in the fit goes by the errors themselves, however small they are."""
+    lengths = rng.uniform(2.0, 20.0, size=300)
+    errors = straight_errors(rng, lengths, 0.002, 0.001)
+    errors[:, 2] += 0.02 * rng.normal(size=300)  # σ at no length far above the least one there is
+    large, small = (fit_drift(lengths, (k * errors)[:, :, None] * (k * errors)[:, None, :]) for k in (1.0, 0.1))
+    for name in ("start", "walk", "scale"):
+        for what in ("position", "heading"):
+            wanted = 0.1 * getattr(large, f"{what}_{name}")
+            assert getattr(small, f"{what}_{name}") == pytest.approx(wanted, rel=1e-6), (what, name)
+    assert small.bend == pytest.approx(large.bend, rel=1e-6)
+
+
+def straight_drive() -> tuple[RecordedErrors, np.ndarray]:
+    """80 m ahead with white noise of heading and distance, a constant yaw rate error and wheels 1 % off; and metres."""
     n, step = 801, 0.1
     odometry = Odometry(
         times=0.1 * np.arange(n),
         increments=np.vstack([np.zeros(3), np.tile([step, 0, 0], (n - 1, 1))]),
         covariances=np.tile(np.diag([0.004**2, 0.002**2, 0.0005**2]), (n, 1, 1)),
     )
-    model = calibrate(RecordedErrors(odometry=odometry, yaw_bias=0.001, scale=0.01), step * np.arange(n))
+    return RecordedErrors(odometry=odometry, yaw_bias=0.001, scale=0.01), step * np.arange(n)
+
+
+def test_intervals_may_be_shorter_than_a_metre_and_those_of_no_length_are_left_out() -> None:
+    errors, metres = straight_drive()
+    model = calibrate(errors, metres, lengths=(0.5, 1.0, 4.0), intervals=5)  # three lengths: none may be missing
+    assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(0.1), rel=0.05)
+    assert calibrate(errors, metres, lengths=(-1.0, 0.0, 0.5, 1.0, 4.0), intervals=5) == model
+
+
+def test_calibrated_on_planar_odometry() -> None:
+    """Every parameter comes back."""
+    errors, metres = straight_drive()
+    step = metres[1]
+    model = calibrate(errors, metres)
     assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(step), rel=0.05)
     assert model.heading_scale == pytest.approx(0.001, rel=0.02)  # 1 m/s
     assert model.bend == pytest.approx(1.0, abs=0.02)
