@@ -190,10 +190,8 @@ def join_blocks(
                         if wj == 3:
                             new_value[at_p + 2] = T[p, 2]
                     else:
-                        new_value[at_p] += gx
+                        new_value[at_p] += gx  # only landmarks are in both maps: two columns
                         new_value[at_p + 1] += gy
-                        if wj == 3:
-                            new_value[at_p + 2] += T[p, 2]
             fresh = i >= N or where[start] < first
             if fresh:
                 new_idx[e], new_block[e] = start, k
