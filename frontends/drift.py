@@ -87,13 +87,13 @@ class DriftModel:
         L = float(length)
         if not (np.isfinite(L) and L >= 0):
             raise DataError("length of a path is impossible", got=length, wanted="≥ 0 m")
-        xy = self.position_start**2 + self.position_walk**2 * L + (self.position_scale * L) ** 2
+        xy = float(_variance(L, self.position_start, self.position_walk, self.position_scale))
         side, cross = _sideways(L, self.heading_walk**2, self.heading_scale**2)
-        heading = self.heading_start**2 + self.heading_walk**2 * L + (self.heading_scale * L) ** 2
+        heading = float(_variance(L, self.heading_start, self.heading_walk, self.heading_scale))
         if self.dim == 2:
             C, y, yaw = np.diag([xy, xy, heading]), 1, 2
         else:
-            z = self.z_start**2 + self.z_walk**2 * L + (self.z_scale * L) ** 2
+            z = float(_variance(L, self.z_start, self.z_walk, self.z_scale))
             C, y, yaw = np.diag([self.tilt**2, self.tilt**2, heading, xy, xy, z]), 4, 2
         C[y, y] += self.bend**2 * side
         C[y, yaw] += self.bend * cross
@@ -103,6 +103,12 @@ class DriftModel:
     def __call__(self, length: float) -> Array:
         """:meth:`covariance`."""
         return self.covariance(length)
+
+
+def _variance(L: npt.ArrayLike, start: float, walk: float, scale: float) -> Array:
+    """``start² + walk² L + (scale L)²``."""
+    l = np.asarray(L, dtype=np.float64)
+    return np.asarray(start**2 + walk**2 * l + (scale * l) ** 2)
 
 
 def _sideways(L: npt.ArrayLike, walk: npt.ArrayLike, scale: npt.ArrayLike) -> tuple[Array, Array]:
@@ -141,10 +147,10 @@ def fit_drift(lengths: npt.ArrayLike, moments: npt.ArrayLike) -> DriftModel:
     x, y, yaw = (0, 1, 2) if dim == 2 else (3, 4, 2)
     heading = _fit_variance(L, M[:, yaw, yaw], 1e-5)
     side, cross = _sideways(L, heading[1] ** 2, heading[2] ** 2)
-    weight = 1.0 / np.maximum(cross, 1e-12) ** 2
-    bend = float(np.clip(np.sum(weight * cross * M[:, y, yaw]) / np.sum(weight * cross**2), 0.0, 1.5))
-    if not np.any(cross > 1e-12):
-        bend = 0.0
+    # the product of two errors varies as the product of their variances: short paths hardly tell how they bend
+    weight = 1.0 / (_variance(L, *heading) * _variance(L, *_fit_variance(L, M[:, y, y], 1e-4)))
+    told = float(np.sum(weight * cross**2))
+    bend = float(np.clip(np.sum(weight * cross * M[:, y, yaw]) / told, 0.0, 1.5)) if told > 0.0 else 0.0
     sideways = np.concatenate([0.0 * side, bend**2 * side])
     position = _fit_variance(np.concatenate([L, L]), np.concatenate([M[:, x, x], M[:, y, y]]), 1e-4, known=sideways)
     z, tilt = (0.01, 0.0, 0.0), 0.006

@@ -71,6 +71,13 @@ def test_a_fit_to_samples_of_errors_finds_the_model(rng: np.random.Generator) ->
     assert model.bend == pytest.approx(1.0, abs=0.15)
 
 
+def test_short_paths_do_not_hide_how_long_ones_bend(rng: np.random.Generator) -> None:
+    """Of a path of some centimetres the errors are those at its start, which say nothing of how it bends."""
+    lengths = rng.uniform(0.0, 60.0, size=400)
+    e = straight_errors(rng, lengths, 0.002, 0.001)
+    assert fit_drift(lengths, e[:, :, None] * e[:, None, :]).bend == pytest.approx(1.0, abs=0.2)
+
+
 def test_a_fit_to_covariances_of_a_model_is_that_model() -> None:
     lengths = np.linspace(1.0, 80.0, 30)
     for true in (
