@@ -72,6 +72,11 @@ def test_odds_of_a_voxel_are_those_of_octomap() -> None:
     np.testing.assert_allclose(odds, [-2.0, 3.5, 0.85, -0.4], atol=0.02)
 
 
+def test_beams_have_nothing_to_do_with_the_map_as_often_as_amcl_assumes() -> None:
+    """Its likelihood fields mix 0.95 of hits with 0.05 of anything."""
+    assert GridFilterConfig().floor == pytest.approx(0.05, rel=0.3)
+
+
 def test_cast_ranges_are_as_unsure_as_the_voxel_they_end_in() -> None:
     c = GridFilterConfig(likelihood="cast")
     # uniform over a voxel that is met under any angle: σ between edge / √12 and the diagonal

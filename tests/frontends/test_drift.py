@@ -121,6 +121,10 @@ def test_intervals_may_be_shorter_than_a_metre_and_those_of_no_length_are_left_o
     model = calibrate(errors, metres, lengths=(0.5, 1.0, 4.0), intervals=5)  # three lengths: none may be missing
     assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(0.1), rel=0.05)
     assert calibrate(errors, metres, lengths=(-1.0, 0.0, 0.5, 1.0, 4.0), intervals=5) == model
+    # lengths that differ by millimetres are different ones, those that differ by arithmetic are not
+    assert calibrate(errors, metres / 25, lengths=(0.006, 0.01, 0.014), intervals=5).dim == 2
+    with pytest.raises(DataError, match="too short"):
+        calibrate(errors, metres, lengths=(0.55, 0.58, 1.05), intervals=50)
 
 
 def test_calibrated_on_planar_odometry() -> None:
