@@ -38,7 +38,7 @@ _TRIAL = {
     "algorithms": texts("a"),
     "quantities": texts("q"),
     **dict.fromkeys(("algorithm", "quantity", "submap"), ints("n")),
-    "value": floats("n", finite=False),
+    "value": floats("n", finite=None),
     "timing": flags("n"),
 }
 SAME_BYTES = ("study.json", "table.csv")

@@ -39,17 +39,18 @@ class Field:
         Lengths. A name stands for a length that is the same wherever it stands; ``"n+1"`` is one more.
     optional : bool
         May be missing.
-    finite : bool
-        False: NaN and infinities mean something here.
+    finite : bool or None
+        False: NaN and infinities mean something here. None: any number may stand here, because nothing is computed
+        with it but statistics.
     """
 
     kind: Literal["float", "int", "bool", "text"]
     shape: tuple[int | str, ...] = ()
     optional: bool = False
-    finite: bool = True
+    finite: bool | None = True
 
 
-def floats(*shape: int | str, optional: bool = False, finite: bool = True) -> Field:
+def floats(*shape: int | str, optional: bool = False, finite: bool | None = True) -> Field:
     """Numbers with a fraction."""
     return Field("float", shape, optional, finite)
 
@@ -202,7 +203,7 @@ def check_arrays(
             )
         if field.kind == "float":
             bad = ~usable(a) if field.finite else ~(usable(a) | ~np.isfinite(a))
-            if np.any(bad):
+            if field.finite is not None and np.any(bad):
                 at = tuple(int(i) for i in np.argwhere(bad)[0])
                 raise FormatError(
                     f"array {name!r} is not finite, or too large, at {list(at)}",
