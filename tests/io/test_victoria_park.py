@@ -73,7 +73,7 @@ def test_reading_is_fast(data_dir: Path) -> None:
     """CPU time, so that a busy machine does not fail it."""
     start = time.process_time()
     read_victoria_park(data_dir / "victoria_park_raw")
-    assert time.process_time() - start < 3.0
+    assert time.process_time() - start < 12.0
 
 
 @pytest.mark.data
