@@ -89,7 +89,7 @@ def test_whole_log_in_one_call_is_fast(laser: LaserScans) -> None:
         start = time.process_time()
         detect_trees(laser)
         best = min(best, time.process_time() - start)
-    assert best < 0.2, best
+    assert best < 1.0, best
 
 
 def test_nearer_detections_do_not_depend_on_max_range(laser: LaserScans) -> None:
