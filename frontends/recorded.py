@@ -138,7 +138,8 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
     covariances = odometry.covariances.copy()
     for i in k:
         near = [j for j in (i - 1, i + 1) if 0 <= j < len(spacing) and j not in k]
-        speed = min((float(metres[j] / spacing[j]) for j in near), default=0.0)
+        # beside the first and the last record there is one neighbour only: a body that stands before it sets off
+        speed = min(float(metres[j] / spacing[j]) for j in near) if len(near) == 2 else 0.0
         sigma = np.full(g.dof, BRIDGED * radians[i])
         sigma[g.position] = BRIDGED * metres[i]
         if metres[i] < 0.5 * speed * spacing[i]:

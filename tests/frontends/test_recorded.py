@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -165,6 +166,12 @@ def test_bridges_cost_certainty(dim: int) -> None:
     lost, _ = bridge(o.take(keep), 5.0, where="odometry")
     speed = np.linalg.norm(log(o.increments[29])[x : x + dim]) / np.diff(o.times)[28]
     assert np.sqrt(lost.covariances[30, x, x]) == pytest.approx(3.2 * speed, rel=0.2)
+    # a long record at the beginning, in which the body stood: it set off afterwards, and nothing was lost
+    stood = replace(o, times=np.r_[o.times[0] - 3.0, o.times[1:]], increments=o.increments.copy())
+    stood.increments[1] *= 0.0
+    still, gaps = bridge(stood, 5.0, where="odometry")
+    assert len(gaps.begin) == 1
+    np.testing.assert_array_equal(still.covariances, stood.covariances)
 
 
 def test_intervals_that_are_not_there() -> None:
