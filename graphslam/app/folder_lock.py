@@ -20,6 +20,8 @@ except ImportError:  # not of this system: there two writers are not kept apart
 
 LOCK = ".lock"
 _HEAD = "graphslam: this folder is written by process"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+"""It is written, so a link under its name must not lead to another file."""
 _guard = threading.Lock()
 _held: dict[str, int] = {}
 
@@ -73,7 +75,7 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 def _take(home: Path) -> Any:
     try:
-        handle = os.fdopen(os.open(home / LOCK, os.O_RDWR | os.O_CREAT, 0o666), "r+", encoding="utf-8")
+        handle = os.fdopen(os.open(home / LOCK, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o666), "r+", encoding="utf-8")
     except OSError as error:
         raise RunFolderError(f"{home}: cannot be written ({error.strerror})") from None
     try:

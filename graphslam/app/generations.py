@@ -47,6 +47,9 @@ OWNED = (
 """Files that verbs write, in folders of plain files, where nothing else says which are ours."""
 NOT_OWNED = ("figures/progress.png",)
 """Written while a run goes on, and of no generation."""
+_FOLDERS = (GENERATIONS, "submaps", "trials", "figures", "inputs", "alternatives")
+_READ = (*OWNED, *NOT_OWNED, *_FOLDERS, *(f"{f}/*" for f in _FOLDERS[:3]), CURRENT, "config.toml", "study.json")
+"""Names, as shell patterns, that our readers follow and our writers write to."""
 _NUMBER = re.compile(r"\d{6,}")
 _LINK_NAMES = re.compile(r"(\.\./)*current/.+")
 T = TypeVar("T")
@@ -107,12 +110,44 @@ def consistent(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
     while True:
         root = outputs(folder)
         try:
+            check_links(folder)
             return read(root)
         except (GraphSlamError, OSError):
             with contextlib.suppress(FormatError):
                 if outputs(folder) != root:
                     continue
             raise
+
+
+def check_links(folder: str | os.PathLike[str]) -> None:
+    """Refuse a folder in which a name of ours is a link that leads out of it: a folder that somebody else made chooses
+    neither which other files are read, nor where is written. Links of other names are left alone.
+
+    Raises
+    ------
+    FormatError
+        Names the link.
+    """
+    home = Path(folder)
+    real = os.path.realpath(home)
+    for path in _links(home):
+        name = path.relative_to(home).as_posix()
+        leads = os.path.realpath(path)
+        if not Path(leads).is_relative_to(real) and any(fnmatch.fnmatchcase(name, p) for p in _READ):
+            raise FormatError(
+                "file name leads out of its folder", where=str(path), got=leads, wanted="a file, or a link within it"
+            )
+
+
+def _links(home: Path) -> Iterator[Path]:
+    for name in ("", *_FOLDERS):
+        top = home / name
+        if top.is_symlink() and name:
+            continue  # found in the folder that holds it
+        for at, folders, files in os.walk(top):
+            yield from (p for n in (*folders, *files) if (p := Path(at, n)).is_symlink())
+            if not name:
+                break
 
 
 def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
@@ -147,9 +182,12 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
     ------
     RunFolderError
         Another process is writing into it.
+    FormatError
+        A link in it leads out of it.
     """
     home = Path(folder)
     with locked(home):
+        check_links(home)
         linked = _has_links(home)
         sweep(home)
         if linked:

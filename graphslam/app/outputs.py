@@ -238,8 +238,8 @@ def _open(home: Path, root: Path) -> Run:
     if (root / "timings.json").is_file():
         timings = read_metrics(root, "timings.json")
         values = dict(zip(timings["key"], timings["value"]))
-        resumed = values.pop(RESUMED, 0.0)
-        report[RESUMED] = int(resumed) if resumed == resumed else 0
+        values = {k: v for k, v in values.items() if v == v}  # what is no number was not measured
+        report[RESUMED] = int(values.pop(RESUMED, 0.0))
         report["seconds"] = {k.removeprefix("seconds_"): v for k, v in values.items() if k.startswith("seconds_")}
         metrics = pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True)
     if root == home:  # plain files: a copy, or of an older version

@@ -16,7 +16,7 @@ from typing import Any
 
 from graphslam.app.config import dump_toml, read_toml
 from graphslam.app.folder_lock import locked, make_folder
-from graphslam.app.generations import is_empty, outputs, sweep
+from graphslam.app.generations import check_links, is_empty, outputs, sweep
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import ConfigError, RunFolderError
 from graphslam.io.submap_store import GridLoader, SubmapStore
@@ -49,12 +49,15 @@ class RunFolder:
         RunFolderError
             The folder holds something else, another configuration, or a run of another log; it is being written by
             another process, or cannot be written.
+        FormatError
+            A link in it leads out of it.
         """
         folder = cls(path)
         make_folder(folder.path)
         if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock is put there
             raise RunFolderError(f"{folder.path}: not empty and not a run folder; choose another --out")
         with locked(folder.path):
+            check_links(folder.path)
             old = folder.path / CONFIG
             if folder._begun():
                 if not resume:

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.folder_lock import locked, make_folder
-from graphslam.app.generations import is_empty, sweep
+from graphslam.app.generations import check_links, is_empty, sweep
 from graphslam.core.atomic import read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.npz import flags, floats, ints, texts
@@ -133,6 +133,7 @@ class StudyFolder:
             if marker.is_file():
                 folder._check_same(identity)
             else:
+                check_links(folder.path)
                 write_json(marker, {"format": STUDY_FORMAT, **identity})
             sweep(folder.path)
             for trials in (folder.path / "trials").glob("*"):
@@ -146,6 +147,7 @@ class StudyFolder:
         ------
         MissingDataError, FormatError
         """
+        check_links(self.path)
         value = read_json(self.path / "study.json", fmt=STUDY_FORMAT, shape=_IDENTITY)
         value.pop("format")
         return value

@@ -69,12 +69,12 @@ def submap_source(source: Run | SubmapSource | str | Path | Sequence[Submap]) ->
     path = Path(source)
     if (path / "submaps").is_dir() or (path / "index.json").is_file():
         root = path if (path / "submaps").is_dir() else path.parent
-        scale, identities = _run_facts(root)
 
-        def read(files: Path) -> tuple[MapTruth | None, list[Submap]]:
-            return read_truth(files), identified_submaps(root if (files / "association.npz").is_file() else path)
+        def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap]]:
+            submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
+            return *_run_facts(root), read_truth(files), submaps
 
-        truth, submaps = consistent(root, read)
+        scale, identities, truth, submaps = consistent(root, read)
         return SubmapSource(submaps, truth if identities != "run" else poses_only(truth), scale)
     loaded: Any = load(source)
     if not (isinstance(loaded, list) and loaded and isinstance(loaded[0], Submap)):

@@ -84,7 +84,7 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
         Unknown format or kind, truncated or corrupt file, or a record that its own class refuses; names the file.
     """
     root = Path(folder)
-    index_path = root / INDEX_NAME
+    index_path = inside(root, INDEX_NAME, str(root))
     where = str(index_path)
     index = read_json(index_path, fmt=LOG_FORMAT, shape=_INDEX)
     streams: dict[str, Stream] = {}

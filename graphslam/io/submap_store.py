@@ -63,7 +63,7 @@ class SubmapStore:
         FormatError
         """
         if self._entries is None:
-            file = self.path / INDEX
+            file = inside(self.path, INDEX, str(self.path))
             self._entries = _read_index(file) if file.exists() else []
         return self._entries
 

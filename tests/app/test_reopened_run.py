@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -29,3 +30,15 @@ def test_ledger_and_events_come_back(tmp_path: Path) -> None:
         stream.write("{half a li")
     with pytest.raises(FormatError, match=r"events\.jsonl"):
         gs.open_run(tmp_path / "run")
+
+
+def test_a_time_that_was_not_measured_is_left_out(tmp_path: Path) -> None:
+    gs.run(gs.simulate("landmark-field", preset="quick", laps=0.3), out=tmp_path / "run", progress=False)
+    file = tmp_path / "run" / "timings.json"
+    rows = json.loads(file.read_text())
+    row = next(r for r in rows if r["key"].startswith("seconds_"))
+    row["value"] = None
+    file.write_text(json.dumps(rows))
+    seconds = gs.open_run(tmp_path / "run").report["seconds"]
+    assert row["key"].removeprefix("seconds_") not in seconds
+    assert len(seconds) == sum(r["key"].startswith("seconds_") for r in rows) - 1

@@ -102,7 +102,7 @@ def damage_json(rng: Rng, data: bytes) -> bytes:
     """A value of another type, a key that is missing, new or given twice, deep nesting."""
     try:
         value = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):  # of a file that is damaged for the second time
         return damage_text(rng, data)
     places: list[tuple[Any, Any]] = []
 

@@ -5,17 +5,25 @@ from __future__ import annotations
 import ast
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
+from graphslam.app.folder_lock import locked
+from graphslam.app.generations import new_generation
+from graphslam.app.loops import loops_of_run
 from graphslam.app.outputs import open_run
+from graphslam.app.report import make_report
+from graphslam.app.run_folder import RunFolder
 from graphslam.app.study import open_study
-from graphslam.core.errors import FormatError, GraphSlamError, UnknownNameError
+from graphslam.app.submap_sources import submap_source
+from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
+from graphslam.io.log_folder import read_log_mesh
 from graphslam.io.log_store import load_log
 from graphslam.io.submap_store import read_submaps
-from tests.faults.readers import a_log_folder, run_folder, study_folder, submap_store
+from tests.faults.readers import a_log_folder, log_with_mesh, run_folder, study_folder, submap_store
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])
@@ -77,16 +85,81 @@ def test_names_lead_nowhere_else(tmp_path: Path, name: str) -> None:
 def test_links_lead_nowhere_else(tmp_path: Path) -> None:
     for place, file, read in (
         ("log", "log/gps.npz", lambda: load_log(tmp_path / "log")),
+        ("log", "log/log.json", lambda: load_log(tmp_path / "log")),
+        ("mesh", "mesh/mesh.ply", lambda: read_log_mesh(tmp_path / "mesh")),
         ("run", "run/submaps/000001.npz", lambda: read_submaps(tmp_path / "run")),
     ):
+        shutil.rmtree(tmp_path / place, ignore_errors=True)
         (tmp_path / place).mkdir()
-        (a_log_folder if place == "log" else submap_store)(tmp_path / place)
+        {"log": a_log_folder, "mesh": log_with_mesh, "run": submap_store}[place](tmp_path / place)
         read()
-        moved = tmp_path / f"outside-{place}.npz"
+        moved = tmp_path / f"outside-{place}"
         os.rename(tmp_path / file, moved)
         (tmp_path / file).symlink_to(moved)
         with pytest.raises(FormatError, match="leads out of its folder"):
             read()
+
+
+OF_A_STATE = ("map.npz", "events.jsonl", "run.json", "metrics.json", "timings.json", "ledger.csv", "association.npz")
+OF_A_RUN = ("config.toml", "submaps", "submaps/index.json")
+
+
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("name", [*OF_A_STATE, *OF_A_RUN, "figures", "generations"])
+def test_links_of_a_run_lead_nowhere_else(name: str, plain: bool, tmp_path: Path) -> None:
+    """Neither the readers nor the writers follow them; ``plain``: a copy without links of its own."""
+    (tmp_path / "made").mkdir()
+    run_folder(tmp_path / "made")
+    folder = Path(shutil.copytree(tmp_path / "made", tmp_path / "run", symlinks=not plain))
+    own = folder / "current" if name in OF_A_STATE and not plain else folder
+    open_run(folder)
+    (folder / "figures").mkdir(exist_ok=True)
+    (own / name).rename(tmp_path / "outside")
+    (own / name).symlink_to(tmp_path / "outside")
+    before = tree(tmp_path / "outside")
+    for read in (open_run, make_report, submap_source, loops_of_run):
+        with pytest.raises(FormatError, match="leads out of its folder"):
+            read(folder)
+    with pytest.raises(FormatError, match="leads out of its folder"), new_generation(folder):
+        pass
+    with pytest.raises(FormatError, match="leads out of its folder"), RunFolder.start(folder, {}, resume=True):
+        pass
+    assert tree(tmp_path / "outside") == before
+
+
+def tree(path: Path) -> dict[Path, bytes]:
+    """Bytes of a file, or of every file of a folder."""
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    return {p: p.read_bytes() for p in files}
+
+
+def test_links_that_no_reader_of_ours_follows_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    run_folder(tmp_path / "made")
+    (tmp_path / "run").symlink_to(tmp_path / "made")
+    (tmp_path / "run" / "log").symlink_to(ROOT)
+    assert len(open_run(tmp_path / "run").submaps)
+
+
+def test_links_of_a_study_lead_nowhere_else(tmp_path: Path) -> None:
+    for name in ("study.json", "trials", "trials/A", "trials/A/000001.npz"):
+        folder = tmp_path / name.replace("/", "-")
+        folder.mkdir()
+        study_folder(folder)
+        outside = folder.with_suffix(".outside")
+        (folder / name).rename(outside)
+        (folder / name).symlink_to(outside)
+        with pytest.raises(FormatError, match="leads out of its folder"):
+            open_study(folder)
+
+
+def test_a_lock_that_is_a_link_is_not_written(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").symlink_to(tmp_path / "mine.txt")
+    with pytest.raises(RunFolderError, match="cannot be written"), locked(tmp_path / "run"):
+        pass
+    assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
 # name of a call, or of a module -> why it stands nowhere in the package
