@@ -200,6 +200,12 @@ def usable(values: npt.ArrayLike) -> Any:
     return np.abs(np.asarray(values, dtype=np.float64)) <= LARGEST
 
 
+def whole(values: npt.ArrayLike) -> Any:
+    """Which numbers are whole, and no larger than a float64 counts to: identities and counts in tables of numbers."""
+    v = np.asarray(values, dtype=np.float64)
+    return (np.abs(v) <= 2.0**53) & (v == np.round(v))
+
+
 # --- names of files ---
 
 

@@ -36,6 +36,8 @@ CONTROL_DELAY = 0.2
 RANGE_SIGMA, BEARING_SIGMA = 0.45, 0.015
 """Stated σ of a range [m] and a bearing [rad]; the recording states none. Range errors last while a barcode is looked
 at from one side: they scatter by 0.15 m, and three times that covers what does not average out."""
+MOST_EMPTY = 1_000_000
+"""Empty scans that are put where nothing was read."""
 IDLE = 0.5
 """The camera looks several times a second, but a frame in which nothing was read left no record: where that lasts
 longer than this, empty scans are put in at this spacing [s], so that maps and paths can be told to have been blind."""
@@ -104,7 +106,7 @@ def read_mrclam(
     subject = table[:, 1].astype(np.int64)
     sigma = (range_sigma, bearing_sigma)
     table[:, 2] -= range_bias
-    stamps = _scan_stamps(np.unique(table[:, 0]), float(controls.times[-1]), idle)
+    stamps = _scan_stamps(np.unique(table[:, 0]), float(controls.times[-1]), idle, str(root))
     streams: dict[str, Stream] = {
         "controls": controls,
         "landmarks": _observations(table[subject > ROBOTS], stamps, sigma),
@@ -187,10 +189,17 @@ def _barcodes(root: Path) -> dict[int, int]:
     return dict(zip(codes, table[:, 0].astype(np.int64).tolist()))
 
 
-def _scan_stamps(read: Array, end: float, idle: float) -> Array:
+def _scan_stamps(read: Array, end: float, idle: float, where: str) -> Array:
     """Stamps of frames in which something was read, and of empty ones at spacing ``idle`` where nothing was."""
     edges = np.append(read, max(end, read[-1])) if len(read) else read
     gaps = np.diff(edges)
+    if np.sum(gaps[gaps > idle]) > MOST_EMPTY * idle:
+        k = int(np.argmax(gaps))
+        raise FormatError(
+            f"nothing was read for {gaps[k]:.0f} s from {edges[k]:.3f} on: a stamp is wrong, or of another clock",
+            where=where,
+            wanted=f"at most {MOST_EMPTY:,} empty scans, one every {idle:g} s",
+        )
     extra = [a + idle * np.arange(1, np.ceil(g / idle)) for a, g in zip(edges[:-1], gaps) if g > idle]
     return np.unique(np.concatenate([read, *extra]))
 

@@ -19,6 +19,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
+from graphslam.core.reading import whole
 from graphslam.core.records import LandmarkObservations
 from graphslam.io.clock import MAX_DROPPED, usable_records
 from graphslam.io.mat import read_mat
@@ -103,7 +104,7 @@ def read_slsjf_observations(
     if table.ndim != 2 or table.shape[1] != 6:
         raise FormatError("wrong number of columns", where=str(path), got=table.shape, wanted="(n, 6)")
     counter = drops if drops is not None else DropCounter()
-    bad = ~np.isfinite(table[:, [0, 1, 2, 5]]).all(axis=1) | ~(table[:, 1] > 0.0)
+    bad = ~np.isfinite(table[:, :3]).all(axis=1) | ~(table[:, 1] > 0.0) | ~whole(table[:, 5])
     _count_bad(bad, "observations", "time, range, bearing or id is impossible", counter, path)
     ignored = ~bad & (table[:, 5] < 0)
     counter.drop("observations", "marked as poor", int(ignored.sum()))
@@ -140,8 +141,9 @@ def read_slsjf_network(folder: str | os.PathLike[str]) -> PoseNetwork:
     (table,) = read_mat(path, "VicPark_clean_data")
     if table.ndim != 2 or table.shape[1] != 12:
         raise FormatError("wrong number of columns", where=str(path), got=table.shape, wanted="(n, 12)")
-    if not np.isfinite(table).all() or not np.isin(table[:, 0], (0.0, 1.0)).all():
-        k = int(np.flatnonzero(~(np.isfinite(table).all(axis=1) & np.isin(table[:, 0], (0.0, 1.0))))[0])
+    good = np.isfinite(table).all(axis=1) & np.isin(table[:, 0], (0.0, 1.0)) & whole(table[:, 1:3]).all(axis=1)
+    if not good.all():
+        k = int(np.flatnonzero(~good)[0])
         raise FormatError(f"row {k} is neither odometry nor an observation", where=str(path), got=table[k])
     odometry, seen = table[table[:, 0] == 1.0], table[table[:, 0] == 0.0]
     if len(odometry) == 0:

@@ -302,6 +302,7 @@ class Bench:
         self.name, self.verb = name, VERBS[name]
         self.base, self.work = work / "base", work / "work"
         self.base.mkdir(parents=True)
+        quick_pictures()
         pid = os.fork()  # what prepares may start threads, which no later fork should find here
         if pid == 0:
             code = 1

@@ -117,6 +117,7 @@ def test_isolated_bad_records_are_dropped_and_counted(folder):
         ("Robot2_Measurement.dat", "81 3.5 -0.20", "81 3.5", r"Robot2_Measurement.dat, line 3"),
         ("Robot2_Measurement.dat", "101.200 63", "101.200 63.5", r"line 4: barcode is no whole number"),
         ("Robot2_Measurement.dat", "101.200", "90.0", "out of order"),
+        ("Robot2_Measurement.dat", "103.000", "1e24", "nothing was read for .* a stamp is wrong"),
         ("Barcodes.dat", "7 81", "7 63", "barcode stands twice"),
         ("Barcodes.dat", "7 81", "7 8.1", "no whole number"),
         ("Landmark_Groundtruth.dat", "3.0", "nan", r"Landmark_Groundtruth.dat, line 3"),

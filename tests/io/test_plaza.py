@@ -109,6 +109,14 @@ def test_what_is_asked_for_must_be_possible(folder, tmp_path):
         read_plaza(folder)
 
 
+@pytest.mark.parametrize("beacon", [[6, np.nan, 2.0], [6, 1.0, np.inf], [0.5, 1.0, 2.0], [1e20, 1.0, 2.0]])
+def test_a_beacon_must_have_a_number_and_a_place(folder, beacon):
+    gt = scipy.io.loadmat(folder / "Plaza1_.mat")["GT"]
+    scipy.io.savemat(folder / "Plaza1_.mat", {"GT": gt, "TL": np.array([[0, 3.0, 4.0], beacon])})
+    with pytest.raises(FormatError, match="row 1 of TL is no beacon"):
+        read_plaza(folder)
+
+
 @pytest.mark.data
 def test_the_recording(data_dir):
     log = load("plaza1")

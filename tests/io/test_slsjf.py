@@ -91,6 +91,8 @@ def test_bad_maps_name_the_file(tmp_path: Path) -> None:
         ({"localmap_st": np.column_stack([ids, mean])[:6]}, FormatError, "wrong shape"),
         ({"localmap_st": np.column_stack([ids + 1, mean])}, FormatError, "feature ids"),
         ({"localmap_st": np.column_stack([ids[::-1], mean])}, FormatError, "feature ids"),
+        ({"localmap_st": np.column_stack([ids * 1.1, mean])}, FormatError, "feature ids"),
+        ({"localmap_st": np.column_stack([ids * 1e20, mean])}, FormatError, "feature ids"),
         ({"localmap_st": np.column_stack([ids, mean * np.nan])}, FormatError, "row 0 of the state is not finite"),
     ):
         write_map(path, **change)

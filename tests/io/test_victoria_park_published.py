@@ -138,24 +138,29 @@ def test_bad_slsjf_files(tmp_path: Path) -> None:
         [21819.0 + 213.0 * np.arange(100), np.full((100, 2), 5.0), np.zeros((100, 2)), np.arange(100)]
     )
     rows[7, 5], rows[8, 1] = -1.0, np.nan
+    rows[9, 5] = 1e20
     path = tmp_path / "slsjf_data_sensor_clean_clean.mat"
     scipy.io.savemat(path, {"data_sensor_clean_clean": rows})
     drops = DropCounter()
-    assert len(read_slsjf_observations(tmp_path, drops=drops).ranges) == 98
+    assert len(read_slsjf_observations(tmp_path, drops=drops).ranges) == 97
     assert drops.counts == {
-        "observations: time, range, bearing or id is impossible": 1,
+        "observations: time, range, bearing or id is impossible": 2,
         "observations: marked as poor": 1,
     }
     rows[50, 0] = 0.0
     scipy.io.savemat(path, {"data_sensor_clean_clean": rows})
-    with pytest.raises(DataError, match="backwards at row 48"):
+    with pytest.raises(DataError, match="backwards at row 47"):
         read_slsjf_observations(tmp_path)
     net = tmp_path / "slsjf_VicPark_clean_data.mat"
     odometry = np.array([[1.0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 0, 1], [1.0, 1, 2, 1, 0, 0, 1, 2, 0, 1, 0, 1]])
     scipy.io.savemat(net, {"VicPark_clean_data": odometry})
     with pytest.raises(FormatError, match="not positive definite, first: number 1"):
         read_slsjf_network(tmp_path)
-    odometry[1, 0] = 7
+    odometry[1, 2] = 2.5
+    scipy.io.savemat(net, {"VicPark_clean_data": odometry})
+    with pytest.raises(FormatError, match="row 1 is neither"):
+        read_slsjf_network(tmp_path)
+    odometry[1, 0], odometry[1, 2] = 7, 2
     scipy.io.savemat(net, {"VicPark_clean_data": odometry})
     with pytest.raises(FormatError, match="row 1 is neither"):
         read_slsjf_network(tmp_path)
