@@ -26,6 +26,8 @@ from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
 
+HEADING_UNKNOWN = float(np.pi / np.sqrt(3.0))
+"""σ of a heading that may be any [rad]."""
 Motion = SteeringControls | VelocityControls | Odometry
 """Streams that can be dead-reckoned, in the order in which a log is asked for them."""
 
@@ -235,7 +237,8 @@ def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, h
     Raises
     ------
     DataError
-        If the odometry is not planar, has fewer than two records, or a stamp lies beyond its reach.
+        If the odometry is not planar, has fewer than two records, states covariances that leave its heading unknown, or
+        a stamp lies beyond its reach.
     """
     t = check_times(times)
     stamps = odometry.times
@@ -246,6 +249,13 @@ def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, h
             "pose stamp outside the odometry",
             got=f"[{t[0]:.3f}, {t[-1]:.3f}] s",
             wanted=f"[{stamps[0] - hold:.3f}, {stamps[-1] + hold:.3f}] s",
+        )
+    usual = float(np.sqrt(np.median(odometry.covariances[1:, 2, 2])))
+    if usual > HEADING_UNKNOWN:
+        raise DataError(
+            "the stated covariances of the odometry leave its heading unknown within one record",
+            got=f"σ of {usual:.3g} rad in {float(np.median(np.diff(stamps))):.3g} s",
+            wanted=f"below {HEADING_UNKNOWN:.2g} rad; look at their unit and their order: x, y [m], heading [rad]",
         )
     increments, covs = _start(len(t), noise)
     if len(t) < 2:

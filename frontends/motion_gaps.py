@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frontends.gaps import refuse_long
-from frontends.motion import Motion, MotionNoise, dead_reckoning, motion_stream
+from frontends.motion import HEADING_UNKNOWN, Motion, MotionNoise, dead_reckoning, motion_stream
 from frontends.recorded import BRIDGED
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_exp, se2_log
@@ -25,8 +25,6 @@ SHORTEST = 1.0
 """A pause that is thrice the usual one and longer than this is a gap [s]: a robot can stop within a second."""
 AROUND = 2.0
 """Time before and after a gap from which the mean motion in it is taken [s]."""
-NOTHING_KNOWN = float(np.pi / np.sqrt(3.0))
-"""σ of a heading that may be any [rad]."""
 LOST = 0.5
 """A record of odometry over a gap that tells less than this part of the way driven around it has lost its records."""
 
@@ -188,7 +186,7 @@ def _widened(odometry: Odometry, gaps: list[MotionGap]) -> Array:
         T = gap.end - gap.begin
         inside = np.zeros(len(t))
         inside[1:] = np.maximum(np.minimum(t[1:], gap.end) - np.maximum(t[:-1], gap.begin), 0.0)
-        heading = min(gap.yaw_rate_sigma * T, NOTHING_KNOWN) / T
+        heading = min(gap.yaw_rate_sigma * T, HEADING_UNKNOWN) / T
         for k in np.flatnonzero(inside > 0.0):
             h = inside[k]
             turn, way = heading * np.sqrt(T * h), abs(gap.speed) * h

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.core.gaussian import inverses
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
-from graphslam.core.reading import read_text
+from graphslam.core.reading import read_text, usable
 from graphslam.graph.consistent_set import Chain
 from graphslam.io.text_records import find_text_file
 
@@ -27,6 +28,8 @@ PLACE_SIGMA = 1.0
 HEADING_SIGMA = 0.3
 """Stated σ of "the same direction of view" [rad]."""
 # Numbers after the tag.
+MOST_NODES = 100_000
+"""Of a network: more come of a wrong stamp."""
 _INPUT = {"odom2": 7, "loop": 3}
 _TRUTH = {"point2": 7, "angle": 3}
 
@@ -99,10 +102,18 @@ class TucLog:
         ------
         ConfigError
             A σ or spacing that is not positive.
+        DataError
+            The stamps span too long a time, or a covariance is singular.
         """
         if not (place_sigma > 0 and spacing > 0 and (heading_sigma is None or heading_sigma > 0)):
             raise ConfigError(f"σ and spacing must be positive, got {place_sigma}, {heading_sigma}, {spacing}")
         chosen = self.loops[self.similarity >= min_similarity]
+        if self.times[-1] - self.times[0] > MOST_NODES * spacing:
+            raise DataError(
+                f"the odometry spans {self.times[-1] - self.times[0]:.3g} s: a stamp is wrong, or of another clock",
+                where=self.source,
+                wanted=f"at most {MOST_NODES:,} nodes, one every {spacing:g} s",
+            )
         grid = np.arange(self.times[0], self.times[-1], spacing)
         stamps = np.unique(np.concatenate([chosen.ravel(), grid]))
         poses, increments, covariances = self._odometry(stamps)
@@ -118,7 +129,7 @@ class TucLog:
             has_initial=np.ones(n, dtype=np.bool_),
             edges=np.concatenate([chain, ends]).astype(np.intp),
             measurements=np.concatenate([increments, np.zeros((len(ends), 3))]),
-            information=np.concatenate([np.linalg.inv(covariances), loop]),
+            information=np.concatenate([inverses(covariances, self.source), loop]),
             source=self.source,
         )
         return network, stamps
@@ -172,7 +183,7 @@ def read_tuc(folder: str | os.PathLike[str], *, drops: DropCounter | None = None
     path = find_text_file(root, INPUT)
     tables = _tables(path, _INPUT)
     odometry, loops = tables["odom2"], tables["loop"]
-    keep = np.isfinite(odometry).all(axis=1) & (odometry[:, 4:] > 0.0).all(axis=1)
+    keep = usable(odometry).all(axis=1) & (odometry[:, 4:] > 0.0).all(axis=1)
     counter.drop("odometry", "not finite, or a variance that is not positive", int((~keep).sum()))
     odometry = odometry[keep]
     forward = odometry[:, 0] > np.maximum.accumulate(np.concatenate([[-np.inf], odometry[:, 0]]))[:-1]

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, FormatError
+from graphslam.core.gaussian import inverses
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
@@ -164,13 +165,13 @@ def read_slsjf_network(folder: str | os.PathLike[str]) -> PoseNetwork:
         has_initial=np.zeros(len(pose_ids), dtype=np.bool_),
         edges=np.stack([index(odometry[:, 1], pose_ids), index(odometry[:, 2], pose_ids)], -1),
         measurements=odometry[:, 3:6],
-        information=_inverse(tangent, path),
+        information=inverses(tangent, str(path)),
         landmark_ids=feature_ids + SLSJF_LANDMARK_OFFSET,
         landmarks=np.zeros((len(feature_ids), 2)),
         has_landmark=np.zeros(len(feature_ids), dtype=np.bool_),
         observations=np.stack([index(seen[:, 1], pose_ids), index(seen[:, 2], feature_ids)], -1),
         observation_values=seen[:, 3:5],
-        observation_information=_inverse(Q, path),
+        observation_information=inverses(Q, str(path)),
         observation_kind="cartesian",
         noise="covariance of (dx, dy, dφ), turned to the right tangent",
         source=path.name,
@@ -183,19 +184,6 @@ def _symmetric(upper: Array, d: int) -> Array:
     i, j = np.triu_indices(d)
     out[:, i, j] = out[:, j, i] = upper
     return out
-
-
-def _inverse(covariances: Array, path: Path) -> Array:
-    low = np.linalg.eigvalsh(covariances)[:, 0] if len(covariances) else np.ones(0)
-    if np.any(low <= 0.0):
-        raise FormatError(
-            f"{int((low <= 0).sum())} covariances are not positive definite, first: number {int(np.argmax(low <= 0))}",
-            where=str(path),
-            got=f"smallest eigenvalue {low.min():.3g}",
-            wanted="> 0",
-        )
-    inverse = np.linalg.inv(covariances)
-    return np.asarray(0.5 * (inverse + np.swapaxes(inverse, 1, 2)))
 
 
 def _runs(times: Array, path: Path) -> tuple[Array, npt.NDArray[np.int64]]:

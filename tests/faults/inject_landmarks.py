@@ -11,9 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.geometry import Array, rotation2, wrap_angle
+from frontends.motion import MotionNoise
+from graphslam.core.geometry import Array, rotation2, se2_between, se2_compose, se2_exp, se2_log, wrap_angle
+from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Gps, LandmarkObservations, SteeringControls
+from graphslam.core.records import Gps, LandmarkObservations, Odometry, SteeringControls, VelocityControls
+from graphslam.core.trajectory import Trajectory
 
 Inject = Callable[[SensorLog], SensorLog]
 
@@ -70,6 +73,101 @@ def gap_of_all(seconds: float, at: float = 20.0) -> Inject:
         return replace(log, streams=streams, truth=None)
 
     return inject
+
+
+def rates(speed: float = 1.0, yaw_rate: float = 1.0, bias: float = 0.0) -> Inject:
+    """Speeds and yaw rates times factors, and a constant added to the yaw rates [rad/s]."""
+
+    def inject(log: SensorLog) -> SensorLog:
+        c: VelocityControls = log["controls"]
+        return with_stream(log, "controls", replace(c, speed=speed * c.speed, yaw_rate=yaw_rate * c.yaw_rate + bias))
+
+    return inject
+
+
+def increments(factor: float) -> Inject:
+    """Every increment of the odometry for ``factor`` times as long: 0 stands still, -1 is the way back."""
+
+    def inject(log: SensorLog) -> SensorLog:
+        o: Odometry = log["odometry"]
+        return with_stream(log, "odometry", replace(o, increments=se2_exp(factor * se2_log(o.increments))))
+
+    return inject
+
+
+def odometry_gap(seconds: float, at: float = 20.0) -> Inject:
+    """Records are lost: the way in them is in no other record."""
+
+    def inject(log: SensorLog) -> SensorLog:
+        o: Odometry = log["odometry"]
+        return with_stream(log, "odometry", o.take((o.times < at) | (o.times >= at + seconds)))
+
+    return inject
+
+
+def stated_covariance(factor: float) -> Inject:
+    """The covariances of the odometry times a factor."""
+
+    def inject(log: SensorLog) -> SensorLog:
+        o: Odometry = log["odometry"]
+        return with_stream(log, "odometry", replace(o, covariances=factor * o.covariances))
+
+    return inject
+
+
+def with_imu(log: SensorLog) -> SensorLog:
+    """A sound IMU on top, standing level: it measures gravity and the turns of the path."""
+    assert log.truth is not None
+    path = log.truth.trajectory
+    t = np.arange(path.times[0], path.times[-1], 0.02)
+    heading = np.interp(t, path.times, np.unwrap(path.poses[:, 2]))
+    rng = np.random.default_rng(9)
+    rate = np.column_stack([np.zeros((len(t), 2)), np.gradient(heading, t)]) + 0.001 * rng.standard_normal((len(t), 3))
+    force = np.array([0.0, 0.0, 9.81]) + 0.02 * rng.standard_normal((len(t), 3))
+    noise = ImuNoise(
+        gyro=1e-3, gyro_bias=1e-3, gyro_walk=1e-4, accelerometer=1e-2, accelerometer_bias=0.1, accelerometer_walk=1e-3
+    )
+    return with_stream(log, "imu", Imu(times=t, angular_rate=rate, specific_force=force, noise=noise))
+
+
+# ---- logs whose wheels say other things ------------------------------------------------------------------------------
+
+
+def measured_velocities(log: SensorLog) -> SensorLog:
+    """The same drive, seen from the rear axle, with controls of speed and yaw rate; σ are the defaults of
+    ``frontend.motion``."""
+    assert log.truth is not None
+    c, z = log["controls"], log["landmarks"]
+    front = np.array([c.geometry.wheelbase, 0.0, 0.0])
+    there = log.truth.trajectory
+    path = Trajectory(there.times, se2_compose(there.poses, np.broadcast_to(-front, there.poses.shape)))
+    t = c.times
+    steps = se2_log(se2_between(path.interpolate(t[:-1]), path.interpolate(t[1:]))) / np.diff(t)[:, None]
+    steps = np.concatenate([steps, steps[-1:]])
+    rng = np.random.default_rng(21)
+    noise = MotionNoise()
+    velocities = VelocityControls(
+        times=t,
+        speed=steps[:, 0] + noise.speed * rng.standard_normal(len(t)),
+        yaw_rate=steps[:, 2] + noise.yaw_rate * rng.standard_normal(len(t)),
+    )
+    streams = {**log.streams, "controls": velocities, "landmarks": replace(z, T_base_sensor=front)}
+    return replace(log, streams=streams, truth=replace(log.truth, trajectory=path))
+
+
+def measured_increments(log: SensorLog) -> SensorLog:
+    """The same drive with recorded increments, five a second, and their covariances."""
+    assert log.truth is not None
+    path = log.truth.trajectory
+    t = np.arange(path.times[0], path.times[-1], 0.2)
+    poses = path.interpolate(t)
+    rng = np.random.default_rng(22)
+    sigma = np.array([0.05, 0.02, 0.01])
+    steps = np.zeros((len(t), 3))
+    steps[1:] = se2_compose(se2_between(poses[:-1], poses[1:]), se2_exp(sigma * rng.standard_normal((len(t) - 1, 3))))
+    odometry = Odometry(times=t, increments=steps, covariances=np.tile(np.diag(sigma**2), (len(t), 1, 1)))
+    streams = {"odometry": odometry, **{k: s for k, s in log.streams.items() if k != "controls"}}
+    return replace(log, streams=streams)
 
 
 # ---- sightings -------------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ class Row:
     shows : str
         Code of a line of the verdict, or a part of the message where the run is refused.
     frontend : str
-    log : {"field", "beacons", "gps"}
+    log : {"field", "velocities", "increments", "beacons", "gps"}
         Which clean log the fault goes into.
     config : mapping
     dim : int
@@ -52,9 +52,9 @@ class Row:
     @property
     def name(self) -> str:
         """Of the front end, with what it is given."""
-        what = {"field": "", "gps": "", "beacons": ", ranges only"}[self.log]
+        what = {"beacons": ", ranges only", "velocities": ", speed and yaw rate", "increments": ", odometry"}
         how = ", by likelihood" if self.config in (LIKELIHOOD, NEAREST) else ""
-        return f"{self.frontend}{what}{how}"
+        return f"{self.frontend}{what.get(self.log, '')}{how}"
 
     @property
     def id(self) -> str:
@@ -157,6 +157,21 @@ GAPS: list[tuple[str, inject.Inject]] = [
 ]
 
 
+RATES: list[tuple[str, inject.Inject]] = [
+    ("speed × 2", inject.rates(speed=2.0)),
+    ("yaw rate in degrees per second", inject.rates(yaw_rate=180.0 / np.pi)),
+    ("yaw rate of the wrong sign", inject.rates(yaw_rate=-1.0)),
+    ("yaw rate off by 1 °/s", inject.rates(bias=float(np.deg2rad(1.0)))),
+]
+UNKNOWN = "leave its heading unknown within one record"
+ODOMETRY: list[tuple[str, inject.Inject, Outcome, str]] = [
+    ("increments × 2", inject.increments(2.0), "reported", "calibration|residuals"),
+    ("increments 0", inject.increments(0.0), "reported", "calibration|residuals"),
+    ("increments × −1", inject.increments(-1.0), "reported", "calibration|residuals"),
+    ("10 s without records", inject.odometry_gap(10.0), "handled", "motion-gap"),
+    ("covariance 1e−12 of the stated one", inject.stated_covariance(1e-12), "reported", "residuals"),
+    ("covariance 1e12 times the stated one", inject.stated_covariance(1e12), "refused", UNKNOWN),
+]
 MILLIMETRES = ("ranges × 1000", inject.ranges(1000.0))
 KILOMETRES = ("ranges × 0.001", inject.ranges(0.001))
 HARDLY = "ranges hardly change while the robot drives"
@@ -221,6 +236,14 @@ def _rows() -> list[Row]:
     rows += [Row("beacons", f, i, "reported", FIT, log="beacons") for f, i in blind]
     rows.append(Row("beacons", *KILOMETRES, "refused", HARDLY, log="beacons"))
     rows += [Row("beacons", "10 % wrong identities", inject.wrong_identities(0.1), "reported", FIT, log="beacons")]
+    for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
+        rows += [Row("wheels", f, i, "reported", "calibration|residuals", frontend, "velocities") for f, i in RATES]
+        for f, i, o, s in ODOMETRY:  # one filter over a whole log is over-confident without a gap, too, and says so
+            out: Outcome = "reported" if frontend == "rbpf-slam" and o == "handled" else o
+            rows.append(Row("odometry", f, i, out, s, frontend, "increments"))
+        rows.append(Row("IMU", "asked for in the plane", inject.with_imu, "reported", "imu-not-used", frontend))
+        rows[-1] = replace(rows[-1], config={**KNOWN, "imu": {"use": "imu"}})
+    rows.append(Row("wheels", "10 s without wheels", inject.gap(10.0), "handled", "motion-gap", log="velocities"))
     used = {"gps": {"use": "all"}}
     rows += [Row("GPS", f, i, o, s, log="gps", config=used) for f, i, o, s in GPS]
     half = {"gps": {"use": "every-second"}}
@@ -235,7 +258,8 @@ def _rows() -> list[Row]:
             config=half,
         )
     ]
-    rows += [Row("GPS", f, i, o, s, "ekf-slam", log="gps", config=used) for f, i, o, s in (GPS[0], GPS[1], GPS[3])]
+    for frontend in ("ekf-slam", "rbpf-slam"):
+        rows += [Row("GPS", f, i, o, s, frontend, log="gps", config=used) for f, i, o, s in (GPS[0], GPS[1], GPS[3])]
     rows += [
         Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT),
         Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),

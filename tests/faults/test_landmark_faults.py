@@ -31,6 +31,10 @@ def clean_log(kind: str) -> SensorLog:
         return gs.simulate("landmark-field", seed=2, preset="quick", gps_rate=1.0, gps_sigma=0.3)
     if kind == "field":
         return gs.simulate("landmark-field", seed=2, preset="quick")
+    if kind == "velocities":
+        return inject.measured_velocities(clean_log("field"))
+    if kind == "increments":
+        return inject.measured_increments(clean_log("field"))
     log = gs.simulate("landmark-field", seed=2, preset="quick", field_of_view=2 * np.pi, max_range=40.0, landmarks=16)
     z = log["landmarks"]
     ranges = LandmarkObservations.range_only(

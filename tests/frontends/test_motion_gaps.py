@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from frontends.motion import MotionNoise, dead_reckoning
-from frontends.motion_gaps import NOTHING_KNOWN, MotionGap, bridged_reckoning
+from frontends.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoning
+from frontends.motion_gaps import MotionGap, bridged_reckoning
 from graphslam.app.front_ends import make_front_end, recommended
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, DataError
@@ -68,7 +68,7 @@ def test_a_gap_is_counted_and_named() -> None:
     counts = DropCounter()
     out, _ = bridged(cut, times, counts=counts)
     assert counts.counts == Counter({"motion: gaps bridged": 1})
-    assert np.sqrt(out.covariances[1:, 2, 2].sum()) <= NOTHING_KNOWN + 0.1
+    assert np.sqrt(out.covariances[1:, 2, 2].sum()) <= HEADING_UNKNOWN + 0.1
     with pytest.raises(DataError, match=r"35\.0.*to 65\.0.*frontend\.longest_gap"):
         bridged(cut, times, limit=20.0)
     # what is no gap stays as it is

@@ -96,6 +96,15 @@ def test_bad_files_are_refused_with_their_line(tmp_path: Path) -> None:
         read_tuc(write(tmp_path, DRIVE, ["angle 0 0 0"]))
     with pytest.raises(ConfigError, match="positive"):
         read_tuc(write(tmp_path, DRIVE)).to_network(place_sigma=0.0)
+    for drive, message in (
+        ([*DRIVE, "odom2 1e12 1.0 0.0 0.5 0.0025 0.0025 0.0001"], "a stamp is wrong"),
+        ([line.replace("0.0025 0.0025 0.0001", "0.0025 0.0025 1e-320") for line in DRIVE], "not positive definite"),
+    ):
+        log = read_tuc(write(tmp_path, drive))
+        with pytest.raises(DataError, match=message):
+            log.to_network()
+    log = read_tuc(write(tmp_path, [*DRIVE, "odom2 5.1 1e40 0.0 0.5 0.0025 0.0025 0.0001"]))
+    assert log.dropped["odometry: not finite, or a variance that is not positive"] == 1
 
 
 @pytest.mark.data
