@@ -94,6 +94,17 @@ def test_a_full_file_system_behind_the_output_is_one_line() -> None:
     )
 
 
+def test_what_was_said_before_an_error_does_not_fail_once_more() -> None:
+    """Text that waits for a full disk would end the interpreter with code 120 and a second message."""
+    code = (
+        "from graphslam.app import cli\ndef app():\n    print('said')\n    raise MemoryError\ncli.app = app\ncli.main()"
+    )
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_a_file_that_cannot_grow_is_one_line_and_no_half_file(tmp_path: Path) -> None:
     out = tmp_path / "log"
     code, err = verb("simulate", "landmark-field", "--preset", "quick", "--out", str(out), "--json", file_size=4096)

@@ -68,6 +68,24 @@ def test_archives_are_refused_before_anything_is_unpacked(tmp_path: Path) -> Non
     assert len(read_npz(path, fmt="f")["b"]) == 5_000_000
 
 
+def test_a_member_that_claims_more_than_it_can_hold_is_refused_without_memory(tmp_path: Path) -> None:
+    """Headers of array and archive agree on 1 GB, below the limit, in a hundred bytes."""
+    path, shape = tmp_path / "a.npz", 125_000_000
+    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape},), }}".ljust(117).encode() + b"\n"
+    data = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", data)
+    raw = path.read_bytes()
+    at = raw.rindex(b"PK\x01\x02") + 24  # of the size in the archive's directory
+    path.write_bytes(raw[:at] + (len(data) + 8 * shape).to_bytes(4, "little") + raw[at + 4 :])
+    tracemalloc.start()
+    with pytest.raises(FormatError, match="truncated or corrupt"):
+        read_npz(path, fmt="f")
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 1_000_000
+
+
 def test_packings_that_numpy_does_not_write_are_refused(tmp_path: Path) -> None:
     """LZMA packs zeros 7,000 to 1, which the check of claimed sizes would not know."""
     stream = io.BytesIO()

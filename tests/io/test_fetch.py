@@ -22,6 +22,7 @@ from graphslam.io.fetch import fetch
 from tests.io.test_catalog import sha, toy_card, write_toy
 
 CONTENT = b"0 1 2\n" * 50
+SCHEMES = fetching.SCHEMES
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -245,7 +246,7 @@ def elsewhere(server: tuple[str, Path]) -> Iterator[str]:
 def test_only_https_is_asked(server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     url, root = server
     serve(root)
-    monkeypatch.setattr(fetching, "SCHEMES", ("https",))
+    monkeypatch.setattr(fetching, "SCHEMES", SCHEMES)  # as they are
     for address in (url, "ftp://127.0.0.1", f"file://{root}"):
         with pytest.raises(DataError, match="address of another scheme"):
             fetch(linked(address))
