@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
+from graphslam.evidence.dense_kernels import known_box
 from graphslam.evidence.layout import STEP
-from graphslam.evidence.query_kernels import count_boxes, count_values, find_bounds, list_occupied, walk_once
+from graphslam.evidence.query_kernels import count_boxes, count_values, list_occupied, walk_once
 from graphslam.evidence.scan import point_rows
 
 if TYPE_CHECKING:
@@ -109,10 +110,10 @@ def bounding_box(grid: EvidenceGrid) -> tuple[Array, Array] | None:
     pool = grid.pool
     bounds = np.empty(6, np.int64)
     with pool.lock:
-        find_bounds(grid.packed_bricks(), pool.bricks, bounds)
-    if bounds[3] < bounds[0]:
+        known_box(grid.root, pool.levels, pool.children, pool.bricks, bounds)
+    if bounds[3] <= bounds[0]:
         return None
-    corners = np.stack([bounds[:3], bounds[3:] + 1]) - pool.half
+    corners = np.stack([bounds[:3], bounds[3:]]) - pool.half
     lower, upper = np.asarray(corners[:, : grid.dim] * grid.voxel_size, dtype=np.float64)
     return lower, upper
 

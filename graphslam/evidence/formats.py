@@ -15,7 +15,17 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import Pieces, check_reach, grid_of, overlap, pieces_of
 from graphslam.evidence.dense_kernels import dense_log_odds, dense_values, known_box
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, LIMIT, MAX_LEVELS, STEP, UNKNOWN, half_edge
+from graphslam.evidence.layout import (
+    BRICK_EDGE,
+    BRICK_VOXELS,
+    LARGEST_VOXEL,
+    LIMIT,
+    MAX_LEVELS,
+    SMALLEST_VOXEL,
+    STEP,
+    UNKNOWN,
+    half_edge,
+)
 from graphslam.evidence.pool import GridPool
 
 FORMAT = "graphslam.evidence/1"
@@ -288,8 +298,9 @@ def _read_head(arrays: dict[str, npt.NDArray[Any]], where: str) -> tuple[BeamMod
         raise FormatError(f"array 'model' is impossible ({error})", where=where) from None
     voxel_size = float(_field(arrays, "voxel_size", np.float64, (), where))
     dim, levels = (int(_field(arrays, name, np.int64, (), where)) for name in ("dim", "levels"))
-    if not (np.isfinite(voxel_size) and voxel_size > 0):
-        raise FormatError("voxel size is impossible", where=where, got=voxel_size, wanted="> 0 m")
+    if not SMALLEST_VOXEL <= voxel_size <= LARGEST_VOXEL:
+        wanted = f"{SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m"
+        raise FormatError("voxel size is impossible", where=where, got=voxel_size, wanted=wanted)
     if dim not in (2, 3):
         raise FormatError("dimension is impossible", where=where, got=dim, wanted="2 or 3")
     if not 2 <= levels <= MAX_LEVELS:

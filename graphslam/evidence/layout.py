@@ -15,6 +15,8 @@ CHILDREN = FAN**3
 
 UNKNOWN = -32768
 """Value of a voxel that was never observed; a known voxel of log-odds 0 is another thing."""
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-6, 1e6
+"""Edge of a voxel in a file [m]: beyond these, places overflow."""
 LIMIT = 32767
 """Largest magnitude of a known value."""
 STEP = 1.0 / 2048.0

@@ -22,7 +22,7 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import Pieces, check_reach, find_all_states, grid_of, levels_for
 from graphslam.evidence.cube_kernels import UNSEEN
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import BRICK_VOXELS, DEFAULT_LEVELS, LIMIT, STEP, UNKNOWN
+from graphslam.evidence.layout import BRICK_VOXELS, DEFAULT_LEVELS, LARGEST_VOXEL, LIMIT, SMALLEST_VOXEL, STEP, UNKNOWN
 from graphslam.evidence.octomap_kernels import (
     BRICKS,
     CHILDLESS,
@@ -154,8 +154,13 @@ def _read_header(data: bytes, where: str) -> _Header:
         resolution = float(text)
     except ValueError:
         resolution = math.nan
-    if not (math.isfinite(resolution) and resolution > 0):
-        raise FormatError("resolution is impossible", where=f"{where}, byte {at}", got=repr(text), wanted="> 0 m")
+    if not SMALLEST_VOXEL <= resolution <= LARGEST_VOXEL:
+        raise FormatError(
+            "resolution is impossible",
+            where=f"{where}, byte {at}",
+            got=repr(text),
+            wanted=f"{SMALLEST_VOXEL:g} to {LARGEST_VOXEL:g} m",
+        )
     return _Header(binary, int(size), resolution, start)
 
 

@@ -139,24 +139,6 @@ def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
 
 
 @kernel()
-def find_bounds(rows, bricks, out):
-    """First and last known voxel per axis, ``out (6,)`` int64 [offset coordinates]; first > last where none is."""
-    out[:3] = 1 << 40
-    out[3:] = -1
-    for r in range(rows.shape[0]):
-        key = rows[r, 0]
-        x, y, z = (key & 0xFFFFF) << 3, ((key >> 20) & 0xFFFFF) << 3, (key >> 40) << 3
-        if x >= out[0] and y >= out[1] and z >= out[2] and x + 7 <= out[3] and y + 7 <= out[4] and z + 7 <= out[5]:
-            continue
-        brick = bricks[rows[r, 1]]
-        for i in range(512):
-            if brick[i] != -32768:
-                vx, vy, vz = x + (i & 7), y + ((i >> 3) & 7), z + (i >> 6)
-                out[0], out[1], out[2] = min(out[0], vx), min(out[1], vy), min(out[2], vz)
-                out[3], out[4], out[5] = max(out[3], vx), max(out[4], vy), max(out[5], vz)
-
-
-@kernel()
 def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
     """Number of occupied voxels; fills ``voxels (n, 3) int32`` (signed) and ``values (n,) int16`` where they have rows.
 

@@ -96,11 +96,13 @@ def test_a_full_file_system_behind_the_output_is_one_line() -> None:
 
 def test_what_was_said_before_an_error_does_not_fail_once_more() -> None:
     """Text that waits for a full disk would end the interpreter with code 120 and a second message."""
-    code = (
-        "from graphslam.app import cli\ndef app():\n    print('said')\n    raise MemoryError\ncli.app = app\ncli.main()"
-    )
+    app = "def app():\n    print('said')\n    raise MemoryError\n"
+    code = f"from graphslam.app import cli\n{app}cli.app = app\ncli.main()"
+    buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     with open("/dev/full", "w") as full:
-        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=buffered
+        )
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
 

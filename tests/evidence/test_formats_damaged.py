@@ -39,6 +39,7 @@ CHANGES: dict[str, tuple[dict[str, Any], str]] = {
     "model of hits that free": ({"model": np.array([0.4, 0.4, 0.1, 0.9, 0.5])}, "array 'model' is impossible"),
     "voxel size 0": ({"voxel_size": np.float64(0)}, "voxel size is impossible; got 0.0"),
     "voxel size inf": ({"voxel_size": np.float64(np.inf)}, "voxel size is impossible"),
+    "voxel size large": ({"voxel_size": np.float64(1e300)}, "voxel size is impossible"),
     "voxel size text": ({"voxel_size": "0.1"}, "'voxel_size' has the wrong shape or type"),
     "dimension 4": ({"dim": np.int64(4)}, "dimension is impossible; got 4"),
     "dimension 2": ({"dim": np.int64(2)}, "2-D grid has voxels beside the layer"),

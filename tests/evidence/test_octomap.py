@@ -206,6 +206,7 @@ def test_cubes_cost_little(tmp_path: Path, depth: int, levels: int) -> None:
     low, high = known_bounds(grid)
     assert low.tolist() == [0 if depth else -32768] * 3
     assert (high - low).tolist() == [edge] * 3
+    assert np.array(grid.bounding_box()).tolist() == [(0.5 * low).tolist(), (0.5 * high).tolist()]
     inside, outside = (low + high) / 2, np.array([low[0] - 1, 0, 0])
     assert grid.values_at([inside * 0.5, (high - 0.5) * 0.5, (low + 0.5) * 0.5]).tolist() == [3072] * 3
     assert grid.values_at([(outside + 0.5) * 0.5, (high + 0.5) * 0.5]).tolist() == [UNKNOWN] * 2
@@ -272,6 +273,7 @@ BAD = {
     "no size": (FULL.replace(b"size", b"sighs"), r"header has no 'size'"),
     "negative size": (FULL.replace(b"size ", b"size -"), r"number of nodes is impossible"),
     "resolution zero": (FULL.replace(b"res 0.1", b"res 0.0"), r"byte \d+: resolution is impossible"),
+    "resolution large": (FULL.replace(b"res 0.1", b"res 1e300"), r"resolution is impossible"),
     "resolution NaN": (FULL.replace(b"res 0.1", b"res nan"), r"resolution is impossible"),
     "resolution word": (FULL.replace(b"res 0.1", b"res big"), r"resolution is impossible; got 'big'"),
     "size of another": (FULL.replace(b"size ", b"size 9"), r"not that of the header; got 19; wanted 919"),

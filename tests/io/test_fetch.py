@@ -7,6 +7,7 @@ import http.server
 import io
 import logging
 import threading
+import tracemalloc
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -204,8 +205,12 @@ def test_a_bomb_stays_folded(server: tuple[str, Path]) -> None:
     """A member that unfolds to more than the card says is read one byte too far, not to its end."""
     url, root = server
     (root / "set.zip").write_bytes(zipped(**{"a.txt": b"\0" * 200_000_000, "b.bin": b"abc"}))
+    tracemalloc.start()
     with pytest.raises(DataError, match="not the file of the card"):
         fetch(archived(url))
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 20_000_000
 
 
 def test_optional_file_may_be_missing_from_the_archive(server: tuple[str, Path]) -> None:
