@@ -3,6 +3,6 @@
 from setuptools import find_packages, setup
 
 setup(
-    packages=[*find_packages(include=["graphslam*", "frontends*"]), "graphslam.cards"],
+    packages=[*find_packages(include=["graphslam*"]), "graphslam.cards"],
     package_dir={"graphslam.cards": "datasets"},
 )

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from frontends.landmarks.config import RbpfEkfConfig
-from graphslam.app import config as cfg
+from graphslam.app.run import config as cfg
+from graphslam.frontends.landmarks.config import RbpfEkfConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [

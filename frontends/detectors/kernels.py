@@ -168,7 +168,7 @@ def detect(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-
         In the order of the ``P_`` constants.
     mean_g, var_g : (m + 1,)
         Mean and variance, by the number of beams on the trunk, of the half chord behind the middle beam, in units of
-        the step (see :mod:`frontends.detectors.trees`).
+        the step (see :mod:`graphslam.frontends.detectors.trees`).
 
     Returns
     -------

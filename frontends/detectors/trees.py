@@ -34,10 +34,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from frontends.detectors import kernels
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.records import LandmarkObservations, LaserScans
+from graphslam.frontends.detectors import kernels
 
 Ints = npt.NDArray[np.int64]
 

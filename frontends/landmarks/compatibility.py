@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from frontends.landmarks.compatibility_kernels import candidates_kernel, joint_kernel, nearest_kernel
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.frontends.landmarks.compatibility_kernels import candidates_kernel, joint_kernel, nearest_kernel
 
 Ints = npt.NDArray[np.int64]
 

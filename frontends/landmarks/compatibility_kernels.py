@@ -1,6 +1,7 @@
 """Compiled data association of one scan against a joint Gaussian: candidates, nearest neighbour, joint compatibility.
 
-All work on the active state of :mod:`frontends.landmarks.ekf_kernels`. Gates come as an array over the degrees of
+All work on the active state of :mod:`graphslam.frontends.landmarks.ekf_kernels`. Gates come as an array over the
+degrees of
 freedom, so that an observation without bearing is judged with one. Twin: ``tests/reference/ekf_slam.py``.
 """
 
@@ -11,8 +12,8 @@ import math
 import numba
 import numpy as np
 
-from frontends.landmarks.ekf_kernels import linearise
-from frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam.frontends.landmarks.ekf_kernels import linearise
+from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -12,10 +12,12 @@ import numpy.typing as npt
 from scipy.linalg import qr
 from scipy.linalg.blas import dsyrk
 
-from frontends.landmarks.compatibility import gates_by_dof, pair
-from frontends.landmarks.compatibility_kernels import misses_kernel
-from frontends.landmarks.ekf_config import EkfFilterConfig
-from frontends.landmarks.ekf_kernels import (
+from graphslam.core.errors import CovarianceError
+from graphslam.core.geometry import Array
+from graphslam.frontends.landmarks.compatibility import gates_by_dof, pair
+from graphslam.frontends.landmarks.compatibility_kernels import misses_kernel
+from graphslam.frontends.landmarks.ekf_config import EkfFilterConfig
+from graphslam.frontends.landmarks.ekf_kernels import (
     augment_kernel,
     gather_kernel,
     innovation_kernel,
@@ -24,8 +26,6 @@ from frontends.landmarks.ekf_kernels import (
     scatter_kernel,
     update_kernel,
 )
-from graphslam.core.errors import CovarianceError
-from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
 IGNORED = -1

@@ -17,7 +17,7 @@ import math
 import numba
 import numpy as np
 
-from frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
 
 
 @numba.njit(cache=True, error_model="numpy")

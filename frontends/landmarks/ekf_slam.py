@@ -10,13 +10,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
-from frontends.landmarks.ekf_filter import EkfMap
-from frontends.landmarks.prepare import Prepared, known_slots, prepare
-from frontends.landmarks.snapshot import Snapshot
-from frontends.landmarks.stopping import Stopping
-from frontends.landmarks.summarise import Smoothed, smooth
-from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
@@ -24,6 +17,13 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
+from graphslam.frontends.landmarks.ekf_filter import EkfMap
+from graphslam.frontends.landmarks.prepare import Prepared, known_slots, prepare
+from graphslam.frontends.landmarks.snapshot import Snapshot
+from graphslam.frontends.landmarks.stopping import Stopping
+from graphslam.frontends.landmarks.summarise import Smoothed, smooth
+from graphslam.frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 OnScan = Callable[[int], None]
@@ -209,7 +209,7 @@ class Ekf:
     def submaps(
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
-        """See :class:`frontends.base.FrontEnd`."""
+        """See :class:`graphslam.frontends.base.FrontEnd`."""
         data = _prepare(log, self.config, drops)
         times, epsilon = data.observations.times, _measurement_sigma(data)
         key, scan, t_start = 0, 0, data.t_start
@@ -261,7 +261,7 @@ class EkfSlam:
     def submaps(
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
-        """See :class:`frontends.base.FrontEnd`; there is nothing after the one submap."""
+        """See :class:`graphslam.frontends.base.FrontEnd`; there is nothing after the one submap."""
         if after is not None:
             return
         data = _prepare(log, self.config, drops)

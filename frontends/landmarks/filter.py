@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.config import FilterConfig
-from frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
-from frontends.landmarks.range_only import Start, WaitingRanges
-from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, se2_transform, wrap_angle
+from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.frontends.landmarks.config import FilterConfig
+from graphslam.frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
+from graphslam.frontends.landmarks.range_only import Start, WaitingRanges
 
 Ints = npt.NDArray[np.int64]
 

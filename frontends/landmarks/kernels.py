@@ -7,7 +7,7 @@ Cost per scan is particles × (landmarks + observations × landmarks *near each 
 bucketed, and an observation looks only into the buckets inside its gate.
 
 An observation with an infinite bearing variance is a range alone: one channel in innovation, likelihood and gate. It
-updates a landmark but cannot found one; what waits for that is in :mod:`frontends.landmarks.range_only`.
+updates a landmark but cannot found one; what waits for that is in :mod:`graphslam.frontends.landmarks.range_only`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import numba
 import numpy as np
 
-from frontends.landmarks.measurement_kernels import (
+from graphslam.frontends.landmarks.measurement_kernels import (
     TWO_PI,
     inverse_innovation,
     landmark_block,

@@ -11,14 +11,14 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from frontends.detectors.trees import TreeDetectorConfig, detect_trees
-from frontends.landmarks.config import RangeBearingNoise
-from frontends.motion import MotionNoise, motion_stream
-from frontends.motion_gaps import SHORTEST, MotionGap, bridged_reckoning
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
+from graphslam.frontends.detectors.trees import TreeDetectorConfig, detect_trees
+from graphslam.frontends.landmarks.config import RangeBearingNoise
+from graphslam.frontends.odometry.motion import MotionNoise, motion_stream
+from graphslam.frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning
 
 Ints = npt.NDArray[np.int64]
 

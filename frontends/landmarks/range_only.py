@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.config import DelayedStart
-from frontends.landmarks.range_only_kernels import (
+from graphslam.core.geometry import Array
+from graphslam.frontends.landmarks.config import DelayedStart
+from graphslam.frontends.landmarks.range_only_kernels import (
     FIT_LENGTH,
     FIT_LOG_LIKELIHOOD,
     FIT_MARGIN,
@@ -32,7 +33,6 @@ from frontends.landmarks.range_only_kernels import (
     trilaterate,
     trilaterate_all,
 )
-from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from frontends.landmarks.measurement_kernels import LOG_2PI, TWO_PI
+from graphslam.frontends.landmarks.measurement_kernels import LOG_2PI, TWO_PI
 
 STARTS = 16
 ITERATIONS = 40

@@ -9,14 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.config import RbpfEkfConfig
-from frontends.landmarks.filter import ParticleSet
-from frontends.landmarks.honesty import distance, flag, particle_gaussians
-from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
-from frontends.landmarks.rivals import SubmapProblem, settle_rivals
-from frontends.landmarks.stopping import Stopping
-from frontends.landmarks.summarise import Smoothed, winning_association
-from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
@@ -24,6 +16,14 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.landmarks.config import RbpfEkfConfig
+from graphslam.frontends.landmarks.filter import ParticleSet
+from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
+from graphslam.frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
+from graphslam.frontends.landmarks.stopping import Stopping
+from graphslam.frontends.landmarks.summarise import Smoothed, winning_association
+from graphslam.frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 
@@ -41,7 +41,7 @@ class RbpfEkf:
     def submaps(
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
-        """See :class:`frontends.base.FrontEnd`."""
+        """See :class:`graphslam.frontends.base.FrontEnd`."""
         for submap, _ in self.with_particles(log, seed=seed, after=after, drops=drops):
             yield submap
 

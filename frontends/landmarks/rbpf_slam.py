@@ -13,12 +13,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.config import RbpfSlamConfig
-from frontends.landmarks.lineage import WholeMapParticles
-from frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
-from frontends.landmarks.snapshot import Snapshot
-from frontends.landmarks.summarise import REGULARISER, Moments
-from frontends.landmarks.systematic import systematic
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, circular_mean, vector_to_tangent_covariance, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
@@ -26,6 +20,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.landmarks.config import RbpfSlamConfig
+from graphslam.frontends.landmarks.lineage import WholeMapParticles
+from graphslam.frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from graphslam.frontends.landmarks.snapshot import Snapshot
+from graphslam.frontends.landmarks.summarise import REGULARISER, Moments
+from graphslam.frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 Joint = Literal["never", "last", "all"]
@@ -116,7 +116,7 @@ def rbpf_snapshots(
     ConfigError
         If the cuts do not increase or lie outside the log.
     MissingDataError
-        See :func:`frontends.landmarks.prepare.prepare`.
+        See :func:`graphslam.frontends.landmarks.prepare.prepare`.
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")
@@ -144,7 +144,7 @@ class RbpfSlam:
     def submaps(
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
-        """See :class:`frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
             data = prepare(log, self.config, drops if drops is not None else DropCounter())
             yield self._build(data, seed.child(0))

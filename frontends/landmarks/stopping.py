@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from frontends.landmarks.config import StoppingConfig
 from graphslam.core.geometry import Array
+from graphslam.frontends.landmarks.config import StoppingConfig
 
 
 class GrowingMap(Protocol):

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.filter import ParticleSet
-from frontends.landmarks.smoothing_kernels import smooth_kernel, smoothed_covariances, smoothing_cost
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
+from graphslam.frontends.landmarks.filter import ParticleSet
+from graphslam.frontends.landmarks.smoothing_kernels import smooth_kernel, smoothed_covariances, smoothing_cost
 
 Ints = npt.NDArray[np.int64]
 _HUBER2 = 1.345**2

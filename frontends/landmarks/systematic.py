@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.prepare import Prepared
-from frontends.landmarks.smoothing_kernels import smooth_kernel
 from graphslam.core.geometry import (
     Array,
     rotation2,
@@ -34,6 +32,8 @@ from graphslam.core.geometry import (
     se2_transform,
     wrap_angle,
 )
+from graphslam.frontends.landmarks.prepare import Prepared
+from graphslam.frontends.landmarks.smoothing_kernels import smooth_kernel
 
 Ints = npt.NDArray[np.int64]
 PARAMETERS = (

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.config import ChoiceConfig
-from frontends.segslam.localisation import Localisation
-from frontends.segslam.segmap import MATCH, Entry
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.frontends.segslam.config import ChoiceConfig
+from graphslam.frontends.segslam.localisation import Localisation
+from graphslam.frontends.segslam.segmap import MATCH, Entry
 from graphslam.registration import gates
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.gates import height_between, match_fails, shift_between, tilt_between

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from frontends.filter_drift import FilterDrift
-from frontends.grid_config import GridFilterConfig
-from frontends.scan_use import checked_steps, with_findings
-from frontends.segslam.config import SegSlamConfig
-from frontends.segslam.progress import Watch
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.segslam import run_segslam
-from frontends.segslam.submaps import drift_by_path, settle, settled_chain
-from frontends.step_config import StepConfig
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.segslam.config import SegSlamConfig
+from graphslam.frontends.segslam.progress import Watch
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.segslam import run_segslam
+from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ class SegSlam:
     def submaps(
         self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[Submap]:
-        """See :class:`frontends.base.FrontEnd`: the settled chain of the best particle, segment by segment."""
+        """See :class:`~graphslam.frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
         c = self.config
         steps = checked_steps(log, c.steps, drops)
         result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=self.watch)

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from frontends.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from frontends.segslam.config import LocalisationConfig
-from frontends.segslam.segmentation import Window
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of, pose_mean, pose_scatter
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.evidence.queries import cast_grids
+from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.frontends.segslam.config import LocalisationConfig
+from graphslam.frontends.segslam.segmentation import Window
 
 _SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
 

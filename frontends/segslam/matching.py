@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.choice import NULL, Proposal, judge
-from frontends.segslam.config import SegSlamConfig
-from frontends.segslam.localisation import localise
-from frontends.segslam.sampling import draw_weights, grow, root_of_particle
-from frontends.segslam.segmap import NEW, Entry, SegMap
-from frontends.segslam.window import Ahead
-from frontends.segslam.winnowing import Candidates, Winnowed, winnow
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
+from graphslam.frontends.segslam.choice import NULL, Proposal, judge
+from graphslam.frontends.segslam.config import SegSlamConfig
+from graphslam.frontends.segslam.localisation import localise
+from graphslam.frontends.segslam.sampling import draw_weights, grow, root_of_particle
+from graphslam.frontends.segslam.segmap import NEW, Entry, SegMap
+from graphslam.frontends.segslam.window import Ahead
+from graphslam.frontends.segslam.winnowing import Candidates, Winnowed, winnow
 from graphslam.registration.register import Registration, distinct, register_starts
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.sampling import OPEN, MapSample
-from frontends.segslam.segmap import SegMap
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.segslam.sampling import OPEN, MapSample
+from graphslam.frontends.segslam.segmap import SegMap
 
 Ints = npt.NDArray[np.int64]
 

@@ -8,9 +8,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from frontends.segslam.segmap import SegMap
-from frontends.segslam.submaps import base_of, settled_chain
 from graphslam.core.geometry import Array
+from graphslam.frontends.segslam.segmap import SegMap
+from graphslam.frontends.segslam.submaps import base_of, settled_chain
 
 
 @dataclass(frozen=True, slots=True)

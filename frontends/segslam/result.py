@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.ancestry import Ancestry
-from frontends.grid_filter import Tally
-from frontends.segslam.matching import Attempt
-from frontends.segslam.paths import concatenate
-from frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
-from frontends.segslam.segmap import SegMap
-from frontends.segslam.winnowing import Winnowed
-from frontends.steps import Steps
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.grid.ancestry import Ancestry
+from graphslam.frontends.grid.filter import Tally
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.matching import Attempt
+from graphslam.frontends.segslam.paths import concatenate
+from graphslam.frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
+from graphslam.frontends.segslam.segmap import SegMap
+from graphslam.frontends.segslam.winnowing import Winnowed
 
 Ints = npt.NDArray[np.int64]
 

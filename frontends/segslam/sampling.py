@@ -18,10 +18,10 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.segmap import NEW, Entry, SegMap
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.poses import frame_between, heading_of, upright
+from graphslam.frontends.segslam.segmap import NEW, Entry, SegMap
 
 Ints = npt.NDArray[np.int64]
 

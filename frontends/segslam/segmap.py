@@ -16,14 +16,14 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
-from frontends.segslam.store import Maps, Table
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, Group, normalised
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
+from graphslam.frontends.segslam.store import Maps, Table
 
 Ints = npt.NDArray[np.int64]
 

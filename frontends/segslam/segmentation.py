@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.config import SegmentationConfig
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of, normalised
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood
 from graphslam.evidence.queries import cast_grids
+from graphslam.frontends.segslam.config import SegmentationConfig
 
 Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
 """Points, origins and returns of one step, in the base frame at its stamp."""

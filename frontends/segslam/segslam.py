@@ -17,20 +17,20 @@ import numpy as np
 import numpy.typing as npt
 from tqdm.auto import tqdm
 
-from frontends.grid_config import GridFilterConfig
-from frontends.grid_filter import GridFilter
-from frontends.segslam.config import SegSlamConfig
-from frontends.segslam.matching import Attempt, Matcher
-from frontends.segslam.progress import Progress, Watch
-from frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
-from frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
-from frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
-from frontends.segslam.window import Ahead, look_ahead
-from frontends.steps import Steps
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.filter import GridFilter
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.config import SegSlamConfig
+from graphslam.frontends.segslam.matching import Attempt, Matcher
+from graphslam.frontends.segslam.progress import Progress, Watch
+from graphslam.frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
+from graphslam.frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
+from graphslam.frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
+from graphslam.frontends.segslam.window import Ahead, look_ahead
 
 Ints = npt.NDArray[np.int64]
 
@@ -58,9 +58,9 @@ def run_segslam(
     progress : bool
         Show a progress bar.
     prune_every : int
-        See :class:`~frontends.ancestry.Ancestry`.
+        See :class:`~graphslam.frontends.grid.ancestry.Ancestry`.
     watch : callable, optional
-        Called with a :class:`~frontends.segslam.progress.Progress` after every step; changes nothing.
+        Called with a :class:`~graphslam.frontends.segslam.progress.Progress` after every step; changes nothing.
 
     Raises
     ------

@@ -7,11 +7,11 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.segment import KINDS
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, heading_of
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.segslam.segment import KINDS
 
 Ints = npt.NDArray[np.int64]
 Scans = frozenset[tuple[int, int]]

@@ -14,13 +14,6 @@ from typing import Any, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.filter_drift import FilterDrift
-from frontends.scan_use import uncorrected, uncorrected_covariance
-from frontends.segslam.config import HandoverConfig
-from frontends.segslam.covariance import exit_covariance
-from frontends.segslam.sampling import MapSample, nearest_step
-from frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
-from frontends.steps import Steps
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2
@@ -28,6 +21,13 @@ from graphslam.core.poses import frame_between, group_of, level, normalised, pos
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.odometry.scan_use import uncorrected, uncorrected_covariance
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.config import HandoverConfig
+from graphslam.frontends.segslam.covariance import exit_covariance
+from graphslam.frontends.segslam.sampling import MapSample, nearest_step
+from graphslam.frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 
 Ints = npt.NDArray[np.int64]
 
@@ -53,7 +53,8 @@ class _Errors(Protocol):
 def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | None = None) -> Drift:
     """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
 
-    With the steps also what dead reckoning adds where no scan corrects it (:mod:`frontends.scan_use`).
+    With the steps also what dead reckoning adds where no scan corrects it
+    (:mod:`graphslam.frontends.odometry.scan_use`).
     """
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
     stretches = [] if steps is None else uncorrected(steps)
@@ -67,7 +68,7 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
 
 
 def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
-    """The drift that the source of the motion states over any interval (`frontends.steps.PathErrors`)."""
+    """The drift that the source of the motion states over any interval (`PathErrors`)."""
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
         return errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from frontends.grid_weights import spread
-from frontends.segslam.segmentation import Window, gather_window
-from frontends.steps import Steps
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.frontends.grid.weights import spread
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.segmentation import Window, gather_window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

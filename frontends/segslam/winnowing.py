@@ -11,11 +11,11 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.config import WinnowConfig
-from frontends.segslam.sampling import OPEN, MapSample
-from frontends.segslam.segmap import SegMap
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.evidence.contents import box_query
+from graphslam.frontends.segslam.config import WinnowConfig
+from graphslam.frontends.segslam.sampling import OPEN, MapSample
+from graphslam.frontends.segslam.segmap import SegMap
 
 Ints = npt.NDArray[np.int64]
 

@@ -17,15 +17,15 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import consistency_index, joint_nees, vector_pose_error
 from graphslam.evaluate.map_error import match_ids
-from graphslam.graph.submap_blocks import relabel, scale_covariances
-from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.join.association import Association
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish as polish_join
-from graphslam.solve.submap_batch import solve_submaps
+from graphslam.join.submap_batch import solve_submaps
+from graphslam.join.submap_blocks import relabel, scale_covariances
+from graphslam.join.submap_solver import SubmapEstimate
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ JSON_COLUMNS = (
 
 
 def _isam2(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> SubmapEstimate:
-    from graphslam.solve.submap_isam2 import solve_submaps_isam2  # gtsam takes a second to load
+    from graphslam.join.submap_isam2 import solve_submaps_isam2  # gtsam takes a second to load
 
     return solve_submaps_isam2(submaps, polish=polish, progress=progress)
 

@@ -10,15 +10,15 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
-from frontends.segslam.progress import Progress
-from graphslam.app.pipeline import run
-from graphslam.app.run import Run
+from graphslam.app.run.pipeline import run
+from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.segslam.progress import Progress
 from graphslam.plots.comparison import plot_comparison
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments

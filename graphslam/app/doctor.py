@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
-from graphslam.app.front_ends import front_end_names
+from graphslam.app.run.front_ends import front_end_names
 from graphslam.io.catalog import cache_folder, data_roots
 
 REQUIRED = {

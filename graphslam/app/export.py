@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.app.folder_lock import locked
-from graphslam.app.generations import name_inside, new_generation
-from graphslam.app.outputs import open_run
-from graphslam.app.run import Run
+from graphslam.app.folders.generations import name_inside, new_generation
+from graphslam.app.folders.lock import locked
+from graphslam.app.run.outputs import open_run
+from graphslam.app.run.run import Run
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic

@@ -10,7 +10,7 @@ from graphslam.core.network import PoseNetwork
 from graphslam.io.g2o import write_g2o
 from graphslam.io.isam_graph import Noise
 from graphslam.io.network_file import read_network
-from graphslam.solve.network_solve import NetworkSolution, solve_network
+from graphslam.solve.network.solve import NetworkSolution, solve_network
 
 RESIDUAL = "gtsam: Log(z^-1 x_i^-1 x_j)"
 
@@ -50,7 +50,7 @@ def solve_file(
         Also say whether the answer is certified to be the global optimum (``"certificate"`` in words, its numbers in
         ``"certificate_numbers"``).
     **options
-        Of :func:`graphslam.solve.network_solve.solve_network`.
+        Of :func:`graphslam.solve.network.solve.solve_network`.
 
     Returns
     -------

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.generations import consistent
-from graphslam.app.outputs import identified_submaps
-from graphslam.app.run import Run
-from graphslam.app.run_files import read_options
+from graphslam.app.folders.generations import consistent
+from graphslam.app.run.files import read_options
+from graphslam.app.run.outputs import identified_submaps
+from graphslam.app.run.run import Run
 from graphslam.core.errors import MissingDataError
 from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth

@@ -9,13 +9,13 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app import compare as comparing
-from graphslam.app.local_maps import local_maps as local_maps
-from graphslam.app.outputs import open_run as open_run
-from graphslam.app.pipeline import load_log_source
-from graphslam.app.pipeline import run as run
-from graphslam.app.run import Run
-from graphslam.app.study import open_study as open_study
-from graphslam.app.study import study as study
+from graphslam.app.run.local_maps import local_maps as local_maps
+from graphslam.app.run.outputs import open_run as open_run
+from graphslam.app.run.pipeline import load_log_source
+from graphslam.app.run.pipeline import run as run
+from graphslam.app.run.run import Run
+from graphslam.app.studies.study import open_study as open_study
+from graphslam.app.studies.study import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate as simulate

@@ -21,13 +21,13 @@ from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import Consistency, nees, vector_pose_error
-from graphslam.graph.submap_blocks import SubmapProblem, check_identified
-from graphslam.graph.submap_solver import SubmapEstimate, minimise
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
+from graphslam.join.submap_blocks import SubmapProblem, check_identified
+from graphslam.join.submap_solver import SubmapEstimate, minimise
 
 logger = logging.getLogger(__name__)
 
@@ -215,7 +215,7 @@ def polish_history(
     start : SubmapEstimate, optional
         Map to start from, of these submaps and unpolished; default the chain of submaps.
     rtol, max_iterations
-        See :func:`~graphslam.graph.submap_solver.minimise`.
+        See :func:`~graphslam.join.submap_solver.minimise`.
     """
     problem = SubmapProblem(submaps)
     x = problem.initial() if start is None else problem.initial(start.poses[1:], start.landmarks)

@@ -34,7 +34,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_log, se2_transform, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.evaluate.without_truth import correlated_dof, two_sided
-from graphslam.graph.submap_blocks import fuse_repeated, landmark_map_of
+from graphslam.join.submap_blocks import fuse_repeated, landmark_map_of
 
 Ints = npt.NDArray[np.int64]
 

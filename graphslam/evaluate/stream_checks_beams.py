@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from frontends.deskew import repeated_clouds, repeated_scans
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans
+from graphslam.frontends.odometry.deskew import repeated_clouds, repeated_scans
 
 Scanner = LaserScans | RangeScans | PointClouds
 Mask = npt.NDArray[np.bool_]

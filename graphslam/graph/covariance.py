@@ -17,7 +17,7 @@ from scipy.linalg import lapack
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.state import Layout
-from graphslam.graph.symmetric_factor import SymmetricFactor
+from graphslam.linear.symmetric_factor import SymmetricFactor
 
 
 class JointCovariance:

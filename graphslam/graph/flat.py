@@ -16,9 +16,9 @@ import scipy.sparse as sp
 
 from graphslam.core.geometry import Array
 from graphslam.graph.attitude import AttitudeFamily
+from graphslam.graph.factors.imu.family import ForceFamily, GyroFamily, ImuBiasFamily, ImuFamily
 from graphslam.graph.families import BetweenFamily, BiasPriorFamily, Family, SubmapFamily, offsets
 from graphslam.graph.gps_family import GpsFamily
-from graphslam.graph.imu_family import ForceFamily, GyroFamily, ImuBiasFamily, ImuFamily
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.normal_kernels import scatter_dense
 from graphslam.graph.records import Record

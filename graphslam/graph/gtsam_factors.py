@@ -11,7 +11,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.gtsam_imu import imu_in_space
+from graphslam.graph.factors.imu.gtsam import imu_in_space
 from graphslam.graph.gtsam_space import attitude_in_space, gps_in_space
 from graphslam.graph.gtsam_values import gtsam_pose
 from graphslam.graph.noise import NO_KERNEL, Robust

@@ -18,14 +18,14 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
 from graphslam.graph.attitude import up_turn
 from graphslam.graph.attitude_verbs import LEVELLED, AttitudeVerbs, without_tilt
-from graphslam.graph.imu_axes import check_imu_axes
-from graphslam.graph.imu_config import ImuConfig, Place, path_of, places_of
-from graphslam.graph.imu_family import GYRO_ROWS, XI, XJ, Ways, way_terms
-from graphslam.graph.imu_plan import FEWEST, Plan, joined, plan_of, window_of
-from graphslam.graph.imu_records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.imu_states import ImuStates, compacted, links_wanted
+from graphslam.graph.factors.imu.axes import check_imu_axes
+from graphslam.graph.factors.imu.config import ImuConfig, Place, path_of, places_of
+from graphslam.graph.factors.imu.family import GYRO_ROWS, XI, XJ, Ways, way_terms
+from graphslam.graph.factors.imu.plan import FEWEST, Plan, joined, plan_of, window_of
+from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
+from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
+from graphslam.graph.factors.imu.states import ImuStates, compacted, links_wanted
 from graphslam.graph.noise import whitener
-from graphslam.graph.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
 from graphslam.graph.records import AttitudeRecord, BetweenRecord
 
 logger = logging.getLogger(__name__)
@@ -53,7 +53,8 @@ class ImuVerbs(AttitudeVerbs):
         """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
 
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
-        preintegrated way (:mod:`graphslam.graph.preintegration`, :mod:`graphslam.graph.imu_family`), inner nodes
+        preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
+        :mod:`graphslam.graph.factors.imu.family`), inner nodes
         included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
         the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
         pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The

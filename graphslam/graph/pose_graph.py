@@ -9,14 +9,14 @@ The path of a pipeline, once per finished submap, and the end of a run::
 
     graph = PoseGraph()
     solver = make_solver("isam2", graph)                     # graphslam.solve.registry; "batch" has the same verbs
-    config = AssociationConfig(covariance_scale=5.0)         # graphslam.graph.landmark_association
+    config = AssociationConfig(covariance_scale=5.0)         # graphslam.association.landmarks
     graph.add_gps(log["gps"], config=GpsConfig(robust=Robust("cauchy", 2.385)))  # fixes wait for their submap
     for submap in submaps:
         ids = associate(graph, submap, config)               # -1 = new
         graph.add_submap(submap, landmark_ids=ids, covariance_scale=5.0)
         solver.update()
     graph.finish_gps()
-    for keep, drop in euclidean_merges(graph, 0.7):          # graphslam.graph.landmark_merging
+    for keep, drop in euclidean_merges(graph, 0.7):          # graphslam.association.merging
         graph.merge_landmarks(keep, drop)
     solver.solve_to_optimum()
     solution = solver.solution()

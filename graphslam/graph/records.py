@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.graph.imu_records import MotionRecord
+from graphslam.graph.factors.imu.records import MotionRecord
 from graphslam.graph.noise import NO_KERNEL, Robust
 
 

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from graphslam.association.consistent_set import Chain
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.gaussian import inverses
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
 from graphslam.core.reading import read_text, usable
-from graphslam.graph.consistent_set import Chain
 from graphslam.io.text_records import find_text_file
 
 INPUT, TRUTH = "Lecture_Hall_Input.txt", "Lecture_Hall_GT.txt"

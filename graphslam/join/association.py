@@ -18,10 +18,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from graphslam.association.compatibility import distance2, joint_limits, most_pairings, nearest, search
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
-from graphslam.graph.compatibility import distance2, joint_limits, most_pairings, nearest, search
 from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
 
 logger = logging.getLogger(__name__)

@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.graph.symmetric_factor import elimination_order
 from graphslam.join import kernels
 from graphslam.join.joined_map import JoinedMap, JoinTimes
+from graphslam.linear.symmetric_factor import elimination_order
 
 Index = npt.NDArray[np.intp]
 

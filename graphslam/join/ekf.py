@@ -27,7 +27,6 @@ from tqdm.auto import tqdm
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.submap_blocks import landmark_map_of
 from graphslam.join.association import Association, associate
 from graphslam.join.joined_map import (
     Ids,
@@ -41,6 +40,7 @@ from graphslam.join.joined_map import (
     landmark_scalars,
     last_pose,
 )
+from graphslam.join.submap_blocks import landmark_map_of
 
 Index = npt.NDArray[np.intp]
 Form = Literal["square", "naive"]

@@ -16,17 +16,17 @@ import scipy.sparse as sp
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.block_cholesky import BlockFactor, BlockSymbolic
-from graphslam.graph.submap_blocks import (
+from graphslam.join import kernels
+from graphslam.join.submap_blocks import (
     SubmapProblem,
     check_identified,
     dense_information,
     fuse_repeated,
     landmark_map_of,
 )
-from graphslam.graph.submap_pattern import csc_of_blocks
-from graphslam.graph.submap_solver import SubmapEstimate
-from graphslam.join import kernels
+from graphslam.join.submap_pattern import csc_of_blocks
+from graphslam.join.submap_solver import SubmapEstimate
+from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 
 Index = npt.NDArray[np.intp]
 Ids = npt.NDArray[np.int64]

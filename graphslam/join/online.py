@@ -21,12 +21,12 @@ from tqdm.auto import tqdm
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_blocks import SubmapProblem
-from graphslam.graph.submap_solver import Minimum, minimise
 from graphslam.join import kernels
 from graphslam.join.association import Association, associate
 from graphslam.join.eif import join_maps, match_by_id
 from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish, landmark_labels
+from graphslam.join.submap_blocks import SubmapProblem
+from graphslam.join.submap_solver import Minimum, minimise
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class RelinearisationPolicy:
     every : int
         After every so many submaps in any case; 0: never for that reason alone.
     rtol, max_iterations
-        See :func:`~graphslam.graph.submap_solver.minimise`.
+        See :func:`~graphslam.join.submap_solver.minimise`.
     """
 
     closure_gap: int = 5

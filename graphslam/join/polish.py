@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_blocks import SubmapProblem
-from graphslam.graph.submap_solver import minimise
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.submap_blocks import SubmapProblem
+from graphslam.join.submap_solver import minimise
 
 
 def polish(
@@ -25,7 +25,7 @@ def polish(
         Those that were joined; their ids are replaced by ``joined.submap_ids``.
     joined : JoinResult
     rtol, max_iterations
-        See :func:`~graphslam.graph.submap_solver.minimise`.
+        See :func:`~graphslam.join.submap_solver.minimise`.
 
     Returns
     -------

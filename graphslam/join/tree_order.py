@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.graph.submap_kernels import adjacency
-from graphslam.graph.symmetric_factor import elimination_order
+from graphslam.join.submap_kernels import adjacency
+from graphslam.linear.symmetric_factor import elimination_order
 
 Ids = npt.NDArray[np.int64]
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from frontends.segslam.segmap import NEW, SegMap
-from frontends.segslam.submaps import base_of
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.segslam.segmap import NEW, SegMap
+from graphslam.frontends.segslam.submaps import base_of
 from graphslam.maps.added import added, grid_of, own_evidence
 
 

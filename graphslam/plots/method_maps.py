@@ -17,7 +17,7 @@ from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import nees
 from graphslam.evaluate.map_error import match_ids
-from graphslam.graph.submap_solver import SubmapEstimate
+from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.plots import style
 from graphslam.plots.map import landmark_blocks, plot_ellipses
 

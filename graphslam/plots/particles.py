@@ -11,14 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 
-from frontends.landmarks.filter import ParticleSet
-from frontends.rbpf_grid import RbpfResult
-from frontends.segslam.result import SegSlamResult
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.submap_consistency import true_submap
+from graphslam.frontends.grid.rbpf_grid import RbpfResult
+from graphslam.frontends.landmarks.filter import ParticleSet
+from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.plots import style
 from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.map import landmark_blocks, plot_ellipses

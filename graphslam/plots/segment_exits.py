@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from frontends.segslam.covariance import Nees
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
+from graphslam.frontends.segslam.covariance import Nees
 from graphslam.plots import style
 from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.paths import position_covariances

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from frontends.segslam.sampling import OPEN, MapSample, nearest_step
-from frontends.segslam.segmap import KINDS, MATCH, SegMap
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.segslam.sampling import OPEN, MapSample, nearest_step
+from graphslam.frontends.segslam.segmap import KINDS, MATCH, SegMap
 from graphslam.plots import style
 
 Path = Trajectory | npt.ArrayLike

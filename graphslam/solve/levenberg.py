@@ -17,7 +17,7 @@ from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.graph.flat import FlatGraph, System
 from graphslam.graph.state import Values
-from graphslam.graph.symmetric_factor import SymmetricFactor
+from graphslam.linear.symmetric_factor import SymmetricFactor
 
 # A dense Cholesky factorisation beats a sparse one below this many columns (measured).
 DENSE_SOLVE_LIMIT = 600

@@ -10,8 +10,8 @@ import pytest
 from graphslam.app.compare import DEFAULT_METHODS, join
 from graphslam.core.geometry import se2_compose
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.io.slsjf import read_slsjf_local_maps
+from graphslam.join.submap_solver import SubmapEstimate
 from tests.reference.submap_chain import submap_chain
 
 

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from frontends.segslam.progress import Progress
-from frontends.segslam.segslam import run_segslam
-from frontends.steps import make_steps
-from graphslam.app import config as cfg
 from graphslam.app.demo import DemoProgress, demo_log
-from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from tests.app.test_cli import graphslam, refused
+from graphslam.frontends.odometry.steps import make_steps
+from graphslam.frontends.segslam.progress import Progress
+from graphslam.frontends.segslam.segslam import run_segslam
+from tests.app.cli.test_cli import graphslam, refused
 
 
 def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:

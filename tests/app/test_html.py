@@ -18,13 +18,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import frontends
 import graphslam
-from graphslam.app.merge import MergedMap
-from graphslam.app.run import GlobalMap, Run
-from graphslam.app.study import Study
-from graphslam.app.study_folder import StudyFolder
-from graphslam.app.without_truth import WithoutTruth
+import graphslam.frontends
+from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.without_truth import WithoutTruth
+from graphslam.app.sessions.merge import MergedMap
+from graphslam.app.studies.folder import StudyFolder
+from graphslam.app.studies.study import Study
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import VelocityControls
 from graphslam.core.submap import Submap
@@ -35,8 +35,8 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.ledger import Ledger
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.score import ClassScore, Score
-from graphslam.graph.submap_solver import SubmapEstimate
 from graphslam.io.cards import list_cards
+from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.solve.batch import BatchSolver
 
 EVIL = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&"
@@ -46,7 +46,7 @@ NOTHING = np.zeros(0, dtype=np.int64)
 def classes() -> dict[str, type]:
     """Every class of the package that says how it looks in a notebook."""
     found = {}
-    for package in (graphslam, frontends):
+    for package in (graphslam,):
         for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if m.name.endswith("__main__"):
                 continue
@@ -173,20 +173,22 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     "graphslam.graph.ledger.Ledger": a_ledger,
     "graphslam.graph.score.Score": lambda _: Score({"class": ClassScore(1.0, 1, 1, 1)}),
     "graphslam.graph.graph_record.GraphRecord": a_graph,
-    "graphslam.graph.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
+    "graphslam.join.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
         np.zeros((1, 3)), NOTHING, np.zeros((0, 2)), None, 0.0, None, 1, True, 0.0, np.zeros((0, 0))
     ),
     "graphslam.solve.solution.Solution": a_solution,
     "graphslam.evidence.grid.EvidenceGrid": lambda _: EvidenceGrid(0.1),
-    "graphslam.app.without_truth.WithoutTruth": lambda _: WithoutTruth({"c": ClassConsistency(**CLASS)}, None, None),
-    "graphslam.app.study.Study": a_study,
-    "graphslam.app.merge.MergedMap": a_merge,
-    "graphslam.app.run.Run": a_run,
+    "graphslam.app.run.without_truth.WithoutTruth": lambda _: WithoutTruth(
+        {"c": ClassConsistency(**CLASS)}, None, None
+    ),
+    "graphslam.app.studies.study.Study": a_study,
+    "graphslam.app.sessions.merge.MergedMap": a_merge,
+    "graphslam.app.run.run.Run": a_run,
 }
 # texts of these stand in the code, not in a file: their HTML has no place for a foreign one
 OWN_WORDS = {
     "graphslam.graph.graph_record.GraphRecord",
-    "graphslam.graph.submap_solver.SubmapEstimate",
+    "graphslam.join.submap_solver.SubmapEstimate",
     "graphslam.evidence.grid.EvidenceGrid",
 }
 FOUND = classes()

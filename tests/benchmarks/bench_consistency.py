@@ -19,7 +19,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from graphslam.app.compare import compare
-from graphslam.app.pipeline import run
+from graphslam.app.run.pipeline import run
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import simulate
 from graphslam.core.gaussian import chi2_mean_bounds

@@ -10,7 +10,7 @@ import argparse
 import numpy as np
 
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.graph.imu_config import ImuConfig
+from graphslam.graph.factors.imu.config import ImuConfig
 from tests.reference.imu_ring import STEP
 from tests.reference.imu_study import trial
 

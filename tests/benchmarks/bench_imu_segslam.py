@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from graphslam.app import pipeline
+from graphslam.app.run import pipeline
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry

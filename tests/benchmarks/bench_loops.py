@@ -19,9 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from frontends.filter_drift import FilterDrift
-from frontends.segslam.segslam import run_segslam
-from frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from graphslam.app.studies import segslam_building, segslam_garage, segslam_mine
 from graphslam.app.studies.segslam_trial import GridTrial
 from graphslam.core import se3
@@ -30,16 +27,19 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
-from graphslam.graph.loop_appearance import AppearanceConfig, appearance_candidates
-from graphslam.graph.loop_candidates import CandidateConfig, proximity_candidates
-from graphslam.graph.loop_measure import Loop, LoopMeasurer
-from graphslam.graph.loop_places import ChainRelative, Places, places_of
-from graphslam.graph.loops import LoopCloser
+from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.segslam.segslam import run_segslam
+from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from graphslam.io.submap_store import read_submaps, write_submaps
+from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
+from graphslam.loops.candidates import CandidateConfig, proximity_candidates
+from graphslam.loops.judge import settled_loops
+from graphslam.loops.loops import LoopCloser
+from graphslam.loops.measure import Loop, LoopMeasurer
+from graphslam.loops.places import ChainRelative, Places, places_of
 from graphslam.registration.place_descriptor import describe, join, similarity
-from graphslam.sim.wrong_submap_loops import KINDS, inject_wrong_loops
-from graphslam.solve.loop_judge import settled_loops
-from graphslam.solve.loop_network import LoopNetwork
+from tests.reference.loop_network import LoopNetwork
+from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops
 
 WORLDS = {**segslam_garage.WORLDS, **segslam_mine.WORLDS, **segslam_building.WORLDS}
 DEFAULT = ("garage-A:1", "garage-B:1", "garage-C:1", "garage-D:1", "building:1", "mine:1")

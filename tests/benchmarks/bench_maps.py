@@ -28,13 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from frontends.grid_config import GridFilterConfig
-from frontends.segslam.front_end import SegSlamFrontEndConfig, settled
-from frontends.segslam.segslam import run_segslam
-from frontends.step_config import StepConfig
-from frontends.steps import Steps, make_steps
-from graphslam.app import config as cfg
-from graphslam.app.front_ends import recommended
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import recommended
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
@@ -42,6 +37,11 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.compact import pieces_of
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import Steps, make_steps
+from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig, settled
+from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.catalog import load
 from graphslam.maps.fuse import FusedMap, fuse
 from graphslam.maps.pieces import DivisionConfig, PieceId

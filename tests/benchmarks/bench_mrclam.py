@@ -25,9 +25,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from graphslam.app.merge import merge
-from graphslam.app.pipeline import load_log_source, run
-from graphslam.app.run import Run
+from graphslam.app.run.pipeline import load_log_source, run
+from graphslam.app.run.run import Run
+from graphslam.app.sessions.merge import merge
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_inverse, se2_transform
 from graphslam.core.log import Truth

@@ -14,9 +14,6 @@ import time
 
 import numpy as np
 
-from frontends.grid_config import GridFilterConfig
-from frontends.rbpf_grid import run_rbpf
-from frontends.steps import Steps
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import (
@@ -29,6 +26,9 @@ from graphslam.core.se3 import (
     se3_transform,
 )
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.rbpf_grid import run_rbpf
+from graphslam.frontends.odometry.steps import Steps
 from tests.benchmarks.evidence_scenes import SPIN_RATE, tunnel
 
 PER_STEP = 15

@@ -13,10 +13,10 @@ import sys
 
 import numpy as np
 
-from frontends.steps import Steps, make_steps
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.odometry.steps import Steps, make_steps
 from graphslam.registration.register import Registration, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField

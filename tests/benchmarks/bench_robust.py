@@ -25,11 +25,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
 from graphslam.io.network_file import read_network
-from graphslam.sim.wrong_loops import WrongLoops, add_wrong_loops, is_odometry
-from graphslam.solve.network_factors import from_values, to_graph, to_values
-from graphslam.solve.network_model import edge_costs
-from graphslam.solve.network_solve import solve_network
-from graphslam.solve.network_start import odometry_start
+from graphslam.solve.network.factors import from_values, to_graph, to_values
+from graphslam.solve.network.model import edge_costs
+from graphslam.solve.network.solve import solve_network
+from graphslam.solve.network.start import odometry_start
+from tests.reference.wrong_loops import WrongLoops, add_wrong_loops, is_odometry
 
 FILES = ("input_M3500_g2o", "parking-garage", "sphere2500")
 

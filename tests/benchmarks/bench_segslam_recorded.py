@@ -20,20 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from frontends.rbpf_grid import run_rbpf
-from frontends.recorded import chain
-from frontends.segslam.front_end import SegSlamFrontEndConfig
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.segslam import run_segslam
-from frontends.steps import Steps, make_steps
-from graphslam.app import config as cfg
-from graphslam.app.front_ends import recommended
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import recommended
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.grid.rbpf_grid import run_rbpf
+from graphslam.frontends.odometry.recorded import chain
+from graphslam.frontends.odometry.steps import Steps, make_steps
+from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.catalog import load
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save

@@ -19,12 +19,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from graphslam.association.consistent_set import consistent_loops
 from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.consistent_set import consistent_loops
 from graphslam.io.catalog import load
-from graphslam.solve.network_huber import huber_least_squares
-from graphslam.solve.network_solve import solve_network
+from graphslam.solve.network.solve import solve_network
+from tests.reference.huber import huber_least_squares
 
 RIGHT = 2.0
 

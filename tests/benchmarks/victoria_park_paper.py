@@ -20,11 +20,11 @@ import numpy.typing as npt
 import pandas as pd
 from tqdm import tqdm
 
-from graphslam.app import config as cfg
-from graphslam.app.audit import reference_labels
-from graphslam.app.back_end import BackEnd
-from graphslam.app.front_ends import make_front_end, recommended
-from graphslam.app.reckoning import dead_reckoning
+from graphslam.app.run import config as cfg
+from graphslam.app.run.audit import reference_labels
+from graphslam.app.run.back_end import BackEnd
+from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.reckoning import dead_reckoning
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -33,12 +33,12 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.gps import gps_residuals
-from graphslam.graph.submap_blocks import scale_covariances
 from graphslam.join.association import Association
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
+from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
 from graphslam.plots.gps_maps import plot_gps_maps
 from graphslam.plots.save import save

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontends.dead_reckoning import reckon
-from frontends.drift import calibrate, fit_drift
-from frontends.reckoned import Reckoned, level
 from graphslam.core import se3
+from graphslam.frontends.odometry.dead_reckoning import reckon
+from graphslam.frontends.odometry.drift import calibrate, fit_drift
+from graphslam.frontends.odometry.reckoned import Reckoned, level
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.garage import garage

@@ -10,9 +10,9 @@ import pytest
 from graphslam.app.compare import map_nees
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_solver import solve_submaps
 from graphslam.join.order import join_tree
 from graphslam.join.polish import polish
+from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 RUNS = 30

@@ -17,11 +17,11 @@ from graphslam.evaluate.gap import (
     polish_history,
     pose_consistency_along,
 )
-from graphslam.graph.submap_blocks import relabel
-from graphslam.graph.submap_solver import solve_submaps
 from graphslam.join.ekf import join_ekf
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.solve.submap_isam2 import solve_submaps_isam2
+from graphslam.join.submap_blocks import relabel
+from graphslam.join.submap_isam2 import solve_submaps_isam2
+from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 

@@ -12,7 +12,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_adjoint, se2_between, se2_compose, se2_exp, se2_inverse, se2_log, se2_transform
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.evaluate.loop_consistency import find_loops, loop_consistency
-from graphslam.graph.submap_solver import solve_submaps
+from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontends.landmarks.systematic import PARAMETERS
-from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.worlds import simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.systematic import KINDS, Systematic, sums, systematic_findings
+from graphslam.frontends.landmarks.systematic import PARAMETERS
 from tests.faults import inject_landmarks as inject
 
 

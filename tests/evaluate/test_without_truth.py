@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_compose_covariance, se2_exp, se2_transform
 from graphslam.core.random import SeedTree
@@ -14,6 +13,7 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
 from graphslam.evaluate.without_truth import class_consistency, correlated_dof, two_sided
+from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
 from graphslam.graph.gps import GpsConfig, arm_of
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from frontends.motion import MotionNoise
 from graphslam.core.geometry import Array, rotation2, se2_between, se2_compose, se2_exp, se2_log, wrap_angle
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, LandmarkObservations, Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.odometry.motion import MotionNoise
 
 Inject = Callable[[SensorLog], SensorLog]
 

@@ -36,12 +36,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from graphslam.app import merge_outputs, outputs, study_folder
 from graphslam.app.cli import app
-from graphslam.app.generations import new_generation
-from graphslam.app.loops import loops_of_run
-from graphslam.app.report import make_report
-from graphslam.app.study_folder import StudyFolder
+from graphslam.app.folders.generations import new_generation
+from graphslam.app.report.report import make_report
+from graphslam.app.run import outputs
+from graphslam.app.run.loops import loops_of_run
+from graphslam.app.sessions import merge_outputs
+from graphslam.app.studies import folder as study_folder
+from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.worlds import simulate, write_simulated
 from graphslam.core.digest import Digest
 from graphslam.core.errors import RunFolderError

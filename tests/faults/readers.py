@@ -20,15 +20,15 @@ import numpy as np
 import scipy.io
 import scipy.sparse as sp
 
-from graphslam.app.config import read_toml
-from graphslam.app.loops import loops_of_run
-from graphslam.app.output_files import OutputFiles
-from graphslam.app.outputs import open_run
-from graphslam.app.report import make_report
-from graphslam.app.report_folder import read_folder
-from graphslam.app.run_files import read_merged_dense
-from graphslam.app.study import open_study
-from graphslam.app.study_folder import StudyFolder
+from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.report.folder import read_folder
+from graphslam.app.report.report import make_report
+from graphslam.app.run.config import read_toml
+from graphslam.app.run.files import read_merged_dense
+from graphslam.app.run.loops import loops_of_run
+from graphslam.app.run.outputs import open_run
+from graphslam.app.studies.folder import StudyFolder
+from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.imu import Imu, ImuNoise
@@ -210,8 +210,9 @@ def finished_run() -> Path:
     """A landmark run, made once; of its pictures and its page nothing is read again."""
     import tempfile
 
-    from graphslam.app import outputs, report
-    from graphslam.app.pipeline import run
+    from graphslam.app.report import report
+    from graphslam.app.run import outputs
+    from graphslam.app.run.pipeline import run
     from graphslam.app.worlds import simulate
 
     out = Path(tempfile.mkdtemp(prefix="fuzz-run-")) / "run"
@@ -230,7 +231,7 @@ def finished_run() -> Path:
         "lever": gps.lever, "fitted": np.int64(3), "outside": np.int64(0), "in_gap": np.int64(0),
     }  # fmt: skip
     write_npz(out / "gps_all.npz", {"format": "graphslam.gps-residuals/1", **residuals})
-    from graphslam.graph.loop_ledger import Decision
+    from graphslam.loops.ledger import Decision
 
     loop = Decision(
         loop=0, verdict="accepted", why="because", i=0, j=1, submap_i=0, submap_j=1, source="proximity", factor_id=9,
@@ -269,8 +270,8 @@ def report_of_run(root: Path) -> Any:
 
 def read_config(root: Path) -> Any:
     """What a resumed run does first."""
-    from graphslam.app import config as cfg
-    from graphslam.app.run_files import read_options
+    from graphslam.app.run import config as cfg
+    from graphslam.app.run.files import read_options
 
     values = read_options(root)
     for part, kind in (("backend", cfg.BackEndConfig), ("gps", cfg.GpsConfig)):

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from graphslam.app.folder_lock import locked
-from graphslam.app.generations import new_generation
-from graphslam.app.loops import loops_of_run
-from graphslam.app.outputs import open_run
-from graphslam.app.report import make_report
-from graphslam.app.run_folder import RunFolder
-from graphslam.app.study import open_study
+from graphslam.app.folders.generations import new_generation
+from graphslam.app.folders.lock import locked
+from graphslam.app.report.report import make_report
+from graphslam.app.run.folder import RunFolder
+from graphslam.app.run.loops import loops_of_run
+from graphslam.app.run.outputs import open_run
+from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
 from graphslam.io.log_folder import read_log_mesh

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import graphslam as gs
-from graphslam.app.run import Run
+from graphslam.app.run.run import Run
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import se2_between, wrap_angle
 from graphslam.core.log import SensorLog

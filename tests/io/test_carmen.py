@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from frontends.steps import StepConfig, make_steps
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.core.log import DropCounter
+from graphslam.frontends.odometry.steps import StepConfig, make_steps
 from graphslam.io.carmen import bearings, mend_stamps, read_carmen
 from graphslam.io.catalog import load
 

@@ -15,8 +15,8 @@ from graphslam.core.network import PoseNetwork
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.isam_graph import read_isam_graph
 from graphslam.io.network_file import read_network
-from graphslam.solve.network_factors import to_graph, to_values
-from graphslam.solve.network_multistart import canonical_start
+from graphslam.solve.network.factors import to_graph, to_values
+from graphslam.solve.network.multistart import canonical_start
 
 SE2 = """VERTEX_SE2 0 0 0 0
 VERTEX_SE2 7 1 0.1 0.2

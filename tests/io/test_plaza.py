@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from frontends.motion import MotionNoise, dead_reckoning
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
+from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
 from graphslam.io.catalog import load
 from graphslam.io.plaza import read_plaza
 

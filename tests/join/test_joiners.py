@@ -9,13 +9,13 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, SolverError, UnknownNameError
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_blocks import SubmapProblem, scale_covariances
-from graphslam.graph.submap_solver import solve_submaps
 from graphslam.join import eif
 from graphslam.join.ekf import DenseMap, join_ekf
 from graphslam.join.joined_map import JoinedMap, JoinTimes
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
+from graphslam.join.submap_blocks import SubmapProblem, scale_covariances
+from graphslam.join.submap_solver import solve_submaps
 from tests.reference.dense_join import dense_information_join, dense_tree_join
 from tests.reference.submap_chain import submap_chain
 

@@ -10,11 +10,11 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees
-from graphslam.graph.submap_solver import solve_submaps
 from graphslam.join.association import Association
 from graphslam.join.joined_map import MapView
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential
+from graphslam.join.submap_solver import solve_submaps
 from graphslam.sim.local_maps import simulate_local_maps
 from tests.reference.submap_chain import submap_chain
 

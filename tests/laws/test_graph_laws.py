@@ -90,7 +90,7 @@ def test_moving_the_gps_frame_moves_the_datum_alone(rng):
 
 def test_a_repeated_landmark_is_its_fusion(rng):
     """Two entries of one id in a submap weigh as much as the single entry that fuses them."""
-    from graphslam.graph.submap_blocks import fuse_repeated
+    from graphslam.join.submap_blocks import fuse_repeated
 
     chain = make_chain(rng, m=6, landmarks=12, laps=1.2)
     twice, fused = PoseGraph(), PoseGraph()

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontends.segslam.front_end import settled
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.segslam import run_segslam
-from frontends.segslam.submaps import settled_chain
-from frontends.steps import Steps, make_steps
 from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.odometry.steps import Steps, make_steps
+from graphslam.frontends.segslam.front_end import settled
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.segslam import run_segslam
+from graphslam.frontends.segslam.submaps import settled_chain
 from graphslam.maps.added import own_evidence
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig

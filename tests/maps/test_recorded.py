@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from frontends.steps import make_steps
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.odometry.steps import make_steps
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import divide_submaps

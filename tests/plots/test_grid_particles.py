@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 
-from frontends.grid_config import GridFilterConfig
-from frontends.rbpf_grid import RbpfResult, run_rbpf
-from frontends.segslam.config import SegmentationConfig, SegSlamConfig
-from frontends.segslam.segslam import run_segslam
 from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.rbpf_grid import RbpfResult, run_rbpf
+from graphslam.frontends.segslam.config import SegmentationConfig, SegSlamConfig
+from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.plots.particles import plot_ancestry, plot_effective, plot_pasts
 from tests.frontends.grid_world import ring
 

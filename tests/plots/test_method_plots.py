@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 import graphslam as gs
 from graphslam.app.compare import join
-from graphslam.app.local_maps import first_particles, local_maps
+from graphslam.app.run.local_maps import first_particles, local_maps
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.submap_consistency import true_submap

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 
-from frontends.segslam.covariance import Nees
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
+from graphslam.frontends.segslam.covariance import Nees
 from graphslam.plots.segment_exits import plot_exit_nees, plot_segment_exit
 
 

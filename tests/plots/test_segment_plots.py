@@ -6,11 +6,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from frontends.segslam.paths import concatenate
-from frontends.segslam.sampling import grow, root_of_segment
-from frontends.segslam.segmap import Entry, SegMap
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose
+from graphslam.frontends.segslam.paths import concatenate
+from graphslam.frontends.segslam.sampling import grow, root_of_segment
+from graphslam.frontends.segslam.segmap import Entry, SegMap
 from graphslam.plots.segments import (
     Tie,
     plot_entropies,

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from frontends.motion import MotionNoise, steering_odometry
 from graphslam.core.gaussian import Information
 from graphslam.core.geometry import (
     rotation2,
@@ -28,6 +27,7 @@ from graphslam.core.geometry import (
 from graphslam.core.log import SensorLog
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.odometry.motion import MotionNoise, steering_odometry
 
 
 @dataclass

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from frontends.grid_config import GridFilterConfig
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.grid.config import GridFilterConfig
 
 
 def probability(grid: EvidenceGrid, point: Array, unknown: float) -> float:

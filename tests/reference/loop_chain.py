@@ -6,7 +6,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.loop_measure import Loop
+from graphslam.loops.measure import Loop
 
 STEP = {2: np.diag([0.03, 0.03, 0.004]) ** 2, 3: np.diag([0.001, 0.001, 0.004, 0.03, 0.03, 0.02]) ** 2}
 MATCH = {2: np.diag([0.05, 0.05, 0.01]) ** 2, 3: np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 0.05]) ** 2}

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from frontends.segslam.sampling import Root, grow_by, probabilities
-from frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
+from graphslam.frontends.segslam.sampling import Root, grow_by, probabilities
+from graphslam.frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
 
 
 class PlainSegMap:

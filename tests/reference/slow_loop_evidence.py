@@ -1,6 +1,6 @@
 """χ² of loops and of groups against everything else, the slow way: dense least squares, solved twice.
 
-Nothing is shared with :mod:`graphslam.solve.network_settle` but the linearised arrays of the network.
+Nothing is shared with :mod:`graphslam.solve.network.settle` but the linearised arrays of the network.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network_model import Layout, compose, edge_residuals, exp, linearise, square_root
+from graphslam.solve.network.model import Layout, compose, edge_residuals, exp, linearise, square_root
 
 
 def least(J: Array, r: Array) -> float:

@@ -13,7 +13,7 @@ from time import perf_counter
 import numpy as np
 import pandas as pd
 
-from graphslam.app.pipeline import run
+from graphslam.app.run.pipeline import run
 from graphslam.app.worlds import simulate
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.consistency import nees, pose_error

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
-from frontends.detectors.trees import TreeDetectorConfig
+from graphslam.frontends.detectors.trees import TreeDetectorConfig
 
 
 @dataclass

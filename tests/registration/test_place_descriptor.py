@@ -9,8 +9,8 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.poses import heading_of
-from graphslam.graph.loop_appearance import AppearanceConfig, appearance_candidates
-from graphslam.graph.loop_places import Places
+from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
+from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import DescriptorConfig, Descriptors, describe, join, similarity
 from tests.reference.box_submaps import mapped, straight_path
 from tests.reference.box_world import hall, heading

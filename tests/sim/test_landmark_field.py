@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from frontends.motion import MotionNoise, steering_odometry
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, se2_log, se2_transform, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, LandmarkObservations, SteeringControls
 from graphslam.evaluate.consistency import joint_nees, pose_error
+from graphslam.frontends.odometry.motion import MotionNoise, steering_odometry
 from graphslam.sim.landmark_field import (
     PRESETS,
     LandmarkFieldConfig,

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import se2_between, se2_transform
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_solver import solve_submaps
+from graphslam.join.submap_solver import solve_submaps
 from graphslam.sim.landmark_field import landmark_layout
 from graphslam.sim.local_maps import local_map_world, simulate_local_maps
 from graphslam.sim.vehicle import follow_route

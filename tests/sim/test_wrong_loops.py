@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from graphslam.association.consistent_set import Chain, LoopArrays, pair_chi2
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
-from graphslam.graph.consistent_set import Chain, LoopArrays, pair_chi2
-from graphslam.sim.wrong_loops import Kind, add_wrong_loops, is_odometry
-from graphslam.solve.network_model import between, compose, edge_costs, exp
+from graphslam.solve.network.model import between, compose, edge_costs, exp
+from tests.reference.wrong_loops import Kind, add_wrong_loops, is_odometry
 
 
 def ring_drive(dim: int, n: int = 200, lap: int = 50, sigma: float = 0.01, seed: int = 0) -> PoseNetwork:

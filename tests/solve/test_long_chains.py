@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-import graphslam.solve.network_multistart as multistart
+import graphslam.solve.network.multistart as multistart
 from graphslam.app.solve_file import report_of
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import optimise_graph
 from graphslam.solve.isam2 import Isam2Solver
-from graphslam.solve.network_batch import is_converged, polish
-from graphslam.solve.network_solve import solve_network
+from graphslam.solve.network.batch import is_converged, polish
+from graphslam.solve.network.solve import solve_network
 from tests.reference.graph_chain import dense_submap
 
 

@@ -80,15 +80,15 @@ class AssociationAmbiguity:
     description = "unknown association in clutter, pairs, rows: EKF (NN, JCBB) against RBPF on errors, divergence, NEES"
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return tuple(QUICK if quick else WORLDS)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return 3 if quick else 20
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         known = {**WORLDS, **QUICK}
         if world not in known:
             raise UnknownNameError("world of association-ambiguity", world, known)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.app.front_ends import make_front_end
+from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import GraphSlamError

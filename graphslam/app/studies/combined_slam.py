@@ -49,26 +49,26 @@ class CombinedSlam:
     description = "EKF, RBPF, EKF-EIF, RBPF-EKF, RBPF-EIF (sequence, tree) beside iSAM2 and batch: NEES, CI, RMSE, time"
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return tuple(_QUICK if quick else _WORLDS)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return 3 if quick else 20
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         known = {**_WORLDS, **_QUICK}
         if world not in known:
             raise UnknownNameError("world of combined-slam", world, known)
         return partial(run_trial, known[world])
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return report(table, timings)
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         made = save_paper_figures(table, timings, folder)
         for world in dict.fromkeys(table["world"]):
             t = table[table["world"] == world]

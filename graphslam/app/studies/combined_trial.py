@@ -13,12 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from frontends.landmarks.ekf_slam import ekf_snapshots
-from frontends.landmarks.prepare import prepare
-from frontends.landmarks.rbpf_slam import rbpf_snapshots
-from frontends.landmarks.snapshot import Snapshot
-from graphslam.app import config as cfg
-from graphslam.app.front_ends import make_front_end, recommended
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.studies.scoring import Judge, Watch, clock, timed, watch_snapshots
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate
@@ -28,15 +24,19 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.graph.submap_solver import SubmapEstimate
+from graphslam.frontends.landmarks.ekf_slam import ekf_snapshots
+from graphslam.frontends.landmarks.prepare import prepare
+from graphslam.frontends.landmarks.rbpf_slam import rbpf_snapshots
+from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
-from graphslam.solve.full_batch import full_batch
-from graphslam.solve.submap_batch import solve_submaps
-from graphslam.solve.submap_isam2 import solve_submaps_isam2
+from graphslam.join.submap_batch import solve_submaps
+from graphslam.join.submap_isam2 import solve_submaps_isam2
+from graphslam.join.submap_solver import SubmapEstimate
+from graphslam.solve.network.full_batch import full_batch
 
 
 @dataclass(frozen=True)

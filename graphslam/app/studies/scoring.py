@@ -13,7 +13,6 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
-from frontends.landmarks.snapshot import Snapshot
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_between, vector_to_tangent_covariance
 from graphslam.core.log import Truth
@@ -21,8 +20,9 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.graph.submap_solver import SubmapEstimate
+from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.join.joined_map import MapView, landmark_scalars
+from graphslam.join.submap_solver import SubmapEstimate
 
 Ids = npt.NDArray[np.int64]
 FEATURE_STRIDE = 9

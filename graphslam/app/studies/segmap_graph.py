@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from frontends.filter_drift import FilterDrift
 from graphslam.app.studies import segslam_report as tables
 from graphslam.app.studies.segmap_trial import GraphStudy, GraphTrialConfig
 from graphslam.app.studies.segslam_building import SEGSLAM as BUILDING
@@ -31,6 +30,7 @@ from graphslam.app.studies.segslam_mine import SEGSLAM as MINE
 from graphslam.app.studies.segslam_trial import LEVEL, QUICK, Figure, GridTrialConfig
 from graphslam.app.studies.worlds_study import draw_runs
 from graphslam.core.gaussian import chi2_mean_bounds
+from graphslam.frontends.grid.filter_drift import FilterDrift
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy")
 _GARAGE = GridTrialConfig(

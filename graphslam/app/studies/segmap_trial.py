@@ -15,8 +15,6 @@ from time import perf_counter
 
 import numpy as np
 
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 from graphslam.app.studies.worlds_study import WorldsStudy
@@ -28,12 +26,14 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.graph.loop_measure import Loop
-from graphslam.graph.loops import LoopCloser
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.find_loops import FindConfig, find_loops
+from graphslam.loops.loops import LoopCloser
+from graphslam.loops.measure import Loop
 from graphslam.maps.entropy import Clarity
 from graphslam.solve.batch import BatchSolver
-from graphslam.solve.find_loops import FindConfig, find_loops
 from graphslam.solve.solution import Solution
 
 RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1

@@ -8,22 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from frontends.filter_drift import FilterDrift
-from frontends.grid_motion import move, tilted
-from frontends.segslam.config import HandoverConfig
-from frontends.segslam.covariance import Nees, exit_nees
-from frontends.segslam.paths import concatenate
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
-from frontends.segslam.segmap import MATCH, SegMap
-from frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
-from frontends.steps import Steps
 from graphslam.core.geometry import Array, arc_length, wrap_angle
 from graphslam.core.poses import group_of, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.grid.motion import move, tilted
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.config import HandoverConfig
+from graphslam.frontends.segslam.covariance import Nees, exit_nees
+from graphslam.frontends.segslam.paths import concatenate
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
+from graphslam.frontends.segslam.segmap import MATCH, SegMap
+from graphslam.frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 from graphslam.maps.entropy import Clarity, clarity_of, placements
 from graphslam.sim.route import Route
 

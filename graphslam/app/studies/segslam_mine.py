@@ -20,10 +20,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from frontends.segslam.config import SegSlamConfig, WinnowConfig
 from graphslam.app.studies import segslam_report as tables
 from graphslam.app.studies.segslam_garage import path_figure
 from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
+from graphslam.frontends.segslam.config import SegSlamConfig, WinnowConfig
 from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
 

@@ -15,13 +15,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from frontends.filter_drift import FilterDrift
-from frontends.grid_config import GridFilterConfig
-from frontends.rbpf_grid import RbpfResult, run_rbpf
-from frontends.segslam.config import CandidateSearch, ChoiceConfig, SegmentationConfig, SegSlamConfig, WinnowConfig
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.segslam import run_segslam
-from frontends.steps import StepConfig, Steps, make_steps
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
@@ -31,6 +24,19 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.grid.rbpf_grid import RbpfResult, run_rbpf
+from graphslam.frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam.frontends.segslam.config import (
+    CandidateSearch,
+    ChoiceConfig,
+    SegmentationConfig,
+    SegSlamConfig,
+    WinnowConfig,
+)
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig

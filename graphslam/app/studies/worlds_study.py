@@ -38,15 +38,15 @@ class WorldsStudy(Generic[C]):
         self.full, self.quick, self._trials = full, quick, trials
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return tuple(self.quick if quick else self.full)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         return 2 if quick else self._trials
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.study_definition.StudyDefinition`."""
+        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
         known = {**self.full, **self.quick}
         if world not in known:
             raise UnknownNameError(f"world of {self.name}", world, known)

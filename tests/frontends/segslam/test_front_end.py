@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from frontends.base import FrontEnd
-from frontends.grid_config import GridFilterConfig
-from frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
-from frontends.step_config import StepConfig
 from graphslam.core.geometry import se2_between
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans, Odometry
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.base import FrontEnd
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
 from tests.frontends.grid_world import ring
 from tests.frontends.segslam.test_segslam import CONFIG
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from frontends.recorded import chain
-from frontends.segslam.front_end import SegSlamFrontEndConfig
-from frontends.segslam.segslam import run_segslam
-from frontends.steps import make_steps
-from graphslam.app import config as cfg
-from graphslam.app.front_ends import recommended
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import recommended
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
+from graphslam.frontends.odometry.recorded import chain
+from graphslam.frontends.odometry.steps import make_steps
+from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
+from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.carmen import read_carmen
 from graphslam.io.catalog import load
 

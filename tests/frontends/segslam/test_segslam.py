@@ -8,14 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontends.grid_config import GridFilterConfig
-from frontends.segslam.config import CandidateSearch, ChoiceConfig, SegmentationConfig, SegSlamConfig, WinnowConfig
-from frontends.segslam.result import SegSlamResult
-from frontends.segslam.segslam import run_segslam
-from frontends.steps import Steps
 from graphslam.core.errors import DataError
 from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.segslam.config import (
+    CandidateSearch,
+    ChoiceConfig,
+    SegmentationConfig,
+    SegSlamConfig,
+    WinnowConfig,
+)
+from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam.frontends.segslam.segslam import run_segslam
 from tests.frontends.grid_world import ring
 
 CONFIG = SegSlamConfig(

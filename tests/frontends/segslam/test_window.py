@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontends.segslam.window import bring_up_to_date, look_ahead
 from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry
+from graphslam.frontends.segslam.window import bring_up_to_date, look_ahead
 from tests.frontends.grid_world import ring
 
 

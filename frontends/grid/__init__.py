@@ -1,0 +1,1 @@
+"""A Rao-Blackwellised particle filter on evidence grids."""

@@ -1,0 +1,356 @@
+"""The particle core: particles with a pose and an evidence grid each, moved, weighed, resampled, written to.
+
+A filter does nothing by itself; whoever owns it calls the parts of a step in order: :meth:`GridFilter.predict`,
+:meth:`~GridFilter.weigh`, :meth:`~GridFilter.record`, :meth:`~GridFilter.resample_if_needed`,
+:meth:`~GridFilter.update` (or all of them by :meth:`~GridFilter.step`), and may change poses, maps and ages in between.
+Everything drawn hangs from ``seed.child(purpose, step)``: the same seed gives the same bytes for any number of threads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3
+from graphslam.core.random import SeedTree
+from graphslam.evidence.batch import update_grids
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.likelihood import log_weights
+from graphslam.evidence.pool import GridPool
+from graphslam.evidence.scan import UpdateReport
+from graphslam.frontends.grid.ancestry import Ancestry
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
+from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.frontends.grid.weights import informed, inherit, spread
+
+if TYPE_CHECKING:
+    from graphslam.frontends.odometry.steps import Steps
+
+Ints = npt.NDArray[np.int64]
+
+PARTS = ("predict", "weigh", "record", "resample", "update")
+
+
+@dataclass(slots=True)
+class GridParticles:
+    """N particles.
+
+    Parameters
+    ----------
+    poses : (N, 7) or (N, 3)
+        ``T_map_body`` of each, in the frame of its own map.
+    tilt_errors : (N, 2) or None
+        By how much each thinks that gravity's roll and pitch are too large [rad]; None where no gravity is measured.
+    grids : list of N EvidenceGrid
+        Of one pool.
+    log_weights : (N,)
+        Normalised: their exponentials sum to one.
+    ages : (N,) int64
+        Scans in each map.
+    scores : (N,)
+        Log-likelihood of each particle's whole past, tempered as the weights are.
+    """
+
+    poses: Array
+    tilt_errors: Array | None
+    grids: list[EvidenceGrid]
+    log_weights: Array
+    ages: Ints
+    scores: Array
+
+    def __len__(self) -> int:
+        return len(self.grids)
+
+    @property
+    def weights(self) -> Array:
+        """Normalised weights ``(N,)``."""
+        return normalise_log_weights(self.log_weights)
+
+    @property
+    def best(self) -> int:
+        """The heaviest particle; of equally heavy ones (after resampling all are) that of the likeliest past."""
+        return int(np.lexsort((-np.arange(len(self)), self.scores, self.log_weights))[-1])
+
+    def gain(self, log_likelihoods: Array) -> None:
+        """Multiply likelihoods ``(N,)`` into the weights and the scores."""
+        self.scores = self.scores + log_likelihoods
+        total = self.log_weights + log_likelihoods
+        with np.errstate(divide="ignore"):
+            self.log_weights = np.log(normalise_log_weights(total))
+
+    def take(self, ancestors: Ints) -> None:
+        """Particle i becomes what ``ancestors[i]`` was, all of equal weight; maps are copied in constant time."""
+        n = len(self)
+        kept: set[int] = set()
+        grids = []
+        for a in ancestors.tolist():
+            grids.append(self.grids[a].copy() if a in kept else self.grids[a])
+            if self.grids[a].locked:
+                grids[-1].lock()
+            kept.add(a)
+        self.grids = grids
+        self.poses, self.ages, self.scores = self.poses[ancestors], self.ages[ancestors], self.scores[ancestors]
+        if self.tilt_errors is not None:
+            self.tilt_errors = self.tilt_errors[ancestors]
+        self.log_weights = np.full(n, -np.log(n))
+
+
+@dataclass(slots=True)
+class Tally:
+    """What happened so far.
+
+    Parameters
+    ----------
+    seconds : mapping of part to float
+        Wall time.
+    resamplings : int
+    without_beams, without_returns : int
+        Steps updated without a beam, and with beams none of which met anything.
+    rays, dropped_rays : int
+        Beams inserted into maps, and beams that could not be, summed over the maps that were written.
+    """
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
+    resamplings: int = 0
+    without_beams: int = 0
+    without_returns: int = 0
+    rays: int = 0
+    dropped_rays: int = 0
+
+
+class GridFilter:
+    """A particle filter on evidence grids over prepared steps (SegSLAM eq. 1–7).
+
+    Parameters
+    ----------
+    steps : Steps
+    config : GridFilterConfig
+    seed : SeedTree
+        Of this filter alone.
+    first : int
+        Step at which the particles stand at the start pose; nothing before it is read.
+    start : (7,), (3,), or (N, …), optional
+        ``T_map_body`` at that step; default the origin, in space with gravity `lift` above it. Where gravity is
+        measured, roll and pitch are taken from it.
+    pool : GridPool, optional
+        Storage of the maps; default one of its own.
+    prune_every : int
+        See :class:`~graphslam.frontends.grid.ancestry.Ancestry`.
+
+    Raises
+    ------
+    GeometryError
+        No such step, or an impossible start.
+    """
+
+    def __init__(
+        self,
+        steps: Steps,
+        config: GridFilterConfig,
+        seed: SeedTree,
+        *,
+        first: int = 0,
+        start: Array | None = None,
+        pool: GridPool | None = None,
+        prune_every: int = 32,
+    ) -> None:
+        if not 0 <= first < len(steps):
+            raise GeometryError(
+                f"no step {first} to start a filter at", where=steps.name, wanted=f"0 … {len(steps) - 1}"
+            )
+        self.steps, self.config, self.seed, self.first = steps, config, seed, first
+        n, group = config.particles, SE2 if steps.dim == 2 else SE3
+        self.tally = Tally()
+        empty = EvidenceGrid(
+            config.voxel_size, model=config.beam_model(), pool=GridPool() if pool is None else pool, dim=steps.dim
+        )
+        at = np.array(group.identity) if start is None else np.asarray(start, dtype=np.float64)
+        if start is None and steps.dim == 3:
+            at[2] = self.lift
+        width = group.size
+        if at.shape not in ((width,), (n, width)) or not np.all(np.isfinite(at)):
+            raise GeometryError("impossible start of a filter", got=at.shape, wanted=f"({width},) or ({n}, {width})")
+        errors = None
+        if steps.tilt is not None:
+            errors = np.zeros((n, 2))
+            if n > 1:
+                errors = steps.tilt_sigma * self._normal("tilt", first, 2)
+        self.particles = GridParticles(
+            poses=np.array(np.broadcast_to(at, (n, width))),
+            tilt_errors=errors,
+            grids=[empty, *(empty.empty() for _ in range(n - 1))],
+            log_weights=np.full(n, -np.log(n)),
+            ages=np.zeros(n, dtype=np.int64),
+            scores=np.zeros(n),
+        )
+        self._level(first)
+        self.ancestry = Ancestry(n, width, prune_every=prune_every)
+
+    def __len__(self) -> int:
+        return self.config.particles
+
+    @property
+    def lift(self) -> float:
+        """How far above the lattice of a new map the body stands [m]; 0 where nobody knows what is up."""
+        return self.config.lift * self.config.voxel_size if self.steps.tilt is not None else 0.0
+
+    @property
+    def pool(self) -> GridPool:
+        """Storage of the maps."""
+        return self.particles.grids[0].pool
+
+    @property
+    def effective(self) -> float:
+        """N_eff (eq. 7)."""
+        return effective_sample_size(self.particles.weights)
+
+    # --- the parts of a step ---------------------------------------------------------------------------------
+
+    def predict(self, k: int) -> None:
+        """Move to step k from the one before (A1); at the first step everybody stands where it starts."""
+        if k == self.first:
+            return
+        with self._timed("predict"):
+            p, odometry = self.particles, self.steps.odometry
+            increment = odometry.increments[k]
+            noise = None
+            if len(p) > 1:
+                cov = motion_covariance(increment, odometry.covariances[k], self.config)
+                noise = self._normal("motion", k, len(cov)) @ square_root(cov).T
+            p.poses = move(p.poses, increment, noise)
+            if p.tilt_errors is not None and len(p) > 1:
+                seconds = float(self.steps.times[k] - self.steps.times[k - 1])
+                p.tilt_errors = walk_tilt_errors(
+                    p.tilt_errors, seconds, self.steps.tilt_sigma, self.steps.tilt_time, self._normal("tilt", k, 2)
+                )
+            self._level(k)
+
+    def weigh(self, k: int) -> Array:
+        """Multiply the likelihood of step k's scan into the weights (A3); its logarithms ``(N,)``.
+
+        Particles whose map is young have the mean of the others; a scan that says nothing leaves all as they are.
+        """
+        with self._timed("weigh"):
+            p, config = self.particles, self.config
+            gains = np.zeros(len(p))
+            points, origins, returns = self.weighed_beams(k)
+            told = informed(p.ages, config.young)
+            rows = np.flatnonzero(told)
+            if len(points) and len(rows):
+                gains[rows] = log_weights(
+                    [p.grids[i] for i in rows],
+                    p.poses[rows],
+                    points,
+                    config.likelihood_of(len(points)),
+                    origin=origins,
+                    max_range=self.steps.max_range,
+                    returns=returns,
+                    threads=config.threads,
+                )
+                gains = inherit(gains, p.log_weights, told)
+                p.gain(gains)
+            return gains
+
+    def record(self, tags: npt.ArrayLike | None = None) -> None:
+        """Write poses, with tags ``(N,)``, into the ancestry: once a step, in the frames they are in now."""
+        with self._timed("record"):
+            self.ancestry.record(self.particles.poses, tags)
+
+    def resample_if_needed(self, k: int) -> Ints | None:
+        """Draw the survivors if too few particles are effective (A4): whom each comes from ``(N,)``, or None."""
+        with self._timed("resample"):
+            p = self.particles
+            w = p.weights
+            if len(p) == 1 or effective_sample_size(w) >= self.config.ess_fraction * len(p):
+                return None
+            ancestors = systematic_resample(w, float(self.seed.child("resample", k).generator().random()))
+            p.take(ancestors)
+            self.ancestry.branch(ancestors)
+            self.tally.resamplings += 1
+            return ancestors
+
+    def update(self, k: int) -> UpdateReport:
+        """Insert step k's scan into all maps that are not locked.
+
+        Particles of the same map at the same pose, as copies are right after resampling, get one update and share it.
+        """
+        with self._timed("update"):
+            p = self.particles
+            points, origins, returns = self.steps.scan(k)
+            if len(points) == 0:
+                self.tally.without_beams += 1
+                return UpdateReport()
+            self.tally.without_returns += not returns.any()
+            use = spread(len(points), self.config.map_beams)
+            leads: dict[tuple[int, bytes, int], int] = {}
+            first_of = np.empty(len(p), dtype=np.int64)
+            for i, grid in enumerate(p.grids):
+                # a locked map is left alone, and counted once for each handle
+                key = (grid.root, p.poses[i].tobytes(), i if grid.locked else -1)
+                first_of[i] = leads.setdefault(key, i)
+            rows = sorted(leads.values())
+            report = update_grids(
+                [p.grids[i] for i in rows],
+                p.poses[rows],
+                points[use],
+                origin=origins[use],
+                max_range=self.steps.max_range,
+                returns=returns[use],
+                threads=self.config.threads,
+            )
+            for i in np.flatnonzero(first_of != np.arange(len(p))).tolist():
+                p.grids[i].take(p.grids[int(first_of[i])])
+            p.ages = p.ages + np.array([not g.locked for g in p.grids], dtype=np.int64)
+            self.tally.rays += report.rays
+            self.tally.dropped_rays += report.dropped
+            return report
+
+    def step(self, k: int) -> tuple[float, Ints | None]:
+        """All parts of step k; N_eff before resampling, and the survivors if there was one."""
+        self.predict(k)
+        self.weigh(k)
+        self.record()
+        effective = self.effective
+        ancestors = self.resample_if_needed(k)
+        self.update(k)
+        return effective, ancestors
+
+    # --- what they are made of -------------------------------------------------------------------------------
+
+    def weighed_beams(self, k: int) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Points, origins and returns of step k's beams that are weighed.
+
+        End points are those of beams that met something; casting also compares beams that met nothing.
+        """
+        points, origins, returns = self.steps.scan(k)
+        rows = np.arange(len(points)) if self.config.likelihood == "cast" else np.flatnonzero(returns)
+        rows = rows[spread(len(rows), self.config.weight_beams)]
+        return points[rows], origins[rows], returns[rows]
+
+    def _level(self, k: int) -> None:
+        """Roll and pitch of all particles from gravity at step k, each with its error taken off."""
+        p = self.particles
+        if p.tilt_errors is not None:
+            assert self.steps.tilt is not None
+            p.poses = tilted(p.poses, self.steps.tilt[k] - p.tilt_errors)
+
+    def _normal(self, purpose: str, k: int, d: int) -> Array:
+        """Standard normal ``(N, d)`` of one purpose in one step."""
+        return self.seed.child(purpose, k).generator().standard_normal((self.config.particles, d))
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.tally.seconds[part] += time.perf_counter() - begin

@@ -1,0 +1,95 @@
+"""How particles move: the odometry with its noise (SegSLAM eq. 1–2), and roll and pitch from gravity.
+
+Gravity tells roll and pitch without drift, but not exactly: an accelerometer's attitude is off by a fraction of a
+degree for seconds on end. Each particle carries such an error of its own, an Ornstein–Uhlenbeck process.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, heading_of
+from graphslam.frontends.grid.config import GridFilterConfig
+
+
+def motion_covariance(increment: Array, covariance: Array, config: GridFilterConfig) -> Array:
+    """Covariance a step's motion is sampled from: the odometry's own, and what errors that last need on top of it.
+
+    Parameters
+    ----------
+    increment : (3,) or (7,)
+        ``T_before_after``.
+    covariance : (d, d)
+        Of the odometry, right tangent.
+    config : GridFilterConfig
+
+    Returns
+    -------
+    (d, d)
+        Right tangent, positive semi-definite.
+    """
+    planar = len(increment) == 3
+    path = float(np.linalg.norm(increment[: 2 if planar else 3]))
+    share = config.walk_scale**2
+    walks = (config.position_walk, config.height_walk, config.tilt_walk)
+    position, height, tilt = (share * w * w * path for w in walks)
+    turn = abs(float(increment[2])) if planar else 2.0 * float(np.arctan2(abs(increment[5]), abs(increment[6])))
+    heading = share * (config.heading_walk**2 * path + config.heading_turn**2 * turn)
+    if planar:
+        added = [position, position, heading]
+    else:
+        added = [tilt, tilt, heading, position, position, height]
+    return config.motion_scale**2 * np.asarray(covariance, dtype=np.float64) + np.diag(added)
+
+
+def square_root(covariance: Array) -> Array:
+    """``L`` with ``L Lᵀ`` = a positive semi-definite ``(d, d)``; Cholesky's fails where one direction has no noise."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def move(poses: Array, increment: Array, noise: Array | None) -> Array:
+    """``T ∘ u ∘ Exp(r)`` for poses ``(n, 3)`` or ``(n, 7)`` and noise ``(n, d)``; None: no noise."""
+    group = group_of(poses)
+    moved = group.compose(poses, np.broadcast_to(increment, poses.shape))
+    return moved if noise is None else group.compose(moved, group.exp(noise))
+
+
+def tilts(poses: Array) -> Array:
+    """Roll and pitch ``(..., 2)`` of 3-D poses [rad], ``R = Rz(heading) Ry(pitch) Rx(roll)``."""
+    x, y, z, w = np.moveaxis(poses[..., 3:], -1, 0)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    return np.stack([roll, pitch], -1)
+
+
+def tilted(poses: Array, tilt: Array) -> Array:
+    """Poses ``(n, 7)`` with roll and pitch ``(n, 2)`` [rad] in place of their own; headings and positions stay."""
+    half = 0.5 * np.column_stack([tilt, heading_of(poses)])
+    (sr, sp, sy), (cr, cp, cy) = np.sin(half).T, np.cos(half).T
+    q = [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+    return np.column_stack([poses[:, :3], *q])
+
+
+def walk_tilt_errors(errors: Array, seconds: float, sigma: float, time: float, normal: Array) -> Array:
+    """Errors of roll and pitch ``(n, 2)`` after some seconds: exact for an Ornstein–Uhlenbeck process.
+
+    Parameters
+    ----------
+    errors : (n, 2)
+    seconds : float
+    sigma : float
+        σ in the long run [rad].
+    time : float
+        In which the memory falls to 1/e [s]; 0: none.
+    normal : (n, 2)
+        Standard normal.
+    """
+    left = float(np.exp(-seconds / time)) if time > 0.0 else 0.0
+    return left * errors + sigma * float(np.sqrt(1.0 - left * left)) * normal

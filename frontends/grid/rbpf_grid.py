@@ -1,0 +1,274 @@
+"""RBPF SLAM on evidence grids: one filter over the whole log, full 6-D (or 2-D), the baseline of the SegSLAM paper.
+
+Each particle carries a pose and a map. Nothing is segmented and nothing matched: a loop closes if one of the particles
+has come back to where its own map has the place. Forty particles seldom do after a long way, and their spread says
+nothing of it, since resampling leaves them a recent common ancestor; so what is handed over is their spread *and* the
+covariance of dead reckoning over the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from tqdm.auto import tqdm
+
+from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.grid.ancestry import Ancestry
+from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.filter import GridFilter, GridParticles, Tally
+from graphslam.frontends.odometry.drift import DriftModel
+from graphslam.frontends.odometry.scan_use import checked_steps, uncorrected, uncorrected_covariance, with_findings
+from graphslam.frontends.odometry.steps import StepConfig, Steps
+from graphslam.frontends.segslam.covariance import Drift, exit_covariance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfResult:
+    """What a filter over all steps came to.
+
+    Parameters
+    ----------
+    name : str
+    times : (n,)
+        Of the steps [s].
+    path_length : (n,)
+        Metres driven until each step, by the odometry.
+    effective : (n,)
+        N_eff after each step's scan, before resampling.
+    resampled : (n,) bool
+    ancestry : Ancestry
+    particles : GridParticles
+        At the end, with the grids of the survivors.
+    best : int
+        The particle whose map and path are handed over.
+    tally : Tally
+        Wall time by part, and what happened to beams.
+    used_bytes : int
+        Memory of all maps at the end, shared parts once.
+    uses : frozenset of str
+        Streams that are inside.
+    """
+
+    name: str
+    times: Array
+    path_length: Array
+    effective: Array
+    resampled: npt.NDArray[np.bool_]
+    ancestry: Ancestry
+    particles: GridParticles
+    best: int
+    tally: Tally
+    used_bytes: int
+    uses: frozenset[str] = frozenset()
+
+    @property
+    def poses(self) -> Array:
+        """Poses of all particles at the end ``(N, 7)`` or ``(N, 3)``."""
+        return self.particles.poses
+
+    @property
+    def final_pose(self) -> Array:
+        """Pose of the best particle at the end."""
+        return self.particles.poses[self.best]
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all parts together [s]."""
+        return float(sum(self.tally.seconds.values()))
+
+    def trajectory(self, drift: Drift | None = None) -> Trajectory:
+        """Path of the best particle, ``T_map_body``.
+
+        Parameters
+        ----------
+        drift : callable, optional
+            Path length [m] → covariance ``(d, d)`` of dead reckoning. With it the path has covariances: second moment
+            of the particles' paths about this one, plus that. Without, none: the particles' alone would be far too
+            small.
+        """
+        path = self.ancestry.path(self.best)
+        if drift is None:
+            return Trajectory(self.times, path)
+        group = group_of(path)
+        every = self.ancestry.paths()
+        e = group.log(group.between(np.broadcast_to(path[:, None], every.shape), every))
+        cov = np.einsum("n,kna,knb->kab", self.particles.weights, e, e)
+        at, back = np.unique(self.path_length, return_inverse=True)
+        cov += np.array([drift(float(s)) for s in at])[back]
+        return Trajectory(self.times, path, cov)
+
+    def report(self) -> dict[str, Any]:
+        """The run in figures; JSON-serialisable."""
+        n = len(self.particles)
+        quantiles = np.quantile(self.effective / n, [0.05, 0.5])
+        last = self.ancestry.coalescence()
+        return {
+            "scans": len(self.times),
+            "particles": n,
+            "path_length": float(self.path_length[-1]),
+            "resamplings": self.tally.resamplings,
+            "effective_median": float(quantiles[1]),
+            "effective_p05": float(quantiles[0]),
+            "coalescence_seconds_back": float(self.times[-1] - self.times[last]) if last >= 0 else None,
+            "steps_without_beams": self.tally.without_beams,
+            "steps_without_returns": self.tally.without_returns,
+            "beams_dropped": self.tally.dropped_rays,
+            "maps_megabytes": self.used_bytes / 1e6,
+        }
+
+
+def run_rbpf(
+    steps: Steps,
+    config: GridFilterConfig,
+    seed: SeedTree,
+    *,
+    prune_every: int = 32,
+    progress: bool = False,
+) -> RbpfResult:
+    """Run one filter over all steps.
+
+    Parameters
+    ----------
+    steps : Steps
+    config : GridFilterConfig
+    seed : SeedTree
+        The same seed gives the same bytes, with any number of threads.
+    prune_every : int
+        Steps between two looks for lineages that died out; 0 keeps them all, for pictures of the whole tree.
+    progress : bool
+        Show a progress bar.
+
+    Raises
+    ------
+    DataError
+        No steps.
+    """
+    n = len(steps)
+    if n == 0:
+        raise DataError("no steps to filter", where=steps.name, wanted="at least 1")
+    filter = GridFilter(steps, config, seed, prune_every=prune_every)
+    effective, resampled = np.empty(n), np.zeros(n, dtype=np.bool_)
+    for k in tqdm(range(n), desc=steps.name, unit="step", disable=not progress):
+        effective[k], ancestors = filter.step(k)
+        resampled[k] = ancestors is not None
+    if prune_every:
+        filter.ancestry.prune()
+    return RbpfResult(
+        name=steps.name,
+        times=steps.times,
+        path_length=steps.path_length,
+        effective=effective,
+        resampled=resampled,
+        ancestry=filter.ancestry,
+        particles=filter.particles,
+        best=filter.particles.best,
+        tally=filter.tally,
+        used_bytes=filter.pool.used_bytes,
+        uses=steps.uses,
+    )
+
+
+def rbpf_submap(
+    result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: float = 1.0, steps: Steps | None = None
+) -> Submap:
+    """The whole run as one submap: the best particle's map and path, and an honest covariance of where it ends.
+
+    Parameters
+    ----------
+    result : RbpfResult
+    drift : callable
+        Path length [m] → covariance ``(d, d)`` of dead reckoning, right tangent.
+    key : int
+    drift_scale : float
+        Factor on the drift model's covariance.
+    steps : Steps, optional
+        With them, dead reckoning's own covariance is added where no scan corrects it
+        (:mod:`graphslam.frontends.odometry.scan_use`).
+
+    Raises
+    ------
+    DataError
+        A single step: there is no interval.
+    CovarianceError
+        The drift model gives none.
+    """
+    times = result.times
+    if len(times) < 2:
+        raise DataError("one step makes no submap", where=result.name, got=len(times), wanted="at least 2 steps")
+    w = result.particles.weights
+    exit = exit_covariance(
+        result.poses, result.final_pose, float(result.path_length[-1]), drift, weights=w, drift_scale=drift_scale
+    )
+    report = result.report() | {
+        "ended": "end-of-log",
+        "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
+        "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
+    }
+    path = result.trajectory(lambda s: drift_scale * np.asarray(drift(s)))
+    added = np.zeros_like(exit.total)
+    alone = len(result.particles) == 1  # nobody to choose from: the path is dead reckoning, whatever scans there are
+    if steps is not None and (stretches := [(1, len(path) - 1)] if alone else uncorrected(steps)):
+        assert path.covariances is not None
+        more = [uncorrected_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
+        path = Trajectory(path.times, path.poses, path.covariances + np.array(more))
+        added = more[-1]
+    return Submap(
+        key=key,
+        interval=(float(times[0]), float(times[-1])),
+        exit_pose=result.final_pose,
+        exit_covariance=exit.total + added,
+        trajectory=path,
+        grid=result.particles.grids[result.best],
+        uses=result.uses,
+        report=report,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfGridConfig:
+    """The front end ``rbpf-grid``."""
+
+    steps: StepConfig = field(default_factory=StepConfig)
+    """How the log becomes steps."""
+    filter: GridFilterConfig = field(default_factory=GridFilterConfig)
+    """Particles, motion, weights."""
+    drift: DriftModel = field(default_factory=DriftModel)
+    """Errors that all particles share, by the length of the path; its dimension is that of the log."""
+    drift_scale: float = 1.0
+    """Factor on the drift model's covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class RbpfGrid:
+    """The front end ``rbpf-grid``: the whole log as one submap with an evidence grid.
+
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion.
+    """
+
+    config: RbpfGridConfig = field(default_factory=RbpfGridConfig)
+    name: ClassVar[str] = "rbpf-grid"
+
+    def submaps(
+        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[Submap]:
+        """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        if after is None:
+            steps = checked_steps(log, self.config.steps, drops)
+            result = run_rbpf(steps, self.config.filter, seed.child(0))
+            drift = replace(self.config.drift, dim=steps.dim)
+            submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)
+            if len(result.particles) == 1:
+                text = "A single particle corrects nothing: the path is dead reckoning, and its covariance says so."
+                steps = replace(steps, findings=(*steps.findings, Finding("look", "one-particle", text)))
+            yield with_findings(submap, steps)

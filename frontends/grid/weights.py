@@ -1,0 +1,52 @@
+"""What of a step is weighed, and how maps that know little are weighed beside others that know more."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.frontends.grid.particles import normalise_log_weights
+
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+def spread(n: int, most: int) -> Ints:
+    """At most ``most`` (0: all) of ``n`` indices, ascending and evenly spread: the same ones every time."""
+    if most <= 0 or n <= most:
+        return np.arange(n, dtype=np.int64)
+    return (np.arange(most, dtype=np.int64) * n) // most
+
+
+def informed(ages: Ints, young: int) -> Flags:
+    """Which maps ``(n,)`` may be weighed by what they say: of at least ``young`` scans, or, where none is, the oldest.
+
+    Maps without any scan say nothing.
+    """
+    oldest = int(ages.max(initial=0))
+    return np.asarray((ages >= min(young, oldest)) & (ages > 0))
+
+
+def inherit(gains: Array, log_weights: Array, told: Flags) -> Array:
+    """Log-likelihoods ``(n,)`` in which particles that were not ``told`` have the mean likelihood of those that were.
+
+    The mean is weighted by what the particles weighed before, which makes it the evidence ``p(z)`` of those told: the
+    share of the weight that the others have together stays what it was. Nobody told: zeros.
+
+    Parameters
+    ----------
+    gains : (n,)
+        Log-likelihoods; only those of particles told are read.
+    log_weights : (n,)
+        Before this step.
+    told : (n,) bool
+    """
+    out = np.zeros(len(gains))
+    if not told.any():
+        return out
+    prior, new = normalise_log_weights(log_weights[told]), gains[told]
+    top = float(new.max())
+    out[told] = new
+    out[~told] = top + float(np.log(np.sum(prior * np.exp(new - top))))
+    return out

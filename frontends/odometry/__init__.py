@@ -1,0 +1,1 @@
+"""Motion of the robot: dead reckoning, recorded odometry, steps of scans and motion."""

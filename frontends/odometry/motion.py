@@ -1,0 +1,320 @@
+"""Dead reckoning between stamps from whatever motion a log holds, with an honest covariance.
+
+Three kinds of stream: speed and steering of a car (:class:`SteeringControls`), speed and yaw rate
+(:class:`VelocityControls`), and ready-made increments with covariances of their own (:class:`Odometry`).
+
+Noise of real vehicles is not white per control step (side slip and steering offsets last for seconds), so the noise
+model has a part that is constant over one increment and a part that grows with the distance driven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.geometry import Array, se2_exp, se2_log
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
+from graphslam.frontends.odometry.motion_kernels import (
+    FRONT_STEER,
+    REAR_AXLE,
+    compose_increments_kernel,
+    steering_increments_kernel,
+    velocity_increments_kernel,
+)
+
+HEADING_UNKNOWN = float(np.pi / np.sqrt(3.0))
+"""σ of a heading that may be any [rad]."""
+Motion = SteeringControls | VelocityControls | Odometry
+"""Streams that can be dead-reckoned, in the order in which a log is asked for them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionNoise:
+    """Noise of one dead-reckoning increment (right tangent at its end).
+
+    ``steering`` is for cars, ``yaw_rate`` and its fraction for streams of speed and yaw rate; a recorded odometry
+    brings its own covariances and takes none of these but the floors.
+    """
+
+    speed: float = 0.3
+    """σ of the measured speed [m/s]."""
+    speed_fraction: float = 0.0
+    """Part of σ proportional to speed: σ² = speed² + (speed_fraction · v)²."""
+    steering: float = float(np.deg2rad(3.0))
+    """σ of the measured steering angle [rad]."""
+    yaw_rate: float = 0.05
+    """σ of the yaw rate [rad/s]."""
+    yaw_rate_fraction: float = 0.0
+    """Part of σ proportional to the yaw rate: σ² = yaw_rate² + (yaw_rate_fraction · ω)²."""
+    speed_walk: float = 0.0
+    """σ of the distance after one second of driving, growing with the root of time [m/√s]; speed and yaw rate only."""
+    yaw_walk: float = 0.0
+    """σ of the heading after one second of driving, growing with the root of time [rad/√s]; speed and yaw rate only."""
+    per_increment: bool = False
+    """True: errors of the controls are constant over an increment; False: independent per control step."""
+    lateral: float = 0.0
+    """σ of side slip per metre driven [m/m], drawn per increment."""
+    heading: float = 0.0
+    """σ of heading drift per metre driven [rad/m], drawn per increment."""
+    floor_position: float = 1e-4
+    """σ added to x and y of every increment [m]: keeps a standing vehicle's covariance invertible."""
+    floor_heading: float = 1e-5
+    """σ added to the heading of every increment [rad]."""
+
+    def __post_init__(self) -> None:
+        rates = ("speed", "speed_fraction", "speed_walk", "steering", "yaw_rate", "yaw_rate_fraction", "yaw_walk")
+        for name in (*rates, "lateral", "heading"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"motion noise {name} = {getattr(self, name)}; wanted ≥ 0")
+        if not (self.floor_position > 0 and self.floor_heading > 0):
+            raise ConfigError("motion noise floors must be > 0: an increment needs an invertible covariance")
+
+    def as_array(self) -> Array:
+        """The order the kernel expects."""
+        return np.array(
+            [
+                self.speed,
+                self.speed_fraction,
+                self.steering,
+                float(self.per_increment),
+                self.lateral,
+                self.heading,
+                self.floor_position,
+                self.floor_heading,
+                self.yaw_rate,
+                self.yaw_rate_fraction,
+                self.speed_walk,
+                self.yaw_walk,
+            ]
+        )
+
+
+def motion_stream(log: SensorLog) -> tuple[str, Motion]:
+    """Name and stream to dead-reckon from: steering before velocities before recorded odometry.
+
+    Raises
+    ------
+    MissingDataError
+        If the log has none of them.
+    """
+    for kind in (SteeringControls, VelocityControls, Odometry):
+        name = log.of_type(kind)
+        if name is not None:
+            return name, log[name]
+    raise MissingDataError(
+        "no motion to dead-reckon from", where=log.name, wanted="SteeringControls, VelocityControls or Odometry"
+    )
+
+
+def dead_reckoning(
+    log: SensorLog, times: npt.ArrayLike, noise: MotionNoise, *, hold: float = 0.0
+) -> tuple[Odometry, str]:
+    """Increments between consecutive ``times`` from the log's motion stream, and that stream's name.
+
+    Parameters
+    ----------
+    log : SensorLog
+    times : (n,)
+        Stamps of the poses [s], strictly increasing.
+    noise : MotionNoise
+        Of controls; recorded odometry brings its own covariances.
+    hold : float
+        Stamps up to this long before the first control are served with that control held backwards [s]; recorded
+        odometry is continued at its first and last velocity by as much. The last *control* is held to the end.
+
+    Raises
+    ------
+    MissingDataError
+        If the log has no motion stream, or an empty one.
+    DataError
+        If a stamp lies outside what the stream covers.
+    """
+    name, stream = motion_stream(log)
+    where = f"{log.name}/{name}"
+    t = check_times(times, where=where)
+    if len(stream.times) == 0:
+        raise MissingDataError("motion stream is empty", where=where)
+    early = float(stream.times[0] - t[0]) if len(t) else 0.0
+    if early > hold:
+        raise DataError(
+            "pose stamp before the first motion record",
+            where=where,
+            got=f"{t[0]:.3f} s",
+            wanted=f"≥ {stream.times[0] - hold:.3f} s",
+        )
+    if isinstance(stream, Odometry):
+        return recorded_odometry(stream, t, noise, hold=hold), name
+    if early > 0:
+        stream = replace(stream, times=np.concatenate([t[:1], stream.times[1:]]))
+    if isinstance(stream, VelocityControls):
+        return velocity_odometry(stream, t, noise), name
+    return steering_odometry(stream, t, noise), name
+
+
+def _fine_steps(stamps: Array, times: Array) -> tuple[Array, Array, npt.NDArray[np.intp], npt.NDArray[np.int64]]:
+    """Steps inside which the controls are constant, between the pose stamps ``times``.
+
+    Returns
+    -------
+    times : (n,)
+    dt : (s,)
+    active : (s,)
+        Control of every step.
+    first : (n,)
+        First step of every increment.
+    """
+    t = check_times(times)
+    if len(t) and t[0] < stamps[0]:
+        raise DataError("pose stamp before the first control", got=f"{t[0]:.3f} s", wanted=f"≥ {stamps[0]:.3f} s")
+    knots = np.union1d(stamps[(stamps > t[0]) & (stamps < t[-1])], t) if len(t) else t
+    active = np.searchsorted(stamps, knots[:-1], side="right") - 1
+    return t, np.diff(knots), active, np.searchsorted(knots, t).astype(np.int64)
+
+
+def _start(n: int, noise: MotionNoise) -> tuple[Array, Array]:
+    """Increments and covariances to be filled: record 0 is the identity with the floor covariance."""
+    increments, covs = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    covs[:1] = np.diag([noise.floor_position**2, noise.floor_position**2, noise.floor_heading**2])
+    return increments, covs
+
+
+def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoise) -> Odometry:
+    """Increments between consecutive ``times`` from speed and yaw rate held from stamp to stamp; exact arcs.
+
+    A control of exactly zero speed and zero rate is a base that stands: it adds no noise but the floors. With white
+    noise the mean is unbiased: a noisy rate shortens what is integrated, which is undone here as for steering.
+
+    Parameters
+    ----------
+    controls : VelocityControls
+        The last one is held to the end.
+    times : (n,)
+        Stamps of the poses, strictly increasing, none before the first control.
+    noise : MotionNoise
+        σ² = speed² + (speed_fraction · v)² and yaw_rate² + (yaw_rate_fraction · ω)²: drawn per control, or with
+        ``per_increment`` once per increment (constant error and scale error each). Random walks of distance and
+        heading come on top, whatever the rate of the controls.
+
+    Returns
+    -------
+    Odometry
+        As :func:`steering_odometry`.
+
+    Raises
+    ------
+    DataError
+        If a stamp lies before the first control.
+    """
+    t, dt, active, first = _fine_steps(controls.times, times)
+    increments, covs = _start(len(t), noise)
+    if len(t) > 1:
+        speed, rate = controls.speed[active], controls.yaw_rate[active]
+        velocity_increments_kernel(dt, speed, rate, first, noise.as_array(), increments[1:], covs[1:])
+    return Odometry(times=t, increments=increments, covariances=covs)
+
+
+def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: float = 0.0) -> Odometry:
+    """Increments between consecutive ``times`` composed of recorded ones and their covariances.
+
+    A record that a stamp falls into is cut at constant velocity, its covariance in proportion to time (as for noise
+    that is white within it; the pieces are then independent and add up to the record's own at first order).
+
+    Parameters
+    ----------
+    odometry : Odometry
+        Two-dimensional.
+    times : (n,)
+    noise : MotionNoise
+        Only its floors.
+    hold : float
+        Reach beyond the first and the last record, continued at constant velocity [s]. Both the motion and its σ then
+        grow with time: what goes on is a guess.
+
+    Raises
+    ------
+    DataError
+        If the odometry is not planar, has fewer than two records, states covariances that leave its heading unknown, or
+        a stamp lies beyond its reach.
+    """
+    t = check_times(times)
+    stamps = odometry.times
+    if odometry.increments.shape[1] != 3 or len(stamps) < 2:
+        raise DataError("odometry cannot be used", got=odometry.increments.shape, wanted="(n, 3) with n ≥ 2")
+    if len(t) and not (t[0] >= stamps[0] - hold and t[-1] <= stamps[-1] + hold):
+        raise DataError(
+            "pose stamp outside the odometry",
+            got=f"[{t[0]:.3f}, {t[-1]:.3f}] s",
+            wanted=f"[{stamps[0] - hold:.3f}, {stamps[-1] + hold:.3f}] s",
+        )
+    usual = float(np.sqrt(np.median(odometry.covariances[1:, 2, 2])))
+    if usual > HEADING_UNKNOWN:
+        raise DataError(
+            "the stated covariances of the odometry leave its heading unknown within one record",
+            got=f"σ of {usual:.3g} rad in {float(np.median(np.diff(stamps))):.3g} s",
+            wanted=f"below {HEADING_UNKNOWN:.2g} rad; look at their unit and their order: x, y [m], heading [rad]",
+        )
+    increments, covs = _start(len(t), noise)
+    if len(t) < 2:
+        return Odometry(times=t, increments=increments, covariances=covs)
+    knots = np.union1d(stamps[(stamps > t[0]) & (stamps < t[-1])], t)
+    record = np.clip(np.searchsorted(stamps, 0.5 * (knots[:-1] + knots[1:]), side="right"), 1, len(stamps) - 1)
+    u = np.diff(knots) / (stamps[record] - stamps[record - 1])
+    whole = (knots[:-1] == stamps[record - 1]) & (knots[1:] == stamps[record])
+    steps = np.where(
+        whole[:, None], odometry.increments[record], se2_exp(u[:, None] * se2_log(odometry.increments[record]))
+    )
+    guessed = (knots[:-1] < stamps[0]) | (knots[:-1] >= stamps[-1])
+    share = np.where(guessed, np.maximum(u, u**2), u)
+    covs[1:] = covs[0]
+    first = np.searchsorted(knots, t).astype(np.int64)
+    compose_increments_kernel(
+        steps, share[:, None, None] * odometry.covariances[record], first, increments[1:], covs[1:]
+    )
+    return Odometry(times=t, increments=increments, covariances=covs)
+
+
+def steering_odometry(controls: SteeringControls, times: Array, noise: MotionNoise) -> Odometry:
+    """Increments between consecutive ``times`` from zero-order-hold controls.
+
+    Parameters
+    ----------
+    controls : SteeringControls
+        Held constant from each stamp to the next; the last one is held to the end.
+    times : (n,)
+        Stamps of the poses, strictly increasing, none before the first control.
+    noise : MotionNoise
+
+    Returns
+    -------
+    Odometry
+        Record 0 is the identity with the floor covariance; record k takes ``times[k - 1]`` to ``times[k]``.
+
+    Raises
+    ------
+    DataError
+        If a stamp lies before the first control.
+    """
+    t, dt, active, first = _fine_steps(controls.times, times)
+    increments, covs = _start(len(t), noise)
+    g = controls.geometry
+    models = {"rear-axle": REAR_AXLE, "front-steer": FRONT_STEER}
+    if g.model not in models:
+        raise ConfigError(f"unknown steering model {g.model!r}; known: {', '.join(models)}")
+    if len(t) > 1:
+        steering_increments_kernel(
+            dt,
+            controls.speed[active],
+            controls.steering[active],
+            first,
+            models[g.model],
+            g.wheelbase,
+            g.encoder_offset,
+            noise.as_array(),
+            increments[1:],
+            covs[1:],
+        )
+    return Odometry(times=t, increments=increments, covariances=covs)

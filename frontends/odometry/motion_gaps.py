@@ -1,0 +1,197 @@
+"""Gaps in the motion of a robot in the plane: bridged by what the robot does elsewhere in the log, said, and counted.
+
+Nothing tells what a robot did while its wheels were not recorded. The model: it went on at the mean of the speed and
+the yaw rate just before and just after the gap, off by an error that is constant over the gap and as large as the
+spread of all its speeds and yaw rates in the log about that mean. So after a gap of T seconds the distance has
+σ = T · spread, and the heading likewise, up to that of a heading of which nothing is known. Increments that share a
+gap divide its variance by their time: their sum is right, and each of them is less certain than it need be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, se2_exp, se2_log
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.records import Odometry, SteeringControls, VelocityControls
+from graphslam.frontends.odometry.gaps import refuse_long
+from graphslam.frontends.odometry.motion import HEADING_UNKNOWN, Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam.frontends.odometry.recorded import BRIDGED
+
+SHORTEST = 1.0
+"""A pause that is thrice the usual one and longer than this is a gap [s]: a robot can stop within a second."""
+AROUND = 2.0
+"""Time before and after a gap from which the mean motion in it is taken [s]."""
+LOST = 0.5
+"""A record of odometry over a gap that tells less than this part of the way driven around it has lost its records."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionGap:
+    """One gap.
+
+    Parameters
+    ----------
+    begin, end : float
+        Stamps of the records around it [s].
+    speed, yaw_rate : float
+        Taken for it [m/s, rad/s].
+    speed_sigma, yaw_rate_sigma : float
+        Of the error that is constant over it.
+    """
+
+    begin: float
+    end: float
+    speed: float
+    yaw_rate: float
+    speed_sigma: float
+    yaw_rate_sigma: float
+
+    def as_row(self) -> dict[str, float]:
+        """JSON object for a report."""
+        return {k: float(getattr(self, k)) for k in self.__dataclass_fields__}
+
+
+def bridged_reckoning(
+    log: SensorLog, times: Array, noise: MotionNoise, *, hold: float, limit: float, drops: DropCounter
+) -> tuple[Odometry, str, list[MotionGap]]:
+    """Dead reckoning (:mod:`graphslam.frontends.odometry.motion`) with the gaps of the motion bridged by this model.
+
+    Parameters
+    ----------
+    log, times, noise, hold
+        As there.
+    limit : float
+        Longest gap that is bridged [s].
+    drops : DropCounter
+        Counts the gaps.
+
+    Returns
+    -------
+    odometry : Odometry
+        At ``times``.
+    name : str
+        Of the motion stream.
+    gaps : list of MotionGap
+
+    Raises
+    ------
+    MissingDataError, DataError
+        As there; and a gap longer than ``limit``: names it and the option.
+    """
+    name, motion = motion_stream(log)
+    gaps = find_motion_gaps(motion, float(times[0]), float(times[-1]), limit, where=f"{log.name}/{name}")
+    drops.drop(name, "gaps bridged", len(gaps))
+    for gap in gaps:
+        motion = _filled(motion, gap)
+    if gaps:
+        log = replace(log, streams={**log.streams, name: motion})
+    odometry, name = dead_reckoning(log, times, noise, hold=hold)
+    return replace(odometry, covariances=_widened(odometry, gaps)) if gaps else odometry, name, gaps
+
+
+def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, where: str) -> list[MotionGap]:
+    """Gaps of the motion between two times.
+
+    Raises
+    ------
+    DataError
+        One longer than ``limit`` seconds: names it and the option.
+    """
+    stamps = motion.times
+    if len(stamps) < 2:
+        if len(stamps) and end - begin > SHORTEST:
+            raise DataError(
+                "the motion stream holds a single record, which tells of no motion",
+                where=where,
+                got=f"one record for {end - begin:.1f} s",
+                wanted=f"records at least every {limit:g} s (frontend.longest_gap)",
+            )
+        return []
+    usual = float(np.median(np.diff(stamps)))
+    if not isinstance(motion, Odometry) and end > stamps[-1]:
+        stamps = np.append(stamps, end)  # the last control is held to the end
+    spacing = np.diff(stamps)
+    k = np.flatnonzero((spacing > max(3.0 * usual, SHORTEST)) & (stamps[1:] > begin) & (stamps[:-1] < end))
+    refuse_long(stamps, k, limit, where, option="frontend.longest_gap")
+    return [_gap(motion, float(stamps[i]), float(stamps[i + 1])) for i in k]
+
+
+def rates(motion: Motion) -> tuple[Array, Array, Array]:
+    """Speed along x ``(n,)`` [m/s] and yaw rate ``(n,)`` [rad/s] of all records, and since when they hold [s]."""
+    if isinstance(motion, VelocityControls):
+        return motion.speed, motion.yaw_rate, motion.times
+    if isinstance(motion, SteeringControls):
+        g, a = motion.geometry, motion.steering
+        if g.model == "front-steer":
+            return motion.speed * np.cos(a), motion.speed * np.sin(a) / g.wheelbase, motion.times
+        v = motion.speed / (1.0 - np.tan(a) * g.encoder_offset / g.wheelbase)
+        return v, v * np.tan(a) / g.wheelbase, motion.times
+    dt = np.diff(motion.times)
+    xi = se2_log(motion.increments[1:])
+    return xi[:, 0] / dt, xi[:, 2] / dt, motion.times[:-1]
+
+
+def _gap(motion: Motion, begin: float, end: float) -> MotionGap:
+    speed, rate, since = rates(motion)
+    known = np.ones(len(since), dtype=np.bool_)
+    over = -1
+    if isinstance(motion, Odometry):  # the record that ends the gap
+        over = int(np.searchsorted(since, begin))
+        known[over] = len(since) == 1
+    before = known & (since <= begin) & (since >= begin - AROUND)
+    after = known & (since >= end) & (since <= end + AROUND)
+    sides = [m for m in (before, after) if m.any()] or [known]
+    v = float(np.mean([np.mean(speed[m]) for m in sides]))
+    w = float(np.mean([np.mean(rate[m]) for m in sides]))
+    if over >= 0 and abs(speed[over]) >= LOST * abs(v):  # it tells the whole way, not how it went
+        v, w = float(speed[over]), float(rate[over])
+        return MotionGap(begin, end, v, w, BRIDGED * abs(v), BRIDGED * abs(w))
+    spread_v = float(np.sqrt(np.mean((speed[known] - v) ** 2)))
+    spread_w = float(np.sqrt(np.mean((rate[known] - w) ** 2)))
+    return MotionGap(begin, end, v, w, spread_v, spread_w)
+
+
+def _filled(motion: Motion, gap: MotionGap) -> Motion:
+    """The motion with the gap's own speed and yaw rate in it."""
+    v, w = gap.speed, gap.yaw_rate
+    if isinstance(motion, Odometry):
+        increments = motion.increments.copy()
+        k = int(np.searchsorted(motion.times, gap.end))
+        increments[k] = se2_exp((gap.end - gap.begin) * np.array([v, 0.0, w]))
+        return replace(motion, increments=increments)
+    k = int(np.searchsorted(motion.times, gap.begin)) + 1
+    times = np.insert(motion.times, k, gap.begin + min(float(np.median(np.diff(motion.times))), SHORTEST))
+    if isinstance(motion, VelocityControls):
+        return replace(
+            motion, times=times, speed=np.insert(motion.speed, k, v), yaw_rate=np.insert(motion.yaw_rate, k, w)
+        )
+    g = motion.geometry
+    angle = float(np.arctan(w * g.wheelbase / v)) if v else 0.0
+    wheel = (
+        v / np.cos(angle) if g.model == "front-steer" else v * (1.0 - np.tan(angle) * g.encoder_offset / g.wheelbase)
+    )
+    return replace(
+        motion, times=times, speed=np.insert(motion.speed, k, wheel), steering=np.insert(motion.steering, k, angle)
+    )
+
+
+def _widened(odometry: Odometry, gaps: list[MotionGap]) -> Array:
+    """Covariances ``(n, 3, 3)`` with what is not known of the motion in the gaps."""
+    t, covariances = odometry.times, odometry.covariances.copy()
+    for gap in gaps:
+        T = gap.end - gap.begin
+        inside = np.zeros(len(t))
+        inside[1:] = np.maximum(np.minimum(t[1:], gap.end) - np.maximum(t[:-1], gap.begin), 0.0)
+        heading = min(gap.yaw_rate_sigma * T, HEADING_UNKNOWN) / T
+        for k in np.flatnonzero(inside > 0.0):
+            h = inside[k]
+            turn, way = heading * np.sqrt(T * h), abs(gap.speed) * h
+            # along: the distance, and what a bend takes off it; across: what a turn moves the end of an arc
+            along = np.hypot(gap.speed_sigma * np.sqrt(T * h), way * min(turn**2, 1.0) / 4.0)
+            across = way * turn / np.sqrt(3.0) + 0.1 * along
+            covariances[k] += np.diag(np.square([along, across, turn]))
+    return covariances

@@ -1,0 +1,177 @@
+"""What scans did for a path: where they could correct it, and how far off it may be where they could not.
+
+A filter's drift model says what scans leave of the errors of dead reckoning. Where there is no scan to speak of, or the
+motion itself is a guess (a gap in its records), nothing takes these errors away: there the covariance is that of dead
+reckoning over the stretch, carried to the end of the path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of, level
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.submap import Submap
+from graphslam.frontends.odometry.motion_check import check_motion, motion_findings, spin_of
+from graphslam.frontends.odometry.scan_matching import match_neighbours
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import Steps, make_steps
+
+FEW = 10
+"""Returns below which a step's scan does not hold a pose: a wall takes some beams to be a line."""
+LONG = 2.0
+"""Stretches without a correction that are shorter are what the filter's own walks are for [s]."""
+
+
+def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
+    """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : StepConfig
+    drops : DropCounter, optional
+
+    Raises
+    ------
+    GraphSlamError
+        As :func:`graphslam.frontends.odometry.steps.make_steps`; a DataError if no beam of any scan met anything.
+    """
+    count = DropCounter()
+    steps = make_steps(log, replace(config, match_scans=False), drops=count)
+    if drops is not None:
+        drops.counts.update(count.counts)
+    require_returns(steps, count)
+    spins = [spin_of(s.spin_rate) for s in log.streams.values() if isinstance(s, RangeScans)]
+    found = tuple(motion_findings(check_motion(steps, max(spins, default=0.0))))
+    if config.match_scans:  # after the check: what is fused with the scans agrees with them
+        steps = match_neighbours(steps, drops=drops)
+    return replace(steps, findings=found)
+
+
+def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
+    """Raise if no beam of any scan met anything: a map of nothing helps nobody.
+
+    Raises
+    ------
+    DataError
+        Says what became of the beams.
+    """
+    if np.any(steps.returns):
+        return
+    counts = {} if drops is None else drops.counts
+    what = "; ".join(f"{k}: {n}" for k, n in counts.items() if "gap" not in k) or "none was there"
+    far = len(steps.returns)
+    if far:
+        what += f"; {far} beams reached max_range, {steps.max_range:g} m, and met nothing"
+    raise DataError(
+        "no beam of any scan met anything: is the scanner alive, and are its ranges in metres?",
+        where=steps.name,
+        got=what,
+        wanted="ranges between min_range and max_range (frontend.steps.min_range, frontend.steps.max_range)",
+    )
+
+
+def uncorrected(steps: Steps) -> list[tuple[int, int]]:
+    """Stretches ``(first, last)`` of steps, both inclusive and at least :data:`LONG`, whose motion no scan corrects.
+
+    Steps with fewer than :data:`FEW` returns, and steps in a gap of the motion.
+    """
+    n = len(steps)
+    met = np.concatenate([[0], np.cumsum(steps.returns)])[steps.offsets]
+    bad: npt.NDArray[np.bool_] = np.diff(met) < FEW
+    for a, b in zip(steps.gaps.begin, steps.gaps.end):
+        if b - a >= LONG:
+            bad[1:] |= (steps.times[1:] > a) & (steps.times[:-1] < b)
+    bad[:1] = False  # the first step does not move
+    out = []
+    for a, b in np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8))).reshape(-1, 2):
+        if steps.times[b - 1] - steps.times[max(a - 1, 0)] >= LONG - 1e-6 and b <= n:
+            out.append((int(a), int(b) - 1))
+    return out
+
+
+def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path: Array, first: int, last: int) -> Array:
+    """What stretches without a correction add at the end of a path: covariance ``(d, d)``, right tangent.
+
+    Parameters
+    ----------
+    steps : Steps
+    stretches : list of (first, last)
+        Of :func:`uncorrected`.
+    path : (last - first + 1, 7) or (…, 3)
+        Poses at the steps ``first`` to ``last``.
+    """
+    group = group_of(path)
+    total = np.zeros((group.dof, group.dof))
+    for begin, end in stretches:
+        a, b = max(begin, first + 1), min(end, last)
+        if a > b:
+            continue
+        P, there = _reckoned(steps, a - 1, b), path[b - first]
+        if group.dim == 3 and steps.tilt is not None:
+            there = level(there)
+        A = group.adjoint(group.between(path[-1], there))
+        total += A @ P @ A.T
+    return 0.5 * (total + total.T)
+
+
+def _reckoned(steps: Steps, start: int, end: int) -> Array:
+    """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent."""
+    if steps.errors is not None:
+        gravity = steps.tilt is not None
+        try:
+            return steps.errors.between(start, end, level_start=gravity, level_end=gravity)[1]
+        except DataError:  # recorded odometry does not know level frames
+            return steps.errors.between(start, end)[1]
+    o, group = steps.odometry, group_of(steps.odometry.increments)
+    P = np.zeros((group.dof, group.dof))
+    for k in range(start + 1, end + 1):
+        back = group.adjoint(group.inverse(o.increments[k]))
+        P = back @ P @ back.T + o.covariances[k]
+    return P
+
+
+def scan_findings(steps: Steps) -> list[Finding]:
+    """Lines of the verdict on gaps of the motion, and on stretches that no scan corrects."""
+    out = []
+    gaps = [(a, b) for a, b in zip(steps.gaps.begin, steps.gaps.end) if b - a >= LONG]
+    if gaps:
+        a, b = max(gaps, key=lambda g: g[1] - g[0])
+        text = (
+            f"Gaps of {LONG:g} s or more in the records of the motion were bridged: {len(gaps)}, the longest "
+            f"{b - a:.1f} s from {a:.2f} s. The motion there is a guess, and the covariances are widened by what this "
+            "robot does in such a time."
+        )
+        out.append(Finding("look", "motion-gap", text))
+    stretches = uncorrected(steps)
+    blind = [s for s in stretches if not _in_gap(steps, s)]
+    if blind:
+        seconds = sum(float(steps.times[b] - steps.times[a - 1]) for a, b in blind)
+        metres = sum(float(steps.path_length[b] - steps.path_length[a - 1]) for a, b in blind)
+        share = seconds / max(float(steps.times[-1] - steps.times[0]), 1e-9)
+        text = (
+            f"No scan corrects the motion for {seconds:.1f} s ({metres:.1f} m, {100 * share:.0f} % of the time; "
+            f"stretches: {len(blind)}): there are fewer than {FEW} returns in a step. The path "
+            "there is dead reckoning, and the covariances are widened by its own."
+        )
+        out.append(Finding("bad" if share > 0.5 else "look", "motion-uncorrected", text))
+    return out
+
+
+def with_findings(submap: Submap, steps: Steps) -> Submap:
+    """The submap, whose report takes along what is to be said of the steps: rows for the run's verdict."""
+    rows = [f.as_row() for f in (*steps.findings, *scan_findings(steps))]
+    return replace(submap, report={**submap.report, "findings": rows}) if rows else submap
+
+
+def _in_gap(steps: Steps, stretch: tuple[int, int]) -> bool:
+    a, b = steps.times[stretch[0] - 1], steps.times[stretch[1]]
+    return bool(np.any((steps.gaps.begin < b) & (steps.gaps.end > a) & (steps.gaps.end - steps.gaps.begin >= LONG)))

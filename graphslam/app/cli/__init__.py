@@ -1,0 +1,114 @@
+"""The command line: verbs, exit codes, and the one place where errors become a line of text.
+
+Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+
+import typer
+
+import graphslam
+
+# Before NumPy loads: thousands of small matrices, whose BLAS threads would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from graphslam.app.cli import data as cli_data
+from graphslam.app.cli import export as cli_export
+from graphslam.app.cli import join as cli_join
+from graphslam.app.cli import localise as cli_localise
+from graphslam.app.cli import loops as cli_loops
+from graphslam.app.cli import map as cli_map
+from graphslam.app.cli import merge as cli_merge
+from graphslam.app.cli import report as cli_report
+from graphslam.app.cli import run as cli_run
+from graphslam.app.cli import study as cli_study
+from graphslam.app.cli import tools as cli_tools
+from graphslam.app.cli.terminal import log_to_stderr
+from graphslam.core.errors import GraphSlamError
+
+app = typer.Typer(
+    name="graphslam",
+    help="Globally consistent maps with an uncertainty you can trust.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"graphslam {graphslam.__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    verbose: bool = typer.Option(False, "--verbose", "-v", help="Say on stderr what is being done."),
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    log_to_stderr(verbose)
+
+
+cli_run.register(app)
+cli_join.register(app)
+cli_map.register(app)
+cli_merge.register(app)
+cli_loops.register(app)
+cli_report.register(app)
+cli_localise.register(app)
+cli_export.register(app)
+cli_study.register(app)
+cli_tools.register(app)
+app.add_typer(cli_data.app, name="data")
+
+
+def main() -> None:
+    """Entry point ``graphslam``."""
+    try:
+        app()
+    except BrokenPipeError:  # `graphslam … | head`
+        sys.stderr.close()
+        sys.exit(1)
+    except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
+        typer.echo(f"graphslam: {one_line(error)}", err=True)
+        _drop_output()
+        sys.exit(1)
+
+
+def one_line(error: BaseException) -> str:
+    """What a user reads of an error: ours as they are, those of the machine with what can be done."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, MemoryError):  # NumPy says how much was asked for
+        return f"not enough memory; use a smaller part of the data, or another machine. {error}".strip()
+    if isinstance(error, RecursionError):
+        return "something is nested too deeply to be followed; look for a damaged file among those given"
+    if isinstance(error, OSError):
+        files = [str(f) for f in (error.filename, error.filename2) if f is not None]
+        advice = _ADVICE.get(error.errno or 0, "")
+        return f"{': '.join([*files, error.strerror or str(error)])}{advice}"
+    return " ".join(str(error).split())
+
+
+def _drop_output() -> None:
+    """Have nothing left that the interpreter would write, and fail to write, at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:  # for example a full disk behind `graphslam … > file`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+_ADVICE = {
+    errno.ENOSPC: "; make room and run the same command again: what is finished is kept",
+    errno.EDQUOT: "; make room and run the same command again: what is finished is kept",
+    errno.EFBIG: "; the limit on the size of files is too low (ulimit -f)",
+    errno.EMFILE: "; the limit on open files is too low (ulimit -n)",
+}
+
+
+if __name__ == "__main__":
+    main()

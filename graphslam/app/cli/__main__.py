@@ -1,0 +1,5 @@
+"""``python -m graphslam.app.cli``."""
+
+from graphslam.app.cli import main
+
+main()

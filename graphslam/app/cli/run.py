@@ -1,0 +1,181 @@
+"""``graphslam run``, ``demo``, ``simulate``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from graphslam.app.cli.terminal import emit, table, verdict_text
+from graphslam.app.run import config as cfg
+from graphslam.core.reading import set_size_limit
+
+
+def _limit(size: str | None) -> str | None:
+    """Set the limit for this process: a number of bytes, or with K, M or G of thousands, millions, 10⁹ of them."""
+    if size is not None:
+        found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?([kKmMgG]?)B?", size.strip())
+        n = 0 if found is None else int(float(found[1]) * 1000 ** " KMG".index(found[2].upper() or " "))
+        if n <= 0:
+            raise typer.BadParameter(f"{size!r}; wanted for example 500M or 4G")
+        set_size_limit(n)
+    return size
+
+
+MAX_SIZE = typer.Option(
+    None, "--max-size", callback=_limit, help="Most that is read of one file, decompressed; 2G unless told, e.g. 8G."
+)
+JSON = typer.Option(False, "--json", help="One JSON object on stdout, nothing else there.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    app.command()(run)
+    app.command()(demo)
+    app.command()(simulate)
+
+
+def run(
+    source: str = typer.Argument(..., help="A data-set card, or a folder with a log."),
+    frontend: str = typer.Option("rbpf-ekf", help="Front end that makes the submaps."),
+    solver: str = typer.Option("isam2", help="isam2 or batch."),
+    config: Path | None = typer.Option(None, help="TOML file with options over the source's preset."),
+    setting: list[str] = typer.Option([], "--set", help="One option, a.b=value; may be repeated."),
+    seed: int = typer.Option(0, help="Root of the seed tree."),
+    out: Path = typer.Option(..., help="Run folder."),
+    resume: bool = typer.Option(False, "--resume", help="Go on after the last finished submap."),
+    saved: list[Path] = typer.Option(
+        [], "--continue", help="Run folder whose graph this session joins, in OUT/continued; may be repeated."
+    ),
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Raw log → submaps → graph → map, with everything that was measured on the way."""
+    from graphslam.app.run.pipeline import run as run_pipeline
+
+    options = _options(config, setting)
+    result = run_pipeline(
+        source,
+        frontend=frontend,
+        solver=solver,
+        seed=seed,
+        out=out,
+        config=options,
+        resume=resume,
+        progress=not as_json,
+    )
+    rows = result.metrics.to_dict("records")
+    value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
+    text = _summary(result, out)
+    if saved:
+        from graphslam.app.sessions.continue_run import continue_runs
+
+        joined = continue_runs(saved, result, out=out / "continued")
+        value["continued"] = joined.report
+        figures = table(joined.metrics.to_dict("records"), ["key", "value", "unit"])
+        text += f"\n{figures}\n{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"
+    emit(value, text, as_json=as_json)
+
+
+def _options(config: Path | None, settings: list[str]) -> dict[str, Any]:
+    values: dict[str, Any] = cfg.read_toml(config) if config else {}
+    values.pop("run", None)  # an effective config.toml of another run may be given as it is
+    for text in settings:
+        values = cfg.merge(values, cfg.parse_setting(text))
+    return values
+
+
+def _summary(result: Any, out: Path) -> str:
+    dropped = result.report["records_dropped"]
+    lines = [table(result.metrics.to_dict("records"), ["key", "value", "unit"])]
+    lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
+    lines += join_note(result)
+    lines += ["", *verdict_text(result.verdict), ""]
+    lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
+    return "\n".join(lines)
+
+
+CAUSES = frozenset(
+    {"residuals", "calibration", "sightings-not-used", "motion-gap", "particles", "gps-mirrored", "gps-scale"}
+    | {"gps-correlated", "ranges-constant", "bearings-degrees", "steering-degrees", "scans-repeated", "ranges-and-way"}
+)
+"""Lines of a verdict that name why submaps fit each other badly."""
+
+
+def join_note(result: Any) -> list[str]:
+    """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
+    from graphslam.app.run.verdict import CERTAIN
+    from graphslam.evaluate.without_truth import two_sided
+
+    m = result.metrics.set_index("key")["value"]
+    chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
+    if chi2 is None or not dof > 0:
+        return []
+    low, high, said = two_sided(chi2, dof, CERTAIN)
+    if said == "consistent":
+        return []
+    text = f"note: join χ²/dof is {chi2:.3g}; for {dof:.4g} degrees of freedom 999 of 1000 honest runs lie between "
+    text += f"{low:.3g} and {high:.3g}. "
+    causes = [f.code for f in result.verdict if f.code in CAUSES and f.level in ("look", "bad")]
+    if said == "over-confident" and causes:
+        named = ", ".join(f"“{c}”" for c in dict.fromkeys(causes))
+        return [f"{text}The verdict names a cause ({named}): mend that before any covariance is scaled"]
+    scale = result.report["covariance_scale"] * chi2
+    return [f"{text}Without another cause: --set backend.covariance_scale={scale:.2g}"]
+
+
+def demo(
+    out: Path = typer.Option(Path("demo-run"), help="Run folder; a demo that is there already is gone on with."),
+    seed: int = typer.Option(0, help="Of every sensor error, of what stands about, and of the filter."),
+    preset: str = typer.Option("garage", help="Size of the world: garage or quick."),
+    as_json: bool = JSON,
+) -> None:
+    """A robot in a simulated garage of two levels → SegSLAM → one graph → the map that follows it."""
+    from graphslam.app.demo import run_demo
+
+    result = run_demo(out, seed=seed, preset=preset, progress=not as_json)
+    rows = result.metrics.to_dict("records")
+    text = (
+        f"{table(rows, ['key', 'value', 'unit'])}"
+        f"\n\n{chr(10).join(verdict_text(result.verdict))}"
+        f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
+        f"\nreport: {out / 'report.html'}"
+        f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"
+    )
+    value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
+    emit(value, text, as_json=as_json)
+
+
+def simulate(
+    world: str = typer.Argument(..., help="landmark-field, garage, mine, building or court"),
+    out: Path = typer.Option(..., help="Folder for the log, truth included."),
+    seed: int = typer.Option(0, help="Of every error, and of what can be moved in the world."),
+    layout: str | None = typer.Option(None, help="Of the garage: A, B or C."),
+    preset: str | None = typer.Option(
+        None, help="Landmark field: A, B, C, demo or quick. Other worlds: light, full or two-scanners."
+    ),
+    setting: list[str] = typer.Option([], "--set", help="A figure of the world or robot, name=value; repeatable."),
+    as_json: bool = JSON,
+) -> None:
+    """A recorded log of a simulated world, with its truth and every noise figure stated."""
+    from graphslam.app.worlds import simulate as make
+    from graphslam.app.worlds import write_simulated
+
+    changes: dict[str, Any] = {}
+    for text in setting:
+        changes |= cfg.parse_setting(text)
+    log = make(world, seed=seed, preset=preset, layout=layout, progress=not as_json, **changes)
+    write_simulated(log, out)
+    streams = {name: len(s.times) for name, s in log.streams.items()}
+    rows = [{"stream": k, "records": v} for k, v in streams.items()]
+    value = {
+        "out": str(out),
+        "world": world,
+        "seed": seed,
+        "duration": log.duration,
+        "streams": streams,
+        "meta": log.meta,
+    }
+    emit(value, f"{table(rows)}\n{log.duration:.1f} s written to {out}", as_json=as_json)

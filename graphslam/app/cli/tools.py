@@ -1,0 +1,91 @@
+"""``graphslam solve``, ``eval``, ``doctor``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+import typer
+
+from graphslam.app.cli.run import JSON, MAX_SIZE
+from graphslam.app.cli.terminal import emit, table
+from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, UnknownNameError
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    app.command()(solve)
+    app.command("eval")(evaluate)
+    app.command()(doctor)
+
+
+def solve(
+    file: str = typer.Argument(..., help="A .g2o, .graph or .txt file (also .xz, .gz, .bz2), or card/file."),
+    solver: str = typer.Option("lm", help="lm, isam2, gnc or pcg."),
+    repair: bool = typer.Option(
+        False, "--repair", help="Project indefinite information matrices instead of refusing them."
+    ),
+    create_missing: bool = typer.Option(
+        False, "--create-missing", help="Make vertices that only edges name instead of refusing the file."
+    ),
+    out: Path | None = typer.Option(None, help="g2o file for the solution."),
+    certify: bool = typer.Option(False, "--certify", help="Say whether the answer is the global optimum."),
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Solve a pose-graph file from its best start, and say honestly whether it is at its optimum."""
+    from graphslam.app.solve_file import solve_file
+    from graphslam.io.catalog import load
+
+    path = Path(file)
+    if not path.is_file():
+        found = load(file)
+        if not isinstance(found, Path) or not found.is_file():
+            raise MissingDataError(
+                f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"
+            )
+        path = found
+    value = solve_file(path, solver, repair=repair, create_missing=create_missing, out=out, certificate=certify)
+    emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
+
+
+def evaluate(
+    estimate: Path = typer.Argument(..., help="TUM file."),
+    reference: Path = typer.Argument(..., help="TUM file."),
+    align: str = typer.Option("se", help="none, origin, se or sim."),
+    delta: float = typer.Option(10.0, help="Distance [m] (or time [s]) of the relative error."),
+    delta_unit: str = typer.Option("m", help="m or s."),
+    max_diff: float = typer.Option(0.01, help="Stamps further apart are no pair [s]."),
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Absolute and relative trajectory error (ATE, RPE)."""
+    from graphslam.evaluate.trajectory_error import Alignment, ate, rpe
+    from graphslam.io.tum import read_tum
+
+    est, ref = read_tum(estimate), read_tum(reference)
+    known = {"align": (align, get_args(Alignment)), "delta-unit": (delta_unit, ("m", "s"))}
+    for option, (given, allowed) in known.items():
+        if given not in allowed:
+            raise UnknownNameError(f"--{option}", given, allowed)
+    absolute = ate(est, ref, alignment=cast(Alignment, align), max_diff=max_diff)
+    unit = cast(Literal["m", "s"], delta_unit)
+    value: dict[str, Any] = {"ate": absolute.as_row(), "rpe": None}
+    try:
+        value["rpe"] = rpe(est, ref, delta=delta, unit=unit, scale=align == "sim", max_diff=max_diff).as_row()
+    except DataError as error:  # a path shorter than delta still has an absolute error
+        typer.echo(f"no relative error: {error}; choose another --delta", err=True)
+    rows = [{"error": k, **v} for k, v in value.items() if v]
+    emit(value, table(rows), as_json=as_json)
+
+
+def doctor(as_json: bool = JSON) -> None:
+    """Versions, missing system libraries, and what to install."""
+    from graphslam.app.doctor import examine
+
+    findings = examine()
+    rows = [{"check": f.name, "state": f.state, "detail": f.detail} for f in findings]
+    emit({"checks": rows}, table(rows), as_json=as_json)
+    bad = [f for f in findings if f.state == "missing"]
+    if bad:
+        raise GraphSlamError(f"{len(bad)} required parts are missing: {', '.join(f.name for f in bad)}")

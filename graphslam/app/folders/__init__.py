@@ -1,0 +1,1 @@
+"""Folders whose files are written together, each state committed as a whole."""

@@ -1,0 +1,1 @@
+"""Alternative graphs of one run, each solved; the clearest chosen."""

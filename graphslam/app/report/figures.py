@@ -1,0 +1,155 @@
+"""Pictures of a report: those that the run drew, and two that are drawn from its folder: its loops, its NEES."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.markup import missing, note, picture, section
+from graphslam.app.run.files import read_map, read_merged_dense
+from graphslam.app.sessions.dense_ties import SESSION
+from graphslam.core.errors import DataError, GraphSlamError
+from graphslam.core.markup import Markup, join
+from graphslam.evaluate.consistency import Consistency, nees, pose_error
+from graphslam.io.submap_store import read_truth
+from graphslam.io.tum import read_tum
+
+CAPTIONS = {
+    "map.png": "The map: path with 95 % ellipses, landmarks where there are any; truth, GPS, dead reckoning if known",
+    "side.png": "The path from the side",
+    "submaps.png": "Submaps at their solved poses",
+    "fused.png": "Fused evidence grid at the solved poses",
+    "fused_above.png": "Fused evidence grid from above",
+    "fused_cut.png": "Fused evidence grid, cut from the side",
+    "gps_residuals.png": "Distances to the GPS fixes",
+    "gps_innovations.png": "Withheld GPS fixes against their prediction",
+    "loops.png": "Loops of landmark submaps against each other",
+    "progress.png": "Segments as they came in, before any loop was closed in the graph",
+}
+
+MOST_NAMES = 60
+"""More loops than these are drawn without their numbers."""
+
+
+def figures(folder: ReportFolder) -> Markup:
+    """Pictures, the map first."""
+    made = dict(folder.figures())
+    parts: list[Any] = []
+    order = [n for n in CAPTIONS if n in made and n != "progress.png"]
+    levels = [n for n in made if n.startswith("fused_level")]
+    rest = [n for n in made if n not in {*order, *levels, "progress.png"}]
+    at = order.index("submaps.png") + 1 if "submaps.png" in order else min(1, len(order))
+    drawn = _drawn(folder)
+    for name in order[:at]:
+        parts.append(picture(made[name], CAPTIONS[name]))
+    parts += drawn
+    for name in [*levels, *order[at:], *rest, *(["progress.png"] if "progress.png" in made else [])]:
+        parts.append(picture(made[name], _caption(name)))
+    if not made:
+        parts.append(missing("pictures of the run: the folder has none in figures/."))
+    elif "map.png" not in made:
+        parts.append(missing("the map (figures/map.png)."))
+    if folder.kind == "run" and not any(n.startswith("fused") for n in made):
+        said = folder.report.get("map_left_out", "the submaps have no evidence grids, or the map was not asked for.")
+        parts.append(missing("a fused map: ", said))
+    return section("figures", "Figures", *parts)
+
+
+def _caption(name: str) -> str:
+    if name in CAPTIONS:
+        return CAPTIONS[name]
+    stem = name.removesuffix(".png")
+    if stem.startswith("fused_level"):
+        return f"Fused evidence grid, storey {stem.removeprefix('fused_level')}"
+    return stem.replace("_", " ")
+
+
+def _drawn(folder: ReportFolder) -> list[Markup]:
+    """Loops over the path, NEES submap by submap: from what the folder holds."""
+    if folder.kind == "interrupted":
+        return [missing("loops over the path, and NEES by submap: the run was not finished.")]
+    if folder.kind == "merged":
+        return _session_ties(folder)
+    try:
+        m = read_map(folder.path)
+    except GraphSlamError as error:
+        folder.problems["map.npz"] = _said(folder, error)
+        return [missing("loops over the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")]
+    bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
+    loops = _loops(folder, m.node_poses, m.trajectory.poses)
+    return [*loops, *_nees(folder, m.node_poses, m.node_covariances, bases)]
+
+
+def _session_ties(folder: ReportFolder) -> list[Markup]:
+    """Ties between sessions over the paths of both."""
+    from graphslam.plots.loops import plot_loops
+    from graphslam.plots.save import png
+
+    ties = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
+    if not ties:
+        return [missing("ties between sessions over their paths: there are none that are places.")]
+    try:
+        nodes = read_merged_dense(folder.path)["nodes"]
+        paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
+        gap = np.full((1, 2), np.nan)  # lifts the pen
+        path = np.concatenate([x for p in paths for x in (p, gap)])
+        ends = [(e["i"], e["j"], "accepted") for e in ties]
+        ax = plot_loops(None, path, nodes, ends, title="ties between sessions, from above")
+    except GraphSlamError as error:
+        return [missing("ties between sessions over their paths: ", _said(folder, error), ".")]
+    return [picture(png(ax), "Paths of the sessions in the common frame, and the places that tie them")]
+
+
+def _said(folder: ReportFolder, error: Exception) -> str:
+    """An error without the place of the folder: the page may be moved, and says the same wherever it was made."""
+    return " ".join(str(error).replace(f"{folder.path}/", "").replace(f"{folder.home}/", "").split())
+
+
+def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Markup]:
+    from graphslam.plots.loops import plot_loops
+    from graphslam.plots.save import png
+
+    n = len(nodes)
+    rows = [r for r in folder.loop_rows if 0 <= r["i"] < n and 0 <= r["j"] < n]
+    if not folder.loop_rows:
+        return []  # the part on loops says why there are none
+    try:
+        ends = [(int(r["i"]), int(r["j"]), str(r["verdict"])) for r in rows]
+        names = [r["loop"] for r in rows] if len(rows) <= MOST_NAMES else None
+        ax = plot_loops(None, path, nodes, ends, names=names, title="loops over the path, from above")
+    except DataError as error:
+        return [missing("loops over the path: ", error, ".")]
+    out = [picture(png(ax), "Loops over the path, by their numbers in the ledger: in the graph, undone, refused")]
+    lost = len(folder.loop_rows) - len(rows)
+    return [*out, note(f"{lost} loops have no node that could be drawn.")] if lost else out
+
+
+def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, bases: np.ndarray) -> list[Markup]:
+    try:
+        truth = read_truth(folder.path)
+        if truth is None:
+            return [missing("NEES by submap: no truth in the folder.")]
+        keys = np.array([int(e["key"]) for e in folder.submaps], dtype=np.int64)
+        if len(bases) != len(keys) + 1:
+            raise DataError("nodes are not those of the submaps", got=len(bases) - 1, wanted=len(keys))
+        here = np.isin(truth.keys, keys)
+        if not np.any(here):
+            return [missing("NEES by submap: the truth is of none of its submaps.")]
+        end = bases[1 + np.searchsorted(keys, truth.keys[here])]
+        d2 = nees(pose_error(nodes[end], truth.exit_poses[here]), covariances[end])
+    except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
+        return [missing("NEES by submap: ", _said(folder, error), ".")]
+    from graphslam.plots.consistency import plot_consistency
+    from graphslam.plots.save import png
+
+    dof = covariances.shape[-1]
+    made = Consistency(
+        quantity="ends of submaps", nees=d2[None], dof=np.full((1, len(d2)), dof), gauge="first base fixed"
+    )
+    ax = plot_consistency(
+        None, {"this run": made}, submaps=truth.keys[here], title=f"n = {dof}, first base fixed, one run"
+    )
+    text = "NEES/n of the ends of the submaps against the truth, with the 95 % bounds of an honest run"
+    return [picture(png(ax), text), note(join(["Ends of one run share their errors: they lie in or out together."]))]

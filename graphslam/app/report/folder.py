@@ -1,0 +1,196 @@
+"""What a report is made of, read from a folder; what is not there, or damaged, is noted and not fatal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import pandas as pd
+
+from graphslam.app.run.files import (
+    read_events,
+    read_ledger,
+    read_merge_report,
+    read_metrics,
+    read_options,
+    read_report,
+)
+from graphslam.app.run.loops import ledger_of_events
+from graphslam.app.run.metrics import is_time
+from graphslam.core.atomic import read_json
+from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
+from graphslam.io.submap_store import SubmapStore
+from graphslam.loops.ledger import LoopLedger
+
+Kind = Literal["run", "interrupted", "merged"]
+T = TypeVar("T")
+_PNG_HEAD, _PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+MOST_BYTES = 8_000_000
+"""A picture larger than this is left out of the page."""
+
+
+@dataclass
+class ReportFolder:
+    """Everything a report says, as it stands in a folder.
+
+    Parameters
+    ----------
+    path : Path
+        Where the files of its present state are.
+    home : Path
+        The folder itself: configuration, submaps.
+    kind : {"run", "interrupted", "merged"}
+        A finished run, one that has no ``run.json`` yet, or several runs merged.
+    """
+
+    path: Path
+    home: Path
+    kind: Kind
+    config: dict[str, Any] = field(default_factory=dict)
+    """``config.toml``."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """``run.json`` or ``merge.json``."""
+    metrics: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] | None = None
+    loops: LoopLedger | None = None
+    loop_rows: list[dict[str, Any]] = field(default_factory=list)
+    """The rows of ``graphslam loops``, with all gates."""
+    ledger: pd.DataFrame | None = None
+    submaps: list[dict[str, Any]] = field(default_factory=list)
+    """Index of the store."""
+    clearest: dict[str, Any] | None = None
+    """Other choices of matches, where they were asked for."""
+    problems: dict[str, str] = field(default_factory=dict)
+    """Part of the folder → why it is not in the report."""
+
+    @property
+    def name(self) -> str:
+        """What was run."""
+        if self.kind == "merged":
+            return " + ".join(str(s.get("name", "?")) for s in self.sessions) or "merged runs"
+        said = self.config.get("run", {})
+        return str(self.report.get("source", said.get("source", "unknown") if isinstance(said, dict) else "unknown"))
+
+    @property
+    def sessions(self) -> list[dict[str, Any]]:
+        """Of a merged folder."""
+        found = self.report.get("sessions", [])
+        return [s for s in found if isinstance(s, dict)] if isinstance(found, list) else []
+
+    def values(self) -> dict[str, float]:
+        """Metrics by key; those without a number are left out."""
+        return {
+            str(r.get("key")): float(r["value"])
+            for r in self.metrics
+            if isinstance(r.get("value"), (int, float)) and not isinstance(r["value"], bool)
+        }
+
+    def part(self, name: str) -> dict[str, Any]:
+        """A mapping inside the report; empty where it is none."""
+        found = self.report.get(name)
+        return found if isinstance(found, dict) else {}
+
+    def figures(self) -> list[tuple[str, bytes]]:
+        """Name and bytes of every picture, in the order of their names."""
+        out = []
+        found = {f.name: f for f in (self.home / "figures").glob("progress.png")}  # drawn while the run went on
+        found |= {f.name: f for f in (self.path / "figures").glob("*.png")}
+        for _, file in sorted(found.items()):
+            if file.name.startswith("."):
+                continue
+            try:
+                data = file.read_bytes()
+            except OSError as error:
+                self.problems[f"figures/{file.name}"] = f"cannot be read ({error.strerror})"
+                continue
+            if not (data.startswith(_PNG_HEAD) and data.endswith(_PNG_TAIL)):
+                self.problems[f"figures/{file.name}"] = "is no whole PNG file"
+            elif len(data) > MOST_BYTES:
+                self.problems[f"figures/{file.name}"] = f"is too large for the page ({len(data) / 1e6:.1f} MB)"
+            else:
+                out.append((file.name, data))
+        return out
+
+
+def read_folder(path: str | Path, root: Path) -> ReportFolder:
+    """Read what there is, of one state of the folder, whose files are in ``root``.
+
+    Raises
+    ------
+    RunFolderError
+        Neither a run folder nor a merged one.
+    """
+    home = Path(path)
+    if (root / "merge.json").is_file():
+        kind: Kind = "merged"
+    elif (root / "run.json").is_file():
+        kind = "run"
+    elif (home / "config.toml").is_file():
+        kind = "interrupted"
+    else:
+        raise RunFolderError(
+            f"{home}: no run folder (neither config.toml nor merge.json); give one that run, demo or merge wrote"
+        )
+    out = ReportFolder(root, home, kind)
+
+    def attempt(name: str, read: Callable[[], T], otherwise: T) -> T:
+        try:
+            return read()
+        except (GraphSlamError, OSError) as error:
+            known = " ".join(str(error).replace(f"{root}/", "").replace(f"{home}/", "").split())
+            out.problems[name] = known if (root / name).exists() or (home / name).exists() else "is not there"
+            return otherwise
+
+    if kind == "merged":
+        out.report = attempt("merge.json", lambda: read_merge_report(root), {})
+    else:
+        out.config = attempt("config.toml", lambda: _options(home), {})
+        out.submaps = attempt("submaps/index.json", lambda: _index(home), [])
+    if kind == "run":
+        out.report = attempt("run.json", lambda: read_report(root), {})
+    if kind == "interrupted":
+        for name in ("run.json", "metrics.json", "events.jsonl", "ledger.csv"):
+            out.problems[name] = "is not there: it is written when a run is finished"
+        return out
+    out.metrics = attempt("metrics.json", lambda: _metrics(root, "metrics.json"), [])
+    if not any(is_time(r.get("key")) for r in out.metrics):  # an older version kept them there
+        out.metrics += attempt("timings.json", lambda: _metrics(root, "timings.json"), [])
+    out.events = attempt("events.jsonl", lambda: read_events(root), None)
+    if out.events is not None:
+        events = out.events
+        nothing: tuple[LoopLedger | None, list[dict[str, Any]]] = (None, [])
+        out.loops, out.loop_rows = attempt("events.jsonl", lambda: _loops(events), nothing)
+    out.ledger = attempt("ledger.csv", lambda: read_ledger(root), None)
+    if (root / "clearest.json").is_file():
+        out.clearest = attempt(
+            "clearest.json", lambda: read_json(root / "clearest.json", fmt="graphslam.clearest/1"), None
+        )
+    return out
+
+
+def _options(root: Path) -> dict[str, Any]:
+    if not (root / "config.toml").exists():
+        raise MissingDataError("no such file", where="config.toml")
+    return read_options(root)
+
+
+def _metrics(root: Path, name: str) -> list[dict[str, Any]]:
+    """Rows of the metrics; what is no number has no value."""
+    rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root, name).to_dict("records")]
+    return [r if r["value"] == r["value"] else {**r, "value": None} for r in rows]
+
+
+def _index(root: Path) -> list[dict[str, Any]]:
+    if not (root / "submaps" / "index.json").is_file():
+        raise RunFolderError("no submap was finished")
+    return SubmapStore(root / "submaps").entries
+
+
+def _loops(events: list[dict[str, Any]]) -> tuple[LoopLedger | None, list[dict[str, Any]]]:
+    ledger = ledger_of_events(events, where="events.jsonl")
+    rows = [{str(k): v for k, v in row.items()} for row in ledger.table().to_dict("records")]
+    for row, d in zip(rows, ledger.current()):
+        row["gates"] = {k: v for k, v in (d.gates or {}).items() if v is not None and v == v}
+    return ledger, rows

@@ -1,0 +1,140 @@
+"""Parts of a report: the ledger of loops, ties between sessions, hypotheses and runners-up."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.markup import folded, missing, note, section
+from graphslam.core.markup import Markup, Row, element, join, table
+
+ORDER = ("accepted", "switched-off", "undone", "rejected")
+COLUMNS = {
+    **{"loop": "loop", "verdict": "verdict", "source": "source", "submap_i": "submap i", "submap_j": "submap j"},
+    **{"i": "node i", "j": "node j", "score": "score", "gain": "gain", "fitness": "fitness", "margin": "margin"},
+    **{"sigma": "σ [m]", "chi2": "χ²", "weight": "weight", "effect_predicted": "effect foreseen", "effect": "effect"},
+    **{"effect_earlier": "on earlier factors", "factor_id": "factor", "why": "why", "gates": "gates"},
+}
+"""Keys as ``graphslam loops --json`` has them."""
+
+
+def loops(folder: ReportFolder) -> Markup:
+    """Every loop with the decision in force: those in the graph, those taken out again, those refused."""
+    title = "Loops"
+    if folder.loops is None:
+        why = folder.problems.get("events.jsonl", "does not say")
+        return section("loops", title, missing("the ledger of loops; events.jsonl ", why, "."), *_ties(folder))
+    if not folder.loop_rows:
+        return section("loops", title, _none(folder), *_ties(folder))
+    counts = folder.loops.counts()
+    said = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
+    rows = sorted(folder.loop_rows, key=_rank)
+    # what the registration itself refused is most of a long run, and least of what one looks for
+    short = [r for r in rows if not str(r["why"]).startswith("registration")]
+    hidden = [r for r in rows if str(r["why"]).startswith("registration")]
+    parts: list[Any] = [note(f"Loops: {len(rows)}; {said}. The same by “graphslam loops”; take one out with --undo.")]
+    parts.append(_ledger(short) if short else note("None but those below."))
+    if hidden:
+        parts.append(folded(f"{len(hidden)} refused by their registration", _ledger(hidden)))
+    parts += _history(folder)
+    parts.append(
+        note(
+            "χ² against the graph without the loop; weight of the robust kernel at the solution, 0 of a loop that is "
+            "not in the graph; effect: by how much it raised the objective, foreseen and measured, and what of that "
+            "earlier factors bear; – : not measured (front-end matches have a support and no registration here). "
+            "docs/loops.md says what each gate asks."
+        )
+    )
+    return section("loops", title, *parts, *_ties(folder))
+
+
+def _none(folder: ReportFolder) -> Markup:
+    backend = folder.config.get("backend", {})
+    asked = bool(backend.get("loops")) if isinstance(backend, Mapping) else False
+    if folder.kind == "merged":
+        return note("No loops in the events; ties between sessions, where they are places, are below.")
+    if asked:
+        return note("Loops were looked for; there was no candidate.")
+    return note(
+        "None: the back end was not asked to look for loops (backend.loops), and the front end handed over no matches. "
+        "Landmarks seen again close loops by themselves, as factors of their submaps."
+    )
+
+
+def _rank(row: Mapping[str, Any]) -> tuple[int, int]:
+    v = str(row["verdict"])
+    return ORDER.index(v) if v in ORDER else len(ORDER), int(row["loop"])
+
+
+def _ledger(rows: list[dict[str, Any]]) -> Markup:
+    return table([Row(r, str(r["verdict"])) for r in rows], COLUMNS, class_="loops")
+
+
+def _history(folder: ReportFolder) -> list[Markup]:
+    """Decisions that are not in force any more."""
+    assert folder.loops is not None
+    times = Counter(d.loop for d in folder.loops.decisions)
+    rows = [
+        {"loop": d.loop, "verdict": d.verdict, "chi2": d.chi2, "weight": d.weight, "effect": d.effect, "why": d.why}
+        for d in folder.loops.decisions
+        if times[d.loop] > 1
+    ]
+    if not rows:
+        return []
+    columns = {k: COLUMNS[k] for k in ("loop", "verdict", "chi2", "weight", "effect", "why")}
+    of = sum(n > 1 for n in times.values())
+    return [folded(f"{of} loops were decided on more than once: each decision in order", table(rows, columns))]
+
+
+def _ties(folder: ReportFolder) -> list[Markup]:
+    """Places by which sessions were tied, or not."""
+    if folder.kind != "merged":
+        return []
+    rows = []
+    for s in folder.sessions:
+        found = s.get("candidates")
+        for c in found if isinstance(found, list) else []:
+            if isinstance(c, Mapping):
+                said = "accepted" if c.get("accepted") else "rejected"
+                rows.append(Row({**c, "session": s.get("name"), "verdict": said}, said))
+    if not rows:
+        return [element("h3", "Ties between sessions"), note("No places were compared: see the sessions above.")]
+    columns = {
+        **{"session": "session", "verdict": "verdict", "submap_map": "submap in the map", "submap_here": "submap here"},
+        **{"i": "node i", "j": "node j", "source": "source", "score": "score", "why": "why", "gates": "gates"},
+    }
+    return [element("h3", "Ties between sessions"), table(rows, columns, class_="ties")]
+
+
+def hypotheses(folder: ReportFolder) -> Markup:
+    """Topologies that were solved side by side; and choices of matches by the entropy of their maps."""
+    title = "Hypotheses and runners-up"
+    events = folder.events or []
+    found = [e for e in events if e.get("event") == "hypothesis"]
+    chosen = next((e for e in reversed(events) if e.get("event") == "hypothesis-chosen"), None)
+    parts: list[Any] = []
+    if found:
+        number = None if chosen is None else chosen.get("hypothesis")
+        columns = {
+            **{"hypothesis": "hypothesis", "support": "support", "withdrawn": "entry withdrawn", "submaps": "submaps"},
+            **{"entries": "entries", "loops": "loops", "chi2": "χ²", "dof": "dof", "contradicted": "contradicted"},
+            **{"entropy": "entropy [nat m³]", "known_volume": "known [m³]", "chosen": "chosen"},
+        }
+        rows = [{**e, "chosen": "chosen" if e.get("hypothesis") == number else "runner-up"} for e in found]
+        parts.append(table(rows, columns))
+        if chosen is not None:
+            parts.append(note(join(["Why: ", str(chosen.get("why", "not said")), "."])))
+    candidates = None if folder.clearest is None else folder.clearest.get("candidates")
+    if isinstance(candidates, list) and candidates:
+        columns = {
+            **{"verdict": "verdict", "choice": "choice of matches", "matches": "matches", "loops": "loops"},
+            **{"objective": "objective", "chi2": "χ²", "dof": "dof", "entropy": "entropy [nat m³]"},
+            **{"known_volume": "known [m³]", "why": "why"},
+        }
+        parts.append(element("h3", "Choices of matches and loops, the chosen one first (clearest.json)"))
+        parts.append(table([c for c in candidates if isinstance(c, Mapping)], columns))
+    if not parts:
+        parts.append(missing("other hypotheses: none were solved in this folder."))
+    return section("hypotheses", title, *parts)

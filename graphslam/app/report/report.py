@@ -1,0 +1,132 @@
+"""``report.html``: what a run did, decided and measured, on one page that needs no network, script or other file."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphslam.app.folders.generations import Generation, consistent, name_inside, new_generation
+from graphslam.app.report.figures import figures
+from graphslam.app.report.folder import Kind, read_folder
+from graphslam.app.report.loops import hypotheses, loops
+from graphslam.app.report.markup import note, page
+from graphslam.app.report.sections import events, evidence, graph, metrics, problems, records, times, what_was_run
+from graphslam.app.report.verdict import verdict_lines
+from graphslam.core.atomic import atomic_open
+from graphslam.core.errors import GraphSlamError, RunFolderError
+from graphslam.core.markup import element, join
+
+logger = logging.getLogger(__name__)
+
+PAGE = "report.html"
+_PARTS = {
+    "figures": figures,
+    "run": what_was_run,
+    "records": records,
+    "metrics": metrics,
+    "graph": graph,
+    "loops": loops,
+    "hypotheses": hypotheses,
+    "evidence": evidence,
+    "events": events,
+    "times": times,
+    "missing": problems,  # last: the others note what they did not find
+}
+_TITLES = {
+    "run": "Report of a run",
+    "interrupted": "Report of a run that was not finished",
+    "merged": "Report of a merge",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A page.
+
+    Parameters
+    ----------
+    html : str
+    kind : {"run", "interrupted", "merged"}
+        Of the folder.
+    problems : dict of str to str
+        Part of the folder → why it is not in the page.
+    """
+
+    html: str
+    kind: Kind
+    problems: dict[str, str]
+
+
+def make_report(folder: str | Path) -> Report:
+    """The page of a run folder or a merged folder, finished or not.
+
+    The same folder gives the same page. Two runs of the same configuration differ in its part ``times`` alone.
+
+    Raises
+    ------
+    RunFolderError
+        Neither a run folder nor a merged one. What is missing inside one, or damaged, is said in the page.
+    """
+    return consistent(folder, lambda root: _page(Path(folder), root))
+
+
+def _page(home: Path, root: Path) -> Report:
+    found = read_folder(home, root)
+    title = f"{_TITLES[found.kind]}: {found.name}"
+    head = [element("h1", title), verdict_lines(found)]
+    links = element("nav", *(element("a", name, href=f"#{name}") for name in _PARTS))
+    made = [part(found) for part in _PARTS.values()]
+    foot = note(
+        "Written by graphslam from the files of the folder; nothing in it was measured anew but its NEES by submap."
+    )
+    html = page(title, [join(head, "\n"), links, *made, foot])
+    return Report(html, found.kind, dict(found.problems))
+
+
+def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
+    """Write the page of a folder; returns the file.
+
+    Parameters
+    ----------
+    folder : path
+    out : path, optional
+        Default: ``report.html`` in the folder.
+
+    Raises
+    ------
+    RunFolderError
+        No run folder, or the page cannot be written.
+    """
+    return report_and_file(folder, out)[1]
+
+
+def report_and_file(folder: str | Path, out: str | Path | None = None) -> tuple[Report, Path]:
+    """Write the page of a folder; the page, and its file. See :func:`write_report`."""
+    home, report = Path(folder), make_report(folder)
+    name = PAGE if out is None else name_inside(home, out)
+    if name is None:
+        assert out is not None
+        return report, _save(report, Path(out))
+    with new_generation(home) as new:
+        new.adopt(drop=[name])
+        report = _page(home, new.path)
+        _save(report, new.path / name)
+    return report, home / name
+
+
+def _save(report: Report, file: Path) -> Path:
+    try:
+        with atomic_open(file, "w") as stream:
+            stream.write(report.html)
+    except OSError as error:
+        raise RunFolderError(f"{file}: cannot be written ({error.strerror})") from None
+    return file
+
+
+def report_beside(new: Generation) -> None:
+    """Write the page of a state that is being written; its failure is said, and undoes nothing."""
+    try:
+        _save(_page(new.home, new.path), new.path / PAGE)
+    except GraphSlamError as error:
+        logger.warning("no report: %s", error)

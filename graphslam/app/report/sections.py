@@ -1,0 +1,287 @@
+"""Parts of a report: what was run, records, metrics, times, the graph, its evidence, events."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.markup import compact, folded, missing, note, section
+from graphslam.app.report.verdict import figures_of, stopped
+from graphslam.app.run.config import dump_toml
+from graphslam.app.run.metrics import is_time
+from graphslam.app.run.outputs import RESUMED
+from graphslam.app.run.verdict import CONFIDENCE, class_rows
+from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
+from graphslam.evaluate.without_truth import two_sided
+from graphslam.graph.ledger import EXCLUSIVE
+
+BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is honest"}
+ROUTINE = frozenset(
+    {"submap", "attitude", "between", "loop", "match-not-used", "hypothesis", "hypothesis-chosen"}
+)  # told elsewhere in the page, or once a submap
+_UNFINISHED = "the run was not finished."
+
+
+def what_was_run(folder: ReportFolder) -> Markup:
+    """Names, seed, versions; every option with its value."""
+    r, said = folder.report, folder.config.get("run", {})
+    parts: list[Any] = []
+    if folder.kind == "merged":
+        facts = {"merged by": r.get("by"), "solver": r.get("solver")}
+        columns = {
+            **{"name": "session", "source": "source", "submaps": "submaps", "hangs_on": "hangs on"},
+            **{"common_landmarks": "common landmarks", "rejected": "rejected", "alignment_rms": "alignment rms [m]"},
+            **{"gps": "GPS", "ties": "ties", "ties_dropped": "ties dropped"},
+            "T_world_first_base": "first base (x y θ, or x y z qx qy qz qw)",
+        }
+        shown = {k: v for k, v in columns.items() if any(k in s for s in folder.sessions)}
+        parts += [pairs(facts), table(folder.sessions, shown) if shown else missing("sessions in merge.json.")]
+        parts.append(note("Options and versions are those of the single runs: see their own reports."))
+        return section("run", "What was run", *parts)
+    said = said if isinstance(said, dict) else {}
+    names = ("source", "frontend", "solver", "seed")
+    parts.append(pairs({k: r.get(k, said.get(k)) for k in names}))
+    if folder.kind == "interrupted":
+        parts.append(note(stopped(folder)))
+    versions = folder.part("versions")
+    parts.append(pairs(versions) if versions else missing("versions; ", _why(folder, "run.json")))
+    if folder.config:
+        parts.append(folded("Every option with its value (config.toml)", element("pre", _toml(folder.config))))
+    else:
+        parts.append(missing("options; ", _why(folder, "config.toml")))
+    if folder.part("source_meta"):
+        parts.append(folded("What the log says of itself", pairs(_flat(folder.part("source_meta")))))
+    return section("run", "What was run", *parts)
+
+
+def records(folder: ReportFolder) -> Markup:
+    """What was read, what was dropped and why, what was flagged."""
+    if folder.kind == "merged":
+        return section("records", "Records", note("A merge reads submaps and no records."))
+    title = "Records read, dropped, flagged"
+    if not folder.report:
+        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "run.json")
+        return section("records", title, missing("counts of records; ", said))
+    read, dropped = folder.part("records_read"), folder.part("records_dropped")
+    flagged = {k: v for k, v in folder.part("flagged_submaps").items() if k != "any"}
+    parts: list[Any] = [element("h3", "Read")]
+    rows = [{"stream": stream, "records": n, "used": _use(stream, folder.ledger)} for stream, n in read.items()]
+    parts.append(table(rows, ["stream", "records", "used"]) if rows else missing("counts of records read."))
+    parts.append(element("h3", "Dropped"))
+    lines = [{"what": k, "records": v} for k, v in dropped.items()]
+    parts.append(table(lines, {"what": "stream and why", "records": "records"}) if lines else note("Nothing."))
+    parts.append(element("h3", "Submaps flagged by the front end"))
+    marks = [{"why": k, "submaps": v} for k, v in flagged.items()]
+    parts.append(table(marks, ["why", "submaps"]) if marks else note("None."))
+    return section("records", title, *parts)
+
+
+def _use(stream: str, ledger: pd.DataFrame | None) -> str:
+    if ledger is None:
+        return "not known"
+    n = int(ledger.loc[ledger["stream"].astype(str) == stream, "factor_id"].nunique())
+    return f"in {n} factor{'s' * (n != 1)}" if n else "in no factor: for scores alone, or not used"
+
+
+def metrics(folder: ReportFolder) -> Markup:
+    """Every figure but times, with its unit, which way is better, and bounds where it has some."""
+    rows = [r for r in folder.metrics if not is_time(r.get("key")) and r.get("key") != RESUMED]
+    if not rows:
+        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
+        return section("metrics", "Metrics", missing("metrics; ", said))
+    bounds, folded_in = _bounds(folder.values())
+    out = []
+    for r in rows:
+        key = str(r.get("key"))
+        if key in folded_in:
+            continue
+        cells = {**r, "direction": BETTER.get(str(r.get("direction")), "")}
+        out.append(cells | dict(zip(("bounds", "said"), bounds.get(key, ("", "")))))
+    columns = {
+        **{"key": "metric", "value": "value", "unit": "unit", "direction": "which way"},
+        **{"bounds": f"{CONFIDENCE * 100:g} % bounds", "said": "against them"},
+    }
+    return section(
+        "metrics",
+        "Metrics",
+        note("What each means: docs/how-to.md, docs/concepts.md, docs/without-truth.md. – : no value."),
+        table(out, columns),
+    )
+
+
+def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str]]:
+    """Bounds and verdict by metric; and the keys of the bounds themselves, which need no row of their own."""
+    out, folded_in = {}, set()
+    for key in m:
+        if not key.endswith("_low") or (stem := key.removesuffix("_low")) + "_high" not in m:
+            continue
+        owner = next((k for k in (f"{stem}_chi2_per_dof", f"{stem}_value") if k in m), None)
+        if owner is None:
+            continue
+        low, high, value = m[key], m[f"{stem}_high"], m[owner]
+        said = "over-confident" if value > high else "pessimistic" if value < low else "consistent"
+        out[owner] = (f"{low:.3g} to {high:.3g}", said)
+        folded_in |= {key, f"{stem}_high"}
+    for key in m:
+        stem = key.removesuffix("_per_dof")
+        if stem != key and stem.startswith("nees") and m.get(f"{stem}_dof", 0.0) > 0:
+            low, high, verdict = two_sided(m[key], m[f"{stem}_dof"], CONFIDENCE)
+            out[key] = (f"{low:.3g} to {high:.3g}", verdict)
+    return out, folded_in
+
+
+def times(folder: ReportFolder) -> Markup:
+    """Seconds of each stage: the one part of the page that differs when the same run is made again."""
+    timed = [r for r in folder.metrics if is_time(r.get("key"))]
+    seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
+    seconds = seconds or folder.part("seconds")
+    if not seconds and is_figure(folder.report.get("seconds")):  # of a merge by an older version
+        seconds = {"merge": folder.report["seconds"]}
+    rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
+    if not seconds and not rows:
+        said = _UNFINISHED if folder.kind == "interrupted" else "the folder does not say."
+        return section("times", "Times", missing("seconds of the stages; ", said))
+    parts: list[Any] = [table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
+    if rows:
+        parts.append(table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
+    resumed = folder.values().get(RESUMED, folder.report.get(RESUMED))
+    if is_figure(resumed) and resumed:
+        parts.append(note(f"{resumed:.0f} submaps were there already: the run was resumed."))
+    return section("times", "Times", *parts)
+
+
+def graph(folder: ReportFolder) -> Markup:
+    """Nodes, factors by kind, χ² by kind with two-sided bounds."""
+    if folder.kind == "interrupted":
+        return section("graph", "Graph", missing("the graph; ", _UNFINISHED))
+    m, g = folder.values(), folder.part("graph")
+    facts = {
+        "nodes": g.get("nodes"),
+        "factors": g.get("factors"),
+        "submaps": g.get("submaps", m.get("submaps")),
+        "landmarks": g.get("landmarks", m.get("landmarks")),
+        "free scalars": m.get("states"),
+        "objective Σ rᵀ P⁻¹ r": m.get("objective", m.get("join_chi2")),
+        "gap to the batch optimum": m.get("gap"),
+    }
+    parts: list[Any] = [pairs(facts)]
+    if not g:
+        parts.append(missing("numbers of nodes and factors; the folder does not say them."))
+    rows = class_rows(figures_of(folder))
+    if not rows:
+        return section("graph", "Graph", *parts, missing("χ² by kind of factor."))
+    columns = {
+        **{"class": "kind of factor", "factors": "factors", "rows": "scalars", "dof": "dof", "chi2": "χ²"},
+        **{"chi2_per_dof": "χ²/dof", "low": f"{CONFIDENCE * 100:g} % from", "high": "to", "verdict": "verdict"},
+        **{"mean_weight": "mean weight", "least_weight": "least weight"},
+    }
+    parts.append(table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
+    parts.append(
+        note(
+            "dof: scalars less what of the unknowns a kind determined; χ² without robust kernels; weights are those "
+            "that the kernels gave. Below the bounds a kind is believed too little, above them too much."
+        )
+    )
+    return section("graph", "Graph", *parts)
+
+
+def evidence(folder: ReportFolder) -> Markup:
+    """Which streams were spent where, and what was declared to be shared."""
+    title = "Evidence: which stream went where"
+    if folder.ledger is None:
+        return section("evidence", title, missing("the ledger of evidence; ", _why(folder, "ledger.csv")))
+    t = folder.ledger.assign(factor=[_kind_of_factor(f) for f in folder.ledger["factor"].astype(str)])
+    if t.empty:
+        return section("evidence", title, note("Nothing was spent."))
+    t["length"] = t["t_end"] - t["t_start"]
+    groups = []
+    for (stream, factor, kind), of in t.groupby(["stream", "factor", "kind"], sort=True):
+        first, last = float(of["t_start"].min()), float(of["t_end"].max())
+        groups.append(
+            {"stream": stream, "factor": factor, "factors": int(of["factor_id"].nunique()), "kind": kind}
+            | {"first": first, "last": last, "seconds": float(of["length"].sum())}
+        )
+    columns = {
+        **{"stream": "stream", "factor": "spent by", "factors": "factors", "kind": "kind", "first": "from [s]"},
+        **{"last": "to [s]", "seconds": "seconds spent"},
+    }
+    return section(
+        "evidence",
+        title,
+        table(groups, columns),
+        element("h3", "Declared exceptions"),
+        _exceptions(t),
+        note("Kind “measurement”: spent once, a second spending is refused. Row by row in ledger.csv."),
+    )
+
+
+def _exceptions(t: pd.DataFrame) -> Markup:
+    shared = t[t["kind"] != EXCLUSIVE]
+    rows = []
+    for (kind, said), of in shared.groupby(["kind", "note"], sort=True):
+        rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": said})
+    return table(rows, {"kind": "kind", "factors": "factors", "note": "why it may"}) if rows else note("None.")
+
+
+def _kind_of_factor(label: str) -> str:
+    """``levelled of x20 (factor 21)`` → ``levelled``: words before the first with a digit."""
+    words: list[str] = []
+    for w in label.split():
+        if any(c.isdigit() for c in w):
+            break
+        words.append(w)
+    while words and words[-1] in ("of", "at", "to"):
+        words.pop()
+    return " ".join(words) or label
+
+
+def events(folder: ReportFolder) -> Markup:
+    """What else was decided or dropped, one line an event; routine ones as counts."""
+    if folder.events is None:
+        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "events.jsonl")
+        return section("events", "Events", missing("events; ", said))
+    counts = Counter(str(e.get("event", "?")) for e in folder.events)
+    rows = [{"event": k, "times": n} for k, n in sorted(counts.items())]
+    lines = [_line(e) for e in folder.events if str(e.get("event")) not in ROUTINE]
+    parts: list[Any] = [table(rows, ["event", "times"]) if rows else note("None.")]
+    if lines:
+        listed = items(lines)
+        parts.append(listed if len(lines) <= 20 else folded(f"All {len(lines)} that are no routine", listed))
+    else:
+        parts.append(note("No event but routine ones."))
+    return section("events", "Events", *parts)
+
+
+def _line(event: Mapping[str, Any]) -> Markup:
+    facts = [f"{k} {figure_text(v)}" for k, v in event.items() if k != "event"]
+    return join([element("b", event.get("event", "?")), ": ", ", ".join(facts)])
+
+
+def problems(folder: ReportFolder) -> Markup:
+    """What is not in the page, and why."""
+    lines = [join([element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
+    body = items(lines) if lines else note("Nothing that this kind of folder holds.")
+    return section("missing", "What is missing", body)
+
+
+def _why(folder: ReportFolder, name: str) -> str:
+    return f"{name} {folder.problems.get(name, 'does not say')}."
+
+
+def _toml(config: Mapping[str, Any]) -> str:
+    return dump_toml(config)
+
+
+def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for k, v in values.items():
+        name = f"{where}.{k}" if where else str(k)
+        if isinstance(v, Mapping):
+            out |= _flat(v, name)
+        else:
+            out[name] = compact(v) if isinstance(v, list) else v
+    return out

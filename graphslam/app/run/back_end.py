@@ -1,0 +1,280 @@
+"""Submaps in, a solved graph out: association, factors, solver, merging. One call per finished submap."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.app.run.config import BackEndConfig, GpsConfig
+from graphslam.app.run.imu_use import ImuPart, recentred
+from graphslam.app.run.loops import DECIDED, ledger_of_events, same_loop
+from graphslam.association.identity import doubtful_identities
+from graphslam.association.landmarks import AssociationConfig, associate
+from graphslam.association.merging import euclidean_merges, mahalanobis_merges
+from graphslam.core.errors import DataError
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.graph.gps import GpsConfig as GpsFactorConfig
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
+from graphslam.loops.appearance import AppearanceConfig
+from graphslam.loops.candidates import FRONT_END, CandidateConfig
+from graphslam.loops.find_loops import FindConfig, find_loops
+from graphslam.loops.ledger import Decision, LoopLedger
+from graphslam.loops.ties import TieConfig, ties_entries
+from graphslam.solve.registry import make_solver
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass
+class BackEnd:
+    """A pose graph that grows by submaps and is solved after each.
+
+    Parameters
+    ----------
+    config : BackEndConfig
+    solver : str
+        Name in the solver registry.
+    """
+
+    config: BackEndConfig
+    solver_name: str
+    graph: PoseGraph = field(default_factory=PoseGraph)
+    """Of two dimensions until a submap of three comes first."""
+    seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
+    per_submap_s: list[float] = field(default_factory=list)
+    submaps: list[Submap] = field(default_factory=list)
+    """With their maps; kept only where loops are looked for."""
+    imu: ImuPart | None = None
+    """IMUs of the log; None where there is no log."""
+
+    def __post_init__(self) -> None:
+        self.solver = make_solver(self.solver_name, self.graph)
+        self._waiting: list[tuple[Gps, GpsConfig]] = []
+        kind = self.config.match_robust
+        self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
+        self._association = AssociationConfig(
+            method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
+        )
+
+    def add_gps(self, gps: Gps, config: GpsConfig) -> None:
+        """Give the graph the fixes that count; they wait for the submaps that hold them.
+
+        Before the first submap it is not known whether the graph is in the plane: there fixes lose their height.
+        """
+        if not self.graph.submaps:
+            self._waiting.append((gps, config))
+            return
+        have, want = gps.positions.shape[1], self.graph.dim
+        if have > want:
+            gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
+        kernel = NO_KERNEL if config.robust == "none" else Robust(config.robust, config.robust_width)
+        self.graph.add_gps(
+            gps,
+            config=GpsFactorConfig(
+                robust=kernel, sigma=config.sigma, bias_sigma=config.bias_sigma, segment_gap=config.segment_gap
+            ),
+        )
+
+    def add(self, submap: Submap) -> None:
+        """Associate, add, solve; now and then merge landmarks that turned out to be one."""
+        start = time.perf_counter()
+        associated = self.append(submap)
+        self.solver.update()
+        solved = time.perf_counter()
+        self.seconds["associate"] += associated - start
+        self.seconds["solve"] += solved - associated
+        if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
+            self.merge()
+        self.per_submap_s.append(time.perf_counter() - start)
+
+    def append(self, submap: Submap) -> float:
+        """Associate and add without solving; returns the time at which it was associated [s]."""
+        if submap.dim != self.graph.dim and not self.graph.submaps:
+            self.graph = PoseGraph(submap.dim)
+            self.solver = make_solver(self.solver_name, self.graph)
+        c = self.config
+        ids = associate(self.graph, submap, self._association) if c.associate and submap.landmarks is not None else None
+        associated = time.perf_counter()
+        dense = submap.landmarks is None
+        self.graph.add_submap(
+            submap,
+            landmark_ids=ids,
+            covariance_scale=c.covariance_scale,
+            spacing=c.node_spacing if dense and c.node_spacing > 0 else None,
+            level_sigma=c.level_sigma if dense and submap.dim == 3 and c.level_sigma > 0 else None,
+        )
+        self._add_matches(submap)
+        if c.loops:
+            self.submaps.append(submap)
+        if self.imu is not None:
+            self.imu.look(self.graph)
+        waiting, self._waiting = self._waiting, []
+        for gps, config in waiting:
+            self.add_gps(gps, config)
+        return associated
+
+    def _add_matches(self, submap: Submap) -> None:
+        """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""
+        for m in submap.matches:
+            if m.support >= self.config.match_support:
+                self.graph.add_match(submap.key, m, robust=self._match_kernel)
+            else:
+                self.graph.note(
+                    "match-not-used", submap=submap.key, target=m.target, fitness=m.fitness, support=m.support
+                )
+
+    def merge(self) -> int:
+        """Merge landmarks by joint covariance, then by distance, and solve again; returns the number merged."""
+        start = time.perf_counter()
+        merged = 0
+        if self.config.associate and len(self.graph.values.landmarks) > 1:
+            for keep, drop in mahalanobis_merges(self.graph, self.config.gate, distance=self.config.merge_reach):
+                self.graph.merge_landmarks(keep, drop)
+                merged += 1
+            if merged:
+                self.solver.update()
+            if self.config.merge_distance > 0:
+                for keep, drop in euclidean_merges(self.graph, self.config.merge_distance):
+                    self.graph.merge_landmarks(keep, drop)
+                    merged += 1
+                self.solver.update()
+        self.seconds["merge"] += time.perf_counter() - start
+        return merged
+
+    def finish(self, undo: Sequence[int | Decision] = ()) -> Solution:
+        """Merge until nothing merges any more, go to the optimum, and return the solution.
+
+        Parameters
+        ----------
+        undo : sequence of int or Decision
+            Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
+            submaps has them, and then one that is not in this graph is noted and stays undone.
+        """
+        self.graph.finish_gps()
+        if self.imu is not None:
+            self.imu.tie(self.graph)
+        recentred(self.graph, self.solver)
+        for _ in range(10):
+            if not self.merge():
+                break
+            self.solver.solve_to_optimum()
+        if self.config.loops:
+            self.find_loops()
+        for loop in undo:
+            if isinstance(loop, Decision):
+                self._stay_undone(loop)
+            else:
+                self.undo_loop(loop)
+        start = time.perf_counter()
+        recentred(self.graph, self.solver)
+        self.split_wrong_identities()
+        solution = self.solver.solution()
+        self.seconds["solve"] += time.perf_counter() - start
+        return solution
+
+    def find_loops(self) -> LoopLedger:
+        """Look for loops between the submaps, take those that are believed, and note every decision.
+
+        The front end's matches are among them: until now each had a factor by its support alone.
+        """
+        start, c = time.perf_counter(), self.config
+        for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
+            self.graph.remove(fid, reason=DECIDED)
+        self.solver.solve_to_optimum()
+        config = FindConfig(
+            candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
+            appearance=AppearanceConfig() if c.loop_appearance else None,
+            front_end=True,
+            ties=TieConfig() if c.loop_ties else None,
+        )
+        ledger = find_loops(self.graph, self.solver, self.submaps, config).ledger
+        for event in ledger.events():
+            self.graph.note(event.pop("event"), **event)
+        self.seconds["loops"] = time.perf_counter() - start
+        return ledger
+
+    def undo_loop(self, loop: int) -> None:
+        """Take a loop, or a front end's match with its ties, out of the graph; what was found with it in stays.
+
+        Raises
+        ------
+        DataError
+            It is not in the graph.
+        """
+        ledger = ledger_of_events(self.graph.events)
+        d = ledger.of(loop)
+        if d.verdict != "accepted" or d.factor_id not in self.graph.records:
+            raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
+        why = {d.loop: "asked for"}
+        if d.source == FRONT_END:
+            entry = (d.submap_i, d.submap_j)
+            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in ties_entries(x.gates))
+            why |= {x.loop: f"by loop {loop}, which was undone" for x in ties}
+        for number, reason in why.items():
+            x = ledger.of(number)
+            matched = self.graph.records[x.factor_id]
+            self.graph.remove(x.factor_id, reason="undone")
+            if isinstance(matched, BetweenRecord) and matched.group != "match":  # of a match the removal says it
+                event = replace(x, verdict="undone", why=reason, weight=0.0, factor_id=-1).event()
+                self.graph.note(event.pop("event"), **event)
+        self.solver.solve_to_optimum()
+
+    def _stay_undone(self, before: Decision) -> None:
+        """Take out a loop that was undone in an earlier run of the same submaps."""
+        ledger = ledger_of_events(self.graph.events)
+        d = same_loop(before, ledger)
+        if d is not None:
+            self.undo_loop(d.loop)
+            return
+        what = f"loop {before.loop} of submaps {before.submap_i} and {before.submap_j}"
+        logger.warning("%s was undone before and was not found this time", what)
+        number = 1 + max((x.loop for x in ledger.decisions), default=-1)
+        event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next time
+        self.graph.note(event.pop("event"), **event)
+
+    def split_wrong_identities(self) -> int:
+        """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""
+        split = 0
+        while self.config.identity_gate > 0 and split < 10 * len(self.graph.submaps):
+            doubts = doubtful_identities(self.graph, self.config.identity_gate)
+            if not doubts:
+                break
+            self.graph.split_landmark(doubts[0].factor_id, doubts[0].entry)
+            self.solver.solve_to_optimum()
+            split += 1
+        return split
+
+    def landmark_hits(self, submaps: list[Submap]) -> dict[int, int]:
+        """Sightings of every landmark over all submaps (1 a submap where a submap does not count them)."""
+        hits: dict[int, int] = {int(i): 0 for i in self.graph.values.landmark_ids}
+        for s in submaps:
+            if s.landmarks is None:
+                continue
+            ids = self.graph.landmark_ids_of(s.key)
+            rows = s.landmarks.sightings
+            counts = np.ones(len(ids), dtype=int) if rows is None else np.bincount(rows[:, 1], minlength=len(ids))
+            for i, n in zip(ids.tolist(), counts.tolist()):
+                hits[i] = hits.get(i, 0) + n
+        return hits
+
+    def observation_labels(self, submaps: list[Submap]) -> tuple[Ints, Ints]:
+        """(observation index in the log, landmark id) of every sighting, for audits of the association."""
+        rows: list[Any] = [np.zeros((0, 2), dtype=np.int64)]
+        for s in submaps:
+            if s.landmarks is not None and s.landmarks.sightings is not None:
+                ids = self.graph.landmark_ids_of(s.key)
+                q = s.landmarks.sightings
+                rows.append(np.column_stack([q[:, 0], ids[q[:, 1]]]))
+        table = np.concatenate(rows)
+        return table[:, 0], table[:, 1]

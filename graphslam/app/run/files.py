@@ -1,0 +1,405 @@
+"""The files of a run folder, read: each with the shape that it must have, and refused where it has not.
+
+Nothing here imports, runs or opens what a file names.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.app.folders.generations import check_same
+from graphslam.app.run.config import read_toml
+from graphslam.app.run.run import GlobalMap
+from graphslam.core.atomic import read_json, read_npz
+from graphslam.core.errors import DataError, FormatError, RunFolderError
+from graphslam.core.geometry import Array
+from graphslam.core.json_file import check_json, parse_json, read_json_lines
+from graphslam.core.npz import Field, floats, ints, read_arrays, texts
+from graphslam.core.reading import LARGEST, read_text
+from graphslam.core.records import Gps
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps import GpsResiduals
+from graphslam.loops.ledger import EVENT
+
+GENERATION_EVENT = "generation"
+"""First line of ``events.jsonl``: which state of the folder it is of."""
+RUN_FORMAT = "graphslam.run/1"
+MERGE_FORMAT = "graphslam.merge/1"
+MAP_FORMAT = "graphslam.map/1"
+GPS_FORMAT = "graphslam.gps-residuals/1"
+FIXES_FORMAT = "graphslam.fixes/1"
+ASSOCIATION_FORMAT = "graphslam.association/1"
+
+MERGED_FORMAT = "graphslam.merged-map/1"
+MERGED_DENSE_FORMAT = "graphslam.merged-submaps/1"
+
+MAP: dict[str, Field] = {
+    "trajectory_times": floats("n"),
+    "trajectory_poses": floats("n", "p"),
+    "trajectory_covariances": floats("n", "d", "d"),
+    "node_times": floats("m"),
+    "node_poses": floats("m", "p"),
+    "node_covariances": floats("m", "d", "d"),
+    "landmark_ids": ints("l"),
+    "landmarks": floats("l", "c"),
+    "landmark_covariances": floats("l", "e", "e"),
+    "landmark_hits": ints("l"),
+    "T_gps_world": floats("p", optional=True),
+    "base_nodes": ints("k", optional=True),
+}
+GPS: dict[str, Field] = {
+    "times": floats("n"),
+    "residuals": floats("n", "c"),
+    "points": floats("n", "c"),
+    "T_gps_map": floats("p"),
+    "lever": floats("c"),
+    "fitted": ints(),
+    "outside": ints(),
+    "in_gap": ints(),
+}
+FIXES: dict[str, Field] = {
+    "times": floats("n"),
+    "positions": floats("n", "c"),
+    "sigma": floats("n"),
+    "lever": floats("c"),
+}
+ASSOCIATION: dict[str, Field] = {"keys": ints("n"), "offsets": ints("n+1"), "ids": ints("q")}
+
+MERGED_DENSE: dict[str, Field] = {
+    "sessions": texts("s"),
+    "session_of_submap": ints("m"),
+    "keys": ints("m"),
+    "bases": floats("b", "p"),
+    "base_covariances": floats("b", "d", "d"),
+    "nodes": floats("n", "p"),
+}
+
+_PART: dict[Any, Any] = {str: object}
+RUN: dict[str, Any] = {
+    "source": str,
+    "frontend?": str,
+    "solver?": str,
+    "seed?": int,
+    "identities?": str,
+    "covariance_scale?": float,
+    "T_world_base?": [float],
+    "source_meta?": _PART,
+    "records_read?": {str: int},
+    "records_dropped?": {str: int},
+    "flagged_submaps?": _PART,
+    "versions?": {str: str},
+    "seconds?": _PART,
+    "graph?": _PART,
+    "backend?": _PART,
+    "gps?": _PART,
+    "imu?": _PART,
+    "verdict?": _PART,
+}
+MERGE: dict[str, Any] = {"sessions?": [_PART], "graph?": _PART}
+METRIC: dict[str, Any] = {"key": str, "value?": float, "unit?": str, "direction?": str}
+_TABLE = [[float]]
+EVENTS: dict[str, dict[str, Any]] = {
+    EVENT: {
+        "loop": int,
+        "verdict": str,
+        "why": str,
+        "i": int,
+        "j": int,
+        "submap_i?": int,
+        "submap_j?": int,
+        "source?": str,
+        "score?": float,
+        "gain?": float,
+        "gates?": {"entries?": [(int, int)], "fitness?": float},
+        "chi2?": float,
+        "weight?": float,
+        "effect_predicted?": float,
+        "effect?": float,
+        "effect_earlier?": float,
+        "factor_id?": int,
+        "T_ij?": [float],
+        "covariance?": _TABLE,
+    },
+    "between": {
+        "i": int,
+        "j": int,
+        "group?": str,
+        "factor_id?": int,
+        "target?": int,
+        "submap?": int,
+        "support?": float,
+        "fitness?": float,
+    },
+    "match-not-used": {"i?": int, "j?": int, "target?": int, "submap?": int, "support?": float, "fitness?": float},
+    "removed": {"factor_id?": int, "reason?": str},
+    "split": {"new": int},
+}
+"""Of the events that are used again when a folder is read; of others only ``event`` must be text."""
+VERDICTS = ("accepted", "rejected", "switched-off", "undone")
+LEDGER: dict[str, type] = {
+    **{"factor_id": int, "factor": str, "stream": str, "t_start": float, "t_end": float, "kind": str, "note": str}
+}
+
+
+def read_report(root: Path) -> dict[str, Any]:
+    """``run.json`` of a finished run.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    return read_json(root / "run.json", fmt=RUN_FORMAT, shape=RUN)
+
+
+def read_merge_report(root: Path) -> dict[str, Any]:
+    """``merge.json`` of a merged map.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    return read_json(root / "merge.json", fmt=MERGE_FORMAT, shape=MERGE)
+
+
+def read_options(root: Path) -> dict[str, Any]:
+    """``config.toml`` of a run: tables of options by name; nothing where there is none.
+
+    Raises
+    ------
+    ConfigError, FormatError
+    """
+    file = root / "config.toml"
+    if not file.exists():
+        return {}
+    values = read_toml(file)
+    shape = {f"{k}?": _PART for k in values}
+    if "run" in values:
+        shape["run?"] = {"source?": str, "frontend?": str, "solver?": str, "seed?": int}
+    return dict(check_json(values, shape, str(file)))
+
+
+def read_map(root: Path) -> GlobalMap:
+    """``map.npz``.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    file = root / "map.npz"
+    where = str(file)
+    a = read_npz(file, fmt=MAP_FORMAT, fields=MAP)
+    m, d = len(a["node_times"]), a["node_covariances"].shape[1]
+    bases = a.get("base_nodes")
+    if bases is not None and len(bases) and (bases.min() < 0 or bases.max() >= m or np.any(np.diff(bases) <= 0)):
+        raise FormatError(
+            "array 'base_nodes' names nodes that are not there", where=where, wanted=f"rising, 0 … {m - 1}"
+        )
+    if d != {3: 3, 7: 6}.get(a["node_poses"].shape[1]):
+        raise FormatError("poses and covariances do not fit", where=where, got=(a["node_poses"].shape, d))
+    try:
+        path = Trajectory(a["trajectory_times"], a["trajectory_poses"], a["trajectory_covariances"])
+        Trajectory(a["node_times"], a["node_poses"])
+    except DataError as error:
+        raise FormatError(error.what, where=where, got=error.got, wanted=error.wanted) from None
+    for name in ("trajectory_covariances", "node_covariances", "landmark_covariances"):
+        _check_covariances(a[name], name, where)
+    return GlobalMap(
+        trajectory=path,
+        node_times=a["node_times"],
+        node_poses=a["node_poses"],
+        node_covariances=a["node_covariances"],
+        landmark_ids=a["landmark_ids"],
+        landmarks=a["landmarks"],
+        landmark_covariances=a["landmark_covariances"],
+        landmark_hits=a["landmark_hits"],
+        T_gps_world=a.get("T_gps_world"),
+        base_nodes=bases,
+    )
+
+
+def _check_covariances(covariances: Array, what: str, where: str) -> None:
+    """Symmetric, and without a variance that rounding does not explain."""
+    if not covariances.size:
+        return
+    skew = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))
+    values = np.linalg.eigvalsh(covariances)
+    bad = np.flatnonzero((skew > 1e-6 * values[:, -1]) | (values[:, 0] < -1e-6 * np.abs(values[:, -1])))
+    if len(bad):
+        raise FormatError(f"{what}: number {bad[0]} is no covariance", where=where, got=covariances[bad[0]].tolist())
+
+
+def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
+    """Landmark identities that a run's back end gave, by submap key.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    file = root / "association.npz"
+    a = read_npz(file, fmt=ASSOCIATION_FORMAT, fields=ASSOCIATION)
+    o = a["offsets"]
+    if o[0] != 0 or np.any(np.diff(o) < 0) or o[-1] != len(a["ids"]) or len(np.unique(a["keys"])) != len(a["keys"]):
+        raise FormatError("offsets do not partition the identities, or a key stands twice", where=str(file))
+    return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
+
+
+def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
+    """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a value that was
+    not a number is NaN.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    file = root / name
+    rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
+    table = pd.DataFrame(rows, columns=["key", "value", "unit", "direction"])
+    table["value"] = [np.nan if r.get("value") is None else float(r["value"]) for r in rows]
+    for name in ("unit", "direction"):
+        table[name] = [r.get(name) or "" for r in rows]
+    return table
+
+
+def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dict[str, Any]]:
+    """``events.jsonl`` of the files of a run; ``home`` is the folder that errors name.
+
+    Raises
+    ------
+    RunFolderError
+        It has none.
+    FormatError
+        A line is no event; names it.
+    """
+    file = Path(root) / "events.jsonl"
+    if not file.is_file():
+        raise RunFolderError(f"{home or root}: has no events.jsonl; give a folder of a finished run")
+    events = read_json_lines(file)
+    for number, event in enumerate(events, start=1):
+        where = f"{file}, line {number}"
+        check_json(event, {"event": str}, where)
+        check_json(event, EVENTS.get(event["event"], {}), where)
+        if event["event"] == EVENT:
+            _check_decision(event, where)
+    return events[1:] if events and events[0]["event"] == GENERATION_EVENT else events
+
+
+def check_state(root: Path) -> None:
+    """Hold the ids of generations in plain files of a run against each other; files of older versions have none.
+
+    Raises
+    ------
+    FormatError
+        Names two files that are not of one state.
+    """
+    known = read_report(root).get("generation")
+    for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "taken.npz")):
+        if file.is_file():
+            check_same((root / "run.json", known), (file, generation_of(read_arrays(file))))
+    for file in sorted(root.glob("gps_*.npz")):
+        check_same((root / "run.json", known), (file, generation_of(read_arrays(file))))
+    if (root / "events.jsonl").is_file():
+        first = next(iter(read_json_lines(root / "events.jsonl")), {})
+        found = first.get("generation") if first.get("event") == GENERATION_EVENT else None
+        check_same((root / "run.json", known), (root / "events.jsonl", found))
+
+
+def generation_of(arrays: Mapping[str, Any]) -> str | None:
+    """Id of the generation in a file's arrays; None in files of older versions."""
+    return str(arrays["generation"]) if "generation" in arrays else None
+
+
+def _check_decision(event: Mapping[str, Any], where: str) -> None:
+    if event["verdict"] not in VERDICTS:
+        raise FormatError("unknown verdict of a loop", where=where, got=event["verdict"][:40], wanted=VERDICTS)
+    T, P = event.get("T_ij") or [], event.get("covariance") or []
+    d = {0: 0, 3: 3, 7: 6}.get(len(T))
+    if d is None or len(P) != d or any(len(row) != d for row in P):
+        raise FormatError("measurement and covariance of a loop do not fit", where=where, got=(len(T), len(P)))
+    if d:
+        _check_covariances(np.array([P], dtype=np.float64), "covariance of a loop", where)
+
+
+def read_ledger(root: Path) -> pd.DataFrame:
+    """``ledger.csv`` as a table: which factor spent which stream when.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        Names file and line.
+    """
+    file = root / "ledger.csv"
+    try:
+        lines = list(csv.reader(io.StringIO(read_text(file)), strict=True))
+    except csv.Error as error:
+        raise FormatError(f"not a table ({error})", where=str(file)) from None
+    head = lines[0] if lines else []
+    if lacking := [c for c in LEDGER if head.count(c) != 1]:
+        raise FormatError(f"table lacks columns {lacking}, or has them twice", where=str(file), wanted=[*LEDGER])
+    columns: dict[str, list[Any]] = {c: [] for c in LEDGER}
+    for number, row in enumerate(lines[1:], start=2):
+        if len(row) != len(head):
+            raise FormatError(
+                "row of another length", where=f"{file}, line {number}", got=len(row), wanted=f"{len(head)} columns"
+            )
+        for name, kind in LEDGER.items():
+            columns[name].append(_cell(row[head.index(name)], kind, f"{file}, line {number}, column {name}"))
+    return pd.DataFrame(columns).astype({"factor_id": "int64", "t_start": "float64", "t_end": "float64"})
+
+
+def _cell(text: str, kind: type, where: str) -> Any:
+    if kind is str:
+        return text
+    try:
+        value = kind(text)
+    except (ValueError, OverflowError):
+        raise FormatError("not a number", where=where, got=repr(text[:40])) from None
+    if not abs(value) <= (2**62 if kind is int else LARGEST):
+        raise FormatError("a number that cannot be used", where=where, got=text[:40], wanted="finite numbers")
+    return value
+
+
+def read_merged_dense(root: Path) -> dict[str, npt.NDArray[Any]]:
+    """``merged.npz`` of merged dense submaps.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    return read_npz(root / "merged.npz", fmt=MERGED_DENSE_FORMAT, fields=MERGED_DENSE)
+
+
+def read_gps_residuals(file: Path) -> GpsResiduals:
+    """``gps_NAME.npz``.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    a: Any = read_npz(file, fmt=GPS_FORMAT, fields=GPS)
+    a |= {name: int(a[name]) for name in ("fitted", "outside", "in_gap")}
+    return GpsResiduals(**a)
+
+
+def read_fixes(root: Path) -> Gps | None:
+    """``fixes.npz``; None where there is none.
+
+    Raises
+    ------
+    FormatError
+    """
+    file = root / "fixes.npz"
+    if not file.is_file():
+        return None
+    a: Any = read_npz(file, fmt=FIXES_FORMAT, fields=FIXES)
+    try:
+        return Gps(**a)
+    except DataError as error:
+        raise FormatError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None

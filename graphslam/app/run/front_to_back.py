@@ -1,0 +1,82 @@
+"""Every submap from the front end to the back end, stored as soon as it is finished."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from graphslam.app.run.back_end import BackEnd
+from graphslam.app.run.folder import RunFolder
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.evidence.formats import load_npz
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FrontEndWork:
+    """What the front end did in this session.
+
+    Parameters
+    ----------
+    seconds : float
+    resumed : int
+        Submaps that were there already.
+    per_scan : (k,)
+        Seconds a scan of each submap but the first, which may have compiled.
+    """
+
+    seconds: float
+    resumed: int
+    per_scan: Array
+
+
+def front_to_back(
+    log: SensorLog,
+    front: Any,
+    back: BackEnd,
+    seed: SeedTree,
+    folder: RunFolder | None,
+    drops: DropCounter,
+    progress: bool,
+    with_grids: bool,
+) -> tuple[list[Submap], FrontEndWork]:
+    """Feed every submap to the back end as soon as it is finished and stored."""
+    store = None if folder is None else folder.submaps_with(load_npz if with_grids else None)
+    submaps = store.complete_prefix() if store is not None else []
+    if store is not None:
+        store.truncate(len(submaps))
+    t_first, t_last = log.interval
+    bar = tqdm(total=round(t_last - t_first, 1), unit="s", desc=log.name, disable=not progress, leave=False)
+    for s in submaps:
+        back.add(s)
+    if submaps:
+        logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
+        bar.update(submaps[-1].interval[1] - t_first)
+    bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
+    front_s, resumed, cost = 0.0, len(submaps), []
+    stream = front.submaps(log, seed=seed.child("frontend"), after=submaps[-1] if submaps else None, drops=drops)
+    while True:
+        start = time.perf_counter()
+        submap = next(stream, None)
+        spent = time.perf_counter() - start
+        front_s += spent
+        if submap is None:
+            break
+        if store is not None:
+            store.append(submap)
+        back.add(submap)
+        submaps.append(submap)
+        cost.append(spent / max(int(submap.report.get("scans", 1)), 1))
+        bar.update(submap.interval[1] - submap.interval[0])
+        bar.set_postfix(submaps=len(submaps), landmarks=len(back.graph.values.landmarks))
+    bar.close()
+    return submaps, FrontEndWork(front_s, resumed, np.array(cost[1:]))

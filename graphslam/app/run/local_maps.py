@@ -1,0 +1,90 @@
+"""Submaps of a log without joining them: what a front end hands over, to look at and to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tqdm.auto import tqdm
+
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.pipeline import load_log_source
+from graphslam.app.threads import one_blas_thread
+from graphslam.core.errors import ConfigError
+from graphslam.core.log import SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.frontends.landmarks.filter import ParticleSet
+from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
+
+
+def _front_end(log: SensorLog, frontend: str, options: Mapping[str, Any] | None) -> Any:
+    settings: cfg.RunConfig = cfg.build(
+        cfg.RunConfig, cfg.merge(recommended(log, frontend), {"frontend": options or {}})
+    )
+    return make_front_end(frontend, settings.frontend)
+
+
+def local_maps(
+    source: str | Path | SensorLog,
+    frontend: str = "rbpf-ekf",
+    *,
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+    progress: bool = False,
+) -> list[Submap]:
+    """The submaps that :func:`graphslam.run` with the same seed and options would join.
+
+    Parameters
+    ----------
+    source : card name, folder, or SensorLog
+    frontend : str
+        Registered name. The single-map front ends (``ekf-slam``, ``rbpf-slam``) give one submap over the whole log.
+    seed : int
+        Root of the seed tree.
+    options : mapping, optional
+        Of the front end, over the source's preset, e.g. ``{"particles": 500, "stopping": {"scans": 59}}``.
+    progress : bool
+        Show a progress bar.
+
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children.
+    """
+    log = load_log_source(source)
+    made = _front_end(log, frontend, options)
+    submaps = []
+    with one_blas_thread(), tqdm(desc=log.name, unit="submap", disable=not progress) as bar:
+        for submap in made.submaps(log, seed=SeedTree(seed).child("frontend")):
+            submaps.append(submap)
+            bar.update()
+    return submaps
+
+
+def first_particles(
+    source: str | Path | SensorLog,
+    frontend: str = "rbpf-ekf",
+    *,
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+) -> tuple[Submap, ParticleSet]:
+    """The first submap of a log with the particles it was made of, as they stood at its last scan.
+
+    Parameters as in :func:`local_maps`; slice the log to begin elsewhere.
+
+    Raises
+    ------
+    ConfigError
+        The front end has no particles to show.
+    GraphSlamError
+        Or another of its children.
+    """
+    log = load_log_source(source)
+    made = _front_end(log, frontend, options)
+    if not isinstance(made, RbpfEkf):
+        raise ConfigError(f"front end {frontend!r} makes no local maps of particles; wanted rbpf-ekf")
+    with one_blas_thread():
+        return next(made.with_particles(log, seed=SeedTree(seed).child("frontend")))

@@ -1,0 +1,307 @@
+"""The fused map of a run: pieces led by the graph's own nodes, at their solved poses; files, pictures, figures.
+
+No scan is read: front ends that work with evidence grids store one with each submap, so that a map can be made again
+from a run folder alone (``graphslam map``).
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.config import MapConfig
+from graphslam.app.run.files import read_options
+from graphslam.app.run.metrics import Metrics
+from graphslam.app.run.run import GlobalMap, Run
+from graphslam.core.errors import DataError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, level
+from graphslam.core.submap import Submap
+from graphslam.evidence.formats import load_npz
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.io.submap_store import read_submaps
+from graphslam.maps.export import save_maps, storeys
+from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.pieces import DivisionConfig, PieceId
+from graphslam.maps.submaps import DividedSubmaps, divide_submaps
+
+logger = logging.getLogger(__name__)
+
+REACH_MARGIN = 1.0
+"""Added to the range of the beams: a voxel farther from the path than that was seen by nobody [m]."""
+MOST_TILT = 0.1
+"""Bases that lean by more than this are not of a front end that knows where down is; its nodes are taken as they are
+[rad]."""
+
+
+@dataclass(frozen=True)
+class RunMap:
+    """The fused map of a run.
+
+    Parameters
+    ----------
+    fused : FusedMap
+        Pieces at the solved poses.
+    divided : DividedSubmaps
+        The pieces, and where the open chain of exits has them.
+    bands : mapping of str to (low, high)
+        Heights of the floor plans, one for each storey that the path keeps to [m]; empty in the plane.
+    open_entropy, open_volume : float
+        Of the same pieces along the open chain: the map that the front end alone would have given [nat m³, m³].
+    divide_s, fuse_s, move_s : float
+        Seconds to cut the submaps into pieces, to fuse these along the open chain, and to move them to the solved
+        poses.
+    """
+
+    fused: FusedMap
+    divided: DividedSubmaps
+    bands: Mapping[str, tuple[float, float]]
+    open_entropy: float
+    open_volume: float
+    divide_s: float
+    fuse_s: float
+    move_s: float
+
+    def facts(self) -> dict[str, Any]:
+        """What ``fused_map.json`` holds."""
+        f = self.fused
+        return {
+            "format": "graphslam.fused-map/1",
+            "dim": f.dim,
+            "voxel_size": f.voxel_size,
+            "pieces": len(f),
+            "entropy": f.entropy(),
+            "known_volume": f.known_volume(),
+            "entropy_open_chain": self.open_entropy,
+            "known_volume_open_chain": self.open_volume,
+            "level_nodes": self.divided.level_nodes,
+            "bands": {name: list(band) for name, band in self.bands.items()},
+            "bytes": f.nbytes,
+        }
+
+    def metrics(self, out: Metrics) -> None:
+        """Rows of ``metrics.json``."""
+        f = self.fused
+        unit = "m³" if f.dim == 3 else "m²"
+        out.add("map_entropy", f.entropy(), f"nat {unit}", "lower")
+        out.add("map_known_volume", f.known_volume(), unit)
+        out.add("map_entropy_open_chain", self.open_entropy, f"nat {unit}")
+        out.add("map_known_volume_open_chain", self.open_volume, unit)
+        out.add("map_pieces", len(f))
+        out.add("map_megabytes", f.nbytes / 1e6, "MB", "lower")
+        for name, value in (("divide", self.divide_s), ("fuse", self.fuse_s), ("move", self.move_s)):
+            out.add(f"map_{name}_seconds", value, "s", "lower")
+
+
+def has_grids(submaps: Sequence[Submap]) -> bool:
+    """Has every submap an evidence grid?"""
+    return bool(submaps) and all(isinstance(s.grid, EvidenceGrid) for s in submaps)
+
+
+def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
+    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of the nodes of each submap, its base first, its exit left out.
+
+    Raises
+    ------
+    DataError
+        The map is not of these submaps.
+    """
+    bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
+    if len(bases) != len(submaps) + 1:
+        raise DataError("the solved nodes are not those of the submaps", got=len(bases) - 1, wanted=len(submaps))
+    return {s.key: (m.node_times[a:b], m.node_poses[a:b]) for s, a, b in zip(submaps, bases, bases[1:])}
+
+
+def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array]]) -> dict[PieceId, Array]:
+    """``T_world_node`` of every piece, from the graph's nodes; standing level where the pieces do."""
+    out: dict[PieceId, Array] = {}
+    for name in divided.pieces:
+        assert isinstance(name, tuple)
+        T = nodes[name[0]][1][name[1]]
+        out[name] = level(T) if divided.level_nodes else T
+    return out
+
+
+def make_run_map(
+    submaps: Sequence[Submap], m: GlobalMap, *, reach: float | None = None, config: MapConfig | None = None
+) -> RunMap:
+    """Fuse the grids of a run's submaps: along the open chain first, then moved to where the graph has them.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        With evidence grids and paths.
+    m : GlobalMap
+        Solved.
+    reach : float, optional
+        Of the sensor [m].
+    config : MapConfig, optional
+        Heights of the floor plans.
+
+    Raises
+    ------
+    MissingDataError
+        Submaps without grids.
+    DataError, GridError, GeometryError
+    """
+    config = MapConfig() if config is None else config
+    if not has_grids(submaps):
+        bare = [s.key for s in submaps if not isinstance(s.grid, EvidenceGrid)]
+        raise MissingDataError(
+            "submaps have no evidence grids to make a map of",
+            got=f"{len(bare)} of {len(submaps)} without",
+            wanted="a run of a front end with grids: segslam, rbpf-grid",
+        )
+    nodes = nodes_by_submap(submaps, m)
+    division = DivisionConfig() if reach is None else DivisionConfig(reach=reach + REACH_MARGIN)
+    begin = time.perf_counter()
+    divided = divide_submaps(
+        [_one_piece(s, nodes) for s in submaps],
+        every=None,
+        config=division,
+        level_nodes=m.dim == 3 and _levelled(m.base_poses),
+        nodes={key: times for key, (times, _) in nodes.items()},
+    )
+    divide_s, begin = time.perf_counter() - begin, time.perf_counter()
+    model = submaps[0].grid.model  # type: ignore[union-attr]
+    fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
+    fuse_s = time.perf_counter() - begin
+    open_entropy, open_volume = fused.entropy(), fused.known_volume()
+    begin = time.perf_counter()
+    fused.move(solved_poses(divided, nodes))
+    move_s = time.perf_counter() - begin
+    bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
+    return RunMap(fused, divided, bands, open_entropy, open_volume, divide_s, fuse_s, move_s)
+
+
+def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, float]]:
+    """Heights of the floor plan of every storey of a path ``(n, 3)`` [m]; of its middle where it keeps to none."""
+    heights = storeys(positions) or [float(np.median(positions[:, 2]))]
+    return {f"level{k}": (z + config.low, z + config.high) for k, z in enumerate(heights)}
+
+
+def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None = None) -> list[Path]:
+    """Write ``map.ply``, ``map.bt``, floor plans and ``fused_map.json``, of that generation; returns the files."""
+    made = save_maps(run_map.fused.grid, folder.path, bands=run_map.bands)
+    folder.write_json("fused_map.json", {**run_map.facts(), "generation": generation})
+    return [*made, folder.path / "fused_map.json"]
+
+
+def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth: Any = None) -> list[Path]:
+    """Pictures of the fused map: from above, each storey, and cut from the side.
+
+    Parameters
+    ----------
+    run_map : RunMap
+    path : Trajectory
+        Solved.
+    figures : Path
+        Folder that is there.
+    name : str
+        Of the run.
+    truth : Trajectory, optional
+        The true path, drawn beside the solved one.
+    """
+    from graphslam.plots.evidence import plot_heights, plot_section
+    from graphslam.plots.fused_map import plot_cut, plot_storey
+    from graphslam.plots.save import save
+
+    grid = run_map.fused.grid
+    if grid.dim == 2:
+        ax = plot_section(grid, title=f"{name}: fused map")
+        if truth is not None:
+            ax.plot(*truth.positions.T, color="tab:blue", lw=0.8, label="truth")
+        ax.plot(*path.positions.T, color="tab:red", lw=0.8, label="path")
+        ax.legend(fontsize="small")
+        return [save(ax, figures / "fused.png")]
+    made = []
+    for k, (band, (low, high)) in enumerate(run_map.bands.items()):
+        title = f"{name}: level {k}, {low:.1f} to {high:.1f} m"
+        made.append(
+            save(plot_storey(grid, low, high, path=path, truth=truth, title=title), figures / f"fused_{band}.png")
+        )
+    top = max(high for _, high in run_map.bands.values())
+    ax = plot_heights(grid, below=top, title=f"{name}: fused map from above, cut at {top:.1f} m")
+    made.append(save(ax, figures / "fused_above.png"))
+    ax = plot_cut(grid, path, truth=truth, title=f"{name}: fused map, cut from the side")
+    made.append(save(ax, figures / "fused_cut.png"))
+    return made
+
+
+def map_of_folder(path: str | Path, *, heights: Callable[[MapConfig], MapConfig] | None = None) -> tuple[Run, RunMap]:
+    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their grids.
+
+    Parameters
+    ----------
+    path : path
+    heights : callable, optional
+        Changes the options that the run had.
+
+    Raises
+    ------
+    RunFolderError
+        Not a finished run.
+    MissingDataError
+        A run of a front end without grids, or one that left them out.
+    FormatError, DataError
+    """
+    from graphslam.app.run.outputs import open_run
+
+    run = open_run(path)
+    root = Path(path)
+    if not any((root / "submaps").glob("*.grid.npz")):
+        raise MissingDataError(
+            f"{root}: the run has no evidence grids to make a map of",
+            got=f"front end {run.report.get('frontend')}",
+            wanted="a run of a front end with grids: segslam, rbpf-grid",
+        )
+    submaps = read_submaps(root, load_grid=load_npz)
+    values = folder_options(root)
+    own = map_config(values)
+    made = make_run_map(submaps, run.map, reach=sensor_reach(values), config=heights(own) if heights else own)
+    return replace(run, submaps=submaps, fused=made), made
+
+
+def folder_options(root: Path) -> dict[str, Any]:
+    """``config.toml`` of a run folder; nothing where there is none."""
+    return read_options(root)
+
+
+def map_config(values: Mapping[str, Any]) -> MapConfig:
+    """Options of the map from those of a run."""
+    from graphslam.app.run.config import build
+
+    made: MapConfig = build(MapConfig, values.get("map", {}), "map")
+    return made
+
+
+def with_heights(config: MapConfig, low: float | None, high: float | None) -> MapConfig:
+    """The same options with other heights of the floor plans, where they are given [m]."""
+    return replace(config, low=config.low if low is None else low, high=config.high if high is None else high)
+
+
+def sensor_reach(values: Mapping[str, Any]) -> float | None:
+    """Range at which the front end cut its beams [m], from the options of a run; None where they do not say."""
+    reach = values.get("frontend", {}).get("steps", {}).get("max_range")
+    return float(reach) if isinstance(reach, (int, float)) else None
+
+
+def _one_piece(s: Submap, nodes: Mapping[int, tuple[Array, Array]]) -> Submap:
+    """A submap with a path, where its nodes ask for one."""
+    if s.trajectory is None and len(nodes[s.key][0]) > 1:
+        raise DataError(f"submap {s.key} has nodes but no path", wanted="a trajectory")
+    return s
+
+
+def _levelled(bases: Array) -> bool:
+    """Do all bases ``(k, 7)`` stand about level?"""
+    group = group_of(bases)
+    lean = group.log(group.between(level(bases), bases))[:, :2]
+    return bool(np.all(np.linalg.norm(lean, axis=1) < MOST_TILT))

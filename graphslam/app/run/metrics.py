@@ -1,0 +1,303 @@
+"""The figures of a run: front end, join, time, GPS, truth. Every figure is measured in this run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from graphslam.app.run.plan_view import plan_path, plan_pose
+from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.poses import group_of
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.consistency import joint_nees, vector_pose_error
+from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+from graphslam.evaluate.gps import GpsResiduals, gps_residuals
+from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.trajectory_error import ate
+from graphslam.solve.solution import Solution
+
+TRUTH_GAP = 0.5
+"""Between records of truth farther apart than this the true pose is unknown [s]."""
+
+
+TIMES = re.compile(r"^seconds_|_seconds$|^times_real_time$|^frontend_ms_per_scan$|^frontend_last_to_first_quarter$")
+"""Metrics that are measured with a clock: no run repeats them, and they have a file of their own."""
+
+
+def is_time(key: object) -> bool:
+    """Is it the key of a metric that was measured with a clock?"""
+    return TIMES.search(str(key)) is not None
+
+
+@dataclass
+class Metrics:
+    """Rows of ``metrics.json`` and ``timings.json``."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, key: str, value: float, unit: str = "", direction: str = "none") -> None:
+        """One figure; ``direction`` says which way is better: lower, higher, one (nearer to 1) or none."""
+        self.rows.append({"key": key, "value": float(value), "unit": unit, "direction": direction})
+
+    def table(self) -> pd.DataFrame:
+        """As a table."""
+        return pd.DataFrame(self.rows, columns=["key", "value", "unit", "direction"])
+
+
+def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
+    """Counts and χ²/dof summed over the submaps, and how far particle maps are from smoothed ones."""
+    out.add("submaps", len(submaps))
+    reports = [s.report for s in submaps]
+    for key, unit in (("scans", ""), ("observations", ""), ("used", ""), ("not_associated", ""), ("trimmed", "")):
+        if all(key in r for r in reports):
+            out.add(f"frontend_{key}", sum(r[key] for r in reports), unit)
+    if all("chi2" in r for r in reports) and sum(r["dof"] for r in reports) > 0:
+        chi2, dof = sum(r["chi2"] for r in reports), sum(r["dof"] for r in reports)
+        used, scans = sum(r["used"] for r in reports), sum(r["scans"] for r in reports)
+        out.add("submap_chi2_per_dof", chi2 / dof, "", "one")
+        out.add("submap_chi2_range", sum(r["chi2_range"] for r in reports) / max(used, 1), "per observation")
+        out.add("submap_chi2_bearing", sum(r["chi2_bearing"] for r in reports) / max(used, 1), "per observation")
+        out.add("submap_chi2_odometry", sum(r["chi2_odometry"] for r in reports) / (3 * scans), "per component")
+    if all("min_ess" in r for r in reports):
+        out.add("min_ess_median", float(np.median([r["min_ess"] for r in reports])), "particles", "higher")
+    if any("flag" in r for r in reports):
+        out.add("flagged_submaps", flag_counts(submaps)["any"], "", "lower")
+
+
+def flag_counts(submaps: Sequence[Submap]) -> dict[str, int]:
+    """Submaps flagged by the front end for each reason, and for ``any``."""
+    flags = [s.report.get("flag", []) for s in submaps]
+    reasons = sorted({reason for f in flags for reason in f})
+    return {"any": sum(bool(f) for f in flags)} | {r: sum(r in f for f in flags) for r in reasons}
+
+
+def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:
+    """Objective per class, gap, landmarks."""
+    out.add("objective", solution.objective, "", "lower")
+    for name in solution.score:
+        c = solution.score[name]
+        label = "join" if name in ("submap", "dense-submap") else name
+        out.add(f"{label}_chi2", c.chi2)
+        out.add(f"{label}_dof", c.dof)
+        if c.dof > 0:
+            out.add(f"{label}_chi2_per_dof", c.chi2_per_dof, "", "one")
+    out.add("gap", solution.gap if solution.gap is not None else float("nan"), "", "lower")
+    out.add("converged", float(solution.converged), "", "higher")
+    out.add("states", solution.states)
+    out.add("landmarks", len(solution.landmarks))
+    out.add("landmarks_confirmed", confirmed)
+
+
+def gps_metrics(
+    out: Metrics, trajectory: Trajectory, gps: Gps, withheld: np.ndarray, T_gps_world: Array | None
+) -> dict[str, GpsResiduals]:
+    """RMSE, median and p95 at the antenna: rigid alignment to the fixes scored, or the graph's own datum."""
+    results: dict[str, GpsResiduals] = {}
+    if len(gps.times) < 2:
+        return results
+    if trajectory.dim == 3:  # scored in the plane, seen from above
+        trajectory = plan_path(trajectory)
+        T_gps_world = None if T_gps_world is None else plan_pose(T_gps_world)
+    try:
+        if T_gps_world is None:
+            results["all"] = gps_residuals(trajectory, gps)
+        else:
+            results["all"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world)
+            if np.any(withheld):
+                results["withheld"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world, score=withheld)
+    except DataError:  # no fix on the path: nothing to score, and the counts say so
+        return results
+    for name, r in results.items():
+        s = r.statistics
+        prefix = "gps" if name == "all" else "gps_withheld"
+        for key, value in (("rmse", s.rmse), ("median", s.median), ("p95", s.p95), ("max", s.maximum)):
+            out.add(f"{prefix}_{key}", value, "m", "lower")
+        out.add(f"{prefix}_fixes", s.count)
+        out.add(f"{prefix}_fixes_off_the_path", r.outside + r.in_gap)
+    return results
+
+
+def dead_reckoning_metrics(out: Metrics, path: Trajectory | None, gps: Gps) -> None:
+    """What the wheels alone would have given, scored like the map: the figure to compare it with."""
+    if path is None or len(gps.times) < 2:
+        return
+    try:
+        s = gps_residuals(path, gps).statistics
+    except DataError:
+        return
+    out.add("gps_dead_reckoning_rmse", s.rmse, "m")
+    out.add("gps_dead_reckoning_median", s.median, "m")
+
+
+def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
+    """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth there.
+
+    Submaps that end where the truth has a gap (:data:`TRUTH_GAP`) or beyond its last record have none.
+    """
+    if log.truth is None or not submaps:
+        return None
+    path = log.truth.trajectory
+    start = np.array([submaps[0].interval[0]])
+    if not _covered(path, start)[0]:
+        return None
+    g = group_of(path.poses)
+    base = true_base(path, submaps[0])
+    times = np.array([s.interval[1] for s in submaps])
+    known = _covered(path, times)
+    ends = path.interpolate(times[known])
+    if g.dim == 3:  # the frame at an exit need not be the body's: bases in space stand level
+        ends = g.compose(ends, np.array([_exit_of_body(s) for s in submaps])[known])
+    return MapTruth(
+        keys=np.array([s.key for s in submaps], dtype=np.int64)[known],
+        exit_poses=g.between(np.broadcast_to(base, ends.shape), ends),
+        landmark_ids=log.truth.landmark_ids,
+        landmarks=g.transform(g.inverse(base), log.truth.landmarks)
+        if len(log.truth.landmarks)
+        else np.zeros((0, g.dim)),
+    )
+
+
+def true_base(path: Trajectory, first: Submap) -> Array:
+    """Where the base of the first submap really stands, in the frame of the true ``path``.
+
+    In space a base may stand level beside the body (SegSLAM's do); the submap's own path says where the body is in it.
+    """
+    at = path.interpolate(np.array([first.interval[0]]))[0]
+    own = first.trajectory
+    if path.dim == 2 or own is None or not len(own):
+        return at
+    return group_of(at).compose(at, group_of(at).inverse(own.poses[0]))
+
+
+def _exit_of_body(submap: Submap) -> Array:
+    """``T_body_exit`` at the end of a submap's own path."""
+    g, own = group_of(submap.exit_pose), submap.trajectory
+    return g.identity if own is None or not len(own) else g.between(own.poses[-1], submap.exit_pose)
+
+
+def _covered(path: Trajectory, times: Array) -> np.ndarray:
+    """Which of ``times`` lie inside the path and in no gap of it."""
+    inside = (times >= path.times[0]) & (times <= path.times[-1])
+    j = np.clip(np.searchsorted(path.times, times), 1, len(path) - 1)
+    return np.asarray(inside & (path.times[j] - path.times[j - 1] <= TRUTH_GAP))
+
+
+def truth_path(log: SensorLog, times: Array, first: Submap | None = None) -> Trajectory | None:
+    """True path at ``times`` where it is known, in the frame of the base at the first of them.
+
+    Parameters
+    ----------
+    first : Submap, optional
+        The first submap, whose base in space need not be the body (:func:`true_base`).
+    """
+    if log.truth is None:
+        return None
+    path = log.truth.trajectory
+    inside = times[_covered(path, times)]
+    if len(inside) == 0:
+        return None
+    poses = path.interpolate(inside)
+    base = poses[0]
+    if path.dim == 3 and first is not None and _covered(path, np.array([first.interval[0]]))[0]:
+        base = true_base(path, first)
+    return Trajectory(inside, group_of(poses).between(np.broadcast_to(base, poses.shape), poses))
+
+
+def true_first_base(log: SensorLog, first: Submap) -> list[float] | None:
+    """Where the first base truly was in the world of the log, which several logs may share; None where not known.
+
+    Logs of one simulated world share its frame (``meta["T_world_frame"]``); what is said of others is in the frame of
+    their truth.
+    """
+    if log.truth is None or not _covered(log.truth.trajectory, np.array([first.interval[0]]))[0]:
+        return None
+    path = log.truth.trajectory
+    base = true_base(path, first) if path.dim == 3 else path.interpolate(np.array([first.interval[0]]))[0]
+    if "T_world_frame" in log.meta:
+        base = group_of(base).compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)
+    return [float(v) for v in base]
+
+
+def truth_metrics(
+    out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool, path: Trajectory | None = None
+) -> None:
+    """RMSE and NEES with the first base fixed, and after a rigid alignment; landmarks only with the truth's identities.
+
+    The first gauge trusts the true pose of the first base, heading included: over metres a degree of it is centimetres.
+    In the second the map is moved onto the truth as a whole (three scalars less in the NEES): landmarks by themselves,
+    the path by itself, and the NEES by generalised least squares over all that is judged.
+
+    Parameters
+    ----------
+    path : Trajectory, optional
+        True path at full rate, for the error of the whole path.
+    """
+    i, j = match_ids(solution.submap_keys, truth.keys)
+    node = solution.exit_nodes[i]
+    true_poses = truth.exit_poses[j]
+    e_pose = vector_pose_error(solution.poses[node], true_poses)
+    out.add("pose_rmse", float(np.sqrt(np.mean(np.sum(e_pose[:, :2] ** 2, axis=1)))), "m", "lower")
+    out.add("heading_rmse", float(np.rad2deg(np.sqrt(np.mean(e_pose[:, 2] ** 2)))), "deg", "lower")
+    P = solution.joint_covariance()
+    first_landmark = 3 * (len(solution.poses) - 1)
+    error, points = e_pose.ravel(), np.zeros((0, 2))
+    ix = (3 * (node - 1)[:, None] + np.arange(3)).ravel()
+    n_pose = len(error)
+    if identities:
+        ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
+        points = solution.landmarks[ours]
+        e_lm = truth.landmarks[theirs] - points
+        out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
+        error = np.concatenate([error, e_lm.ravel()])
+        ix = np.concatenate([ix, (first_landmark + 2 * ours[:, None] + np.arange(2)).ravel()])
+        if len(ours) >= 2:
+            rigid = landmark_error(
+                truth.landmark_ids[theirs], points, truth.landmark_ids, truth.landmarks, gauge="rigid"
+            )
+            out.add("landmark_rmse_aligned", rigid.statistics.rmse, "m", "lower")
+    if path is not None and len(path) >= 3:
+        whole = ate(solution.trajectory(covariances=False), path, alignment="se")
+        out.add("path_rmse_aligned", whole.statistics.rmse, "m", "lower")
+        out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
+    P = P[np.ix_(ix, ix)]
+    _add_nees(out, "nees", joint_nees(error, covariance=P), len(error))
+    gauge = gauge_directions(solution.poses[node], points)
+    parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
+    for name, part in parts.items():
+        dof = len(error[part]) - 3
+        if dof > 0:
+            _add_nees(out, f"nees_aligned{name}", aligned_nees(error[part], P[part, part], gauge[part]), dof)
+
+
+def _add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
+    out.add(key, nees)
+    out.add(f"{key}_dof", dof)
+    out.add(f"{key}_per_dof", nees / dof, "", "one")
+    out.add("ci" if key == "nees" else key.replace("nees", "ci"), nees / chi2_quantile(0.95, dof), "", "lower")
+
+
+def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, cost: Array) -> None:
+    """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log."""
+    for stage, value in seconds.items():
+        out.add(f"seconds_{stage}", value, "s", "lower")
+    total = seconds.get("total", 0.0)
+    if total > 0:
+        out.add("times_real_time", duration / total, "x", "higher")
+    if scans:
+        out.add("frontend_ms_per_scan", 1e3 * seconds.get("frontend", 0.0) / scans, "ms", "lower")
+    if len(cost) >= 8:
+        quarter = len(cost) // 4
+        out.add(
+            "frontend_last_to_first_quarter", float(np.median(cost[-quarter:]) / np.median(cost[:quarter])), "x", "one"
+        )

@@ -1,0 +1,280 @@
+"""What a run leaves on disk beside its submaps: one state, written and replaced as a whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import filecmp
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from graphslam.app.folders.generations import Generation, consistent, new_generation
+from graphslam.app.folders.output_files import json_lines
+from graphslam.app.run.figures import save_figures
+from graphslam.app.run.files import (
+    ASSOCIATION_FORMAT,
+    FIXES_FORMAT,
+    GENERATION_EVENT,
+    GPS_FORMAT,
+    MAP_FORMAT,
+    check_state,
+    read_association,
+    read_events,
+    read_fixes,
+    read_gps_residuals,
+    read_ledger,
+    read_map,
+    read_metrics,
+    read_report,
+)
+from graphslam.app.run.maps import draw_run_map, write_run_map
+from graphslam.app.run.metrics import is_time
+from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.taken import write_taken
+from graphslam.core.atomic import write_npz
+from graphslam.core.digest import Digest
+from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.graph.network import to_network
+from graphslam.io.g2o import write_g2o
+from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
+from graphslam.io.tum import read_tum, write_tum
+
+logger = logging.getLogger(__name__)
+RESUMED = "resumed_submaps"
+OF_THE_CLOCK = ("seconds", RESUMED)
+"""Parts of a run's report that are not in ``run.json``, which no clock and no kill changes, but in ``timings.json``."""
+
+
+SAME_BYTES = (
+    *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
+    *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
+    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "map*.pgm"),
+    *("map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
+    *("figures/gps_*.png", "figures/fused*.png"),
+)
+"""Files of a run folder that are the same bytes after a kill and a resume, after undoing and redoing a loop, and in two
+runs of one configuration. The others hold times (``timings.json``, and the part of ``report.html`` that shows them), or
+were drawn on the way (``figures/progress.png``)."""
+_MADE_OF_MAP = ("map.grid.npz", "map.kml", "map.geojson", "clearest*", "alternatives/*", "*.kml", "*.geojson")
+"""What other verbs made of a map, which stays where the map does."""
+
+
+def write_outputs(folder: Path, run: Run) -> Run:
+    """Write a new state of a run folder: everything but ``config.toml`` and ``submaps/``, which are there already.
+
+    Parameters
+    ----------
+    folder : Path
+    run : Run
+
+    Returns
+    -------
+    Run
+        With its folder, and the id of its generation in its report.
+    """
+    run = replace(run, folder=folder, report={**run.report, "generation": generation_id(run)})
+    with new_generation(folder) as new:
+        _write_files(new, run)
+        before = new.before
+        if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
+            for pattern in _MADE_OF_MAP:
+                new.adopt(only=pattern)
+        from graphslam.app.report.report import report_beside  # the page is made from the files, so they come first
+
+        report_beside(new)
+    return run
+
+
+def _write_files(new: Generation, run: Run) -> None:
+    m, root = run.map, new.path
+    mark = {"generation": run.report["generation"]}
+    write_tum(root / "trajectory.tum", m.trajectory)
+    write_tum(root / "nodes.tum", Trajectory(m.node_times, m.node_poses))
+    new.write_text("landmarks.csv", landmarks_csv(m))
+    write_npz(root / "map.npz", _map_arrays(m) | mark)
+    write_npz(root / "association.npz", _association_arrays(run.submaps) | mark)
+    if run.graph is not None:
+        write_g2o(root / "graph.g2o", to_network(run.graph))
+    if run.truth is not None:
+        write_truth(root, run.truth)
+    for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):
+        if path is not None:
+            write_tum(root / name, path)
+    for name, r in run.gps.items():
+        arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
+        write_npz(root / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays, **mark})
+    if run.fixes is not None:
+        g = run.fixes
+        arrays = {"times": g.times, "positions": g.positions, "sigma": g.sigma, "lever": g.lever}
+        write_npz(root / "fixes.npz", {"format": FIXES_FORMAT, **arrays, **mark})
+    if run.taken is not None:
+        try:
+            write_taken(root, run.taken, mark["generation"])
+        except FormatError as error:
+            logger.warning("no loop of this run can be undone: what its graph was made of is not stored (%s)", error)
+    new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, **mark}, *run.events])
+    if run.ledger is not None:
+        new.write_text("ledger.csv", run.ledger.to_csv(index=False))
+    new.write_json("metrics.json", figure_rows(run))
+    new.write_json("timings.json", timing_rows(run))
+    save_figures(run, new.figures)
+    if run.fused is not None:
+        write_run_map(new, run.fused, mark["generation"])
+        draw_run_map(run.fused, m.trajectory, new.figures, name=run.name, truth=run.truth_path)
+    new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
+
+
+def figure_rows(run: Run) -> list[dict[str, Any]]:
+    """Rows of ``metrics.json``: what the run found."""
+    return [r for r in run.metrics.to_dict("records") if not is_time(r["key"])]
+
+
+def timing_rows(run: Run) -> list[dict[str, Any]]:
+    """Rows of ``timings.json``: how long it took, and how much of it was there already."""
+    resumed = {"key": RESUMED, "value": float(run.report.get(RESUMED, 0)), "unit": "", "direction": "none"}
+    return [*(r for r in run.metrics.to_dict("records") if is_time(r["key"])), resumed]
+
+
+def generation_id(run: Run) -> str:
+    """Digest of what a run found: the same map, events and figures have the same id."""
+    d = Digest()
+    d.add_all(_map_arrays(run.map))
+    d.add_all(_association_arrays(run.submaps))
+    d.add("events", json_lines(run.events).encode())
+    d.add("metrics", json_lines(figure_rows(run)).encode())
+    return d.text()
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    return a.is_file() and b.is_file() and filecmp.cmp(a, b, shallow=False)
+
+
+def landmarks_csv(m: GlobalMap) -> str:
+    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]."""
+    P = m.landmark_covariances
+    table = pd.DataFrame(
+        {
+            "id": m.landmark_ids,
+            "x": m.landmarks[:, 0],
+            "y": m.landmarks[:, 1],
+            "cov_xx": P[:, 0, 0],
+            "cov_xy": P[:, 0, 1],
+            "cov_yy": P[:, 1, 1],
+            "hits": m.landmark_hits,
+        }
+    )
+    return str(table.to_csv(index=False, float_format="%.9g"))
+
+
+def _map_arrays(m: GlobalMap) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "format": MAP_FORMAT,
+        "trajectory_times": m.trajectory.times,
+        "trajectory_poses": m.trajectory.poses,
+        "trajectory_covariances": m.trajectory.covariances,
+    }
+    for name in ("node_times", "node_poses", "node_covariances", "landmark_ids", "landmarks", "landmark_covariances"):
+        arrays[name] = getattr(m, name)
+    arrays["landmark_hits"] = m.landmark_hits
+    for name in ("T_gps_world", "base_nodes"):
+        if getattr(m, name) is not None:
+            arrays[name] = getattr(m, name)
+    return arrays
+
+
+def _association_arrays(submaps: Any) -> dict[str, Any]:
+    ids = [s.landmarks.ids if s.landmarks is not None else np.zeros(0, dtype=np.int64) for s in submaps]
+    return {
+        "format": ASSOCIATION_FORMAT,
+        "keys": np.array([s.key for s in submaps], dtype=np.int64),
+        "offsets": np.concatenate([[0], np.cumsum([len(i) for i in ids])]).astype(np.int64),
+        "ids": np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64),
+    }
+
+
+def identified_submaps(path: str | Path) -> list[Submap]:
+    """Submaps of a store or of a run folder; a run's carry the identities of its back end."""
+    return consistent(path, lambda root: _identified(Path(path), root))
+
+
+def _identified(home: Path, root: Path) -> list[Submap]:
+    submaps = read_submaps(home)
+    if not (root / "association.npz").is_file():
+        return submaps
+    ids = read_association(root)
+    return [
+        s.with_ids(ids[s.key]) if s.landmarks is not None and len(ids.get(s.key, ())) == len(s.landmarks) else s
+        for s in submaps
+    ]
+
+
+def open_run(path: str | Path) -> Run:
+    """Read a finished run folder, all of it of one state.
+
+    Raises
+    ------
+    RunFolderError
+        Not a finished run.
+    FormatError
+        A file is damaged, or not of one state with the others.
+    """
+    return consistent(path, lambda root: _open(Path(path), root))
+
+
+def _open(home: Path, root: Path) -> Run:
+    if not (root / "run.json").is_file():
+        hint = (
+            "run again with --resume" if (home / "config.toml").is_file() else "give a folder that graphslam run wrote"
+        )
+        raise RunFolderError(f"{home}: not a finished run; {hint}")
+    report, m = read_report(root), read_map(root)
+    metrics = read_metrics(root)
+    if (root / "timings.json").is_file():
+        timings = read_metrics(root, "timings.json")
+        values = dict(zip(timings["key"], timings["value"]))
+        values = {k: v for k, v in values.items() if v == v}  # what is no number was not measured
+        report[RESUMED] = int(values.pop(RESUMED, 0.0))
+        report["seconds"] = {k.removeprefix("seconds_"): v for k, v in values.items() if k.startswith("seconds_")}
+        metrics = pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True)
+    if root == home:  # plain files: a copy, or of an older version
+        check_state(root)
+    _check_submaps(home, root)
+    return Run(
+        name=str(report["source"]),
+        submaps=_identified(home, root),
+        map=m,
+        metrics=metrics,
+        report=report,
+        events=read_events(root) if (root / "events.jsonl").is_file() else [],
+        ledger=read_ledger(root) if (root / "ledger.csv").is_file() else None,
+        folder=home,
+        gps={p.stem.removeprefix("gps_"): read_gps_residuals(p) for p in sorted(root.glob("gps_*.npz"))},
+        fixes=read_fixes(root),
+        truth=read_truth(root),
+        truth_path=_path(root / "truth.tum", m.dim),
+        dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
+    )
+
+
+def _check_submaps(home: Path, root: Path) -> None:
+    """A run whose store was damaged and cut is not the run that its map is of."""
+    if not (root / "association.npz").is_file():
+        return
+    have, wanted = [e["key"] for e in SubmapStore(home).entries], [*read_association(root)]
+    if have != wanted:
+        raise FormatError(
+            "submaps are not those that the map was made of (association.npz); run again with --resume",
+            where=str(home / "submaps" / "index.json"),
+            got=f"{len(have)} submaps",
+            wanted=f"{len(wanted)}, to key {wanted[-1] if wanted else None}",
+        )
+
+
+def _path(file: Path, dim: int) -> Trajectory | None:
+    return read_tum(file, dim=dim) if file.is_file() else None

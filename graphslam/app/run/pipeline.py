@@ -1,0 +1,409 @@
+"""Raw log → submaps → graph → map: the main line of the project, one step after the other."""
+
+from __future__ import annotations
+
+import logging
+import time
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from graphslam.app.folders.generations import consistent
+from graphslam.app.folders.lock import locked
+from graphslam.app.run import config as cfg
+from graphslam.app.run.audit import audit_association, reference_identities
+from graphslam.app.run.back_end import BackEnd
+from graphslam.app.run.files import read_options
+from graphslam.app.run.folder import CONFIG, RunFolder
+from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_to_back import FrontEndWork, front_to_back
+from graphslam.app.run.gps_use import split, used_fixes
+from graphslam.app.run.graph_facts import graph_facts
+from graphslam.app.run.imu_use import ImuPart, imu_metrics, imus_of
+from graphslam.app.run.loops import undone_of_run
+from graphslam.app.run.maps import RunMap, has_grids, make_run_map, sensor_reach
+from graphslam.app.run.metrics import (
+    Metrics,
+    dead_reckoning_metrics,
+    flag_counts,
+    front_end_metrics,
+    gps_metrics,
+    map_truth,
+    solution_metrics,
+    time_metrics,
+    true_first_base,
+    truth_metrics,
+    truth_path,
+)
+from graphslam.app.run.metrics_space import truth_metrics_in_space
+from graphslam.app.run.outputs import write_outputs
+from graphslam.app.run.reckoning import dead_reckoning
+from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.stream_use import stream_use
+from graphslam.app.run.taken import Taken, read_taken, take
+from graphslam.app.run.verdict import Figures, observed, verdict
+from graphslam.app.run.without_truth import check_without_truth
+from graphslam.app.threads import one_blas_thread
+from graphslam.app.versions import versions
+from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.findings import verdict_json
+from graphslam.core.json_file import check_json
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.evaluate.landmark_checks import sighting_findings
+from graphslam.evaluate.stream_checks import Noticed, check_streams
+from graphslam.evaluate.systematic import systematic_findings
+from graphslam.evidence.formats import load_npz
+from graphslam.io.catalog import load
+from graphslam.io.log_digest import log_digest
+from graphslam.io.submap_store import read_submaps
+from graphslam.loops.ledger import Decision
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+
+
+def run(
+    source: str | Path | SensorLog,
+    *,
+    frontend: str = "rbpf-ekf",
+    solver: str = "isam2",
+    seed: int = 0,
+    out: str | Path | None = None,
+    config: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    progress: bool = True,
+    undo: Sequence[int | Decision] | None = None,
+    watch: Callable[[Any], None] | None = None,
+) -> Run:
+    """Run a front end over a log, join its submaps in a graph, and score what can be scored.
+
+    Parameters
+    ----------
+    source : card name, folder, or SensorLog
+    frontend, solver : str
+        Registered names.
+    seed : int
+        Root of the seed tree.
+    out : path, optional
+        Run folder; without one nothing is written.
+    config : mapping, optional
+        Nested options over the source's preset: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``.
+    resume : bool
+        Go on after the last finished submap of ``out``, to the same result.
+    progress : bool
+        Show a progress bar on stderr.
+    undo : sequence of int or Decision, optional
+        Loops that are taken out again at the end, by their numbers in the ledger of loops, or as an earlier ledger has
+        them. By default those that were undone before where the run is resumed, none otherwise.
+    watch : callable, optional
+        Handed to a front end that can be watched (``segslam``: `graphslam.frontends.segslam.progress`); others ignore
+        it.
+
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children; says what, where, got, wanted.
+    """
+    with one_blas_thread():
+        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, watch)
+
+
+def _run(
+    source: str | Path | SensorLog,
+    frontend: str,
+    solver: str,
+    seed: int,
+    out: str | Path | None,
+    config: Mapping[str, Any],
+    resume: bool,
+    progress: bool,
+    undo: Sequence[int | Decision] | None,
+    watch: Callable[[Any], None] | None,
+) -> Run:
+    begin = time.perf_counter()
+    log = load_log_source(source)
+    seconds = {"load": time.perf_counter() - begin}
+    options = cfg.merge(recommended(log, frontend), config)
+    settings: cfg.RunConfig = cfg.build(cfg.RunConfig, options)
+    front: Any = make_front_end(frontend, settings.frontend)
+    if watch is not None and hasattr(front, "watch"):
+        front = replace(front, watch=watch)
+    effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
+    noticed = check_streams(log)
+    back = _back_end(log, settings, solver)
+    if out is None:
+        return _made(log, front, back, settings, effective, None, seconds, begin, progress, undo or (), noticed)
+    effective["run"]["log"] = log_digest(log)
+    effective = tomllib.loads(cfg.dump_toml(effective))  # as it comes back from the folder, order and all
+    with RunFolder.start(out, effective, resume=resume) as folder:
+        if undo is None:  # what was taken out of a run stays out when it is gone on with
+            undo = undone_of_run(folder.path) if resume else ()
+        result = _made(log, front, back, settings, effective, folder, seconds, begin, progress, undo, noticed)
+        return write_outputs(folder.path, result)
+
+
+def _made(
+    log: SensorLog,
+    front: Any,
+    back: BackEnd,
+    settings: cfg.RunConfig,
+    effective: dict[str, Any],
+    folder: RunFolder | None,
+    seconds: dict[str, float],
+    begin: float,
+    progress: bool,
+    undo: Sequence[int | Decision],
+    noticed: Sequence[Noticed],
+) -> Run:
+    """Submaps of the front end, in the graph of the back end, solved and judged."""
+    drops = DropCounter()
+    tree, grids = SeedTree(effective["run"]["seed"]), _with_grids(settings)
+    submaps, work = front_to_back(log, front, back, tree, folder, drops, progress, grids)
+    if not submaps:
+        raise MissingDataError("the log gave no submap", where=log.name)
+    taken = take(log, drops.counts, reference_identities(log, front), noticed)
+    result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
+    return replace(result, log=log)
+
+
+def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
+    """Make a finished run again from what its folder holds, without these loops, and write its files anew.
+
+    No log is read, and no submap made.
+
+    Parameters
+    ----------
+    folder : path
+    undo : sequence of Decision
+        Loops that are taken out.
+    progress : bool
+        Show a progress bar on stderr.
+
+    Raises
+    ------
+    RunFolderError
+        No finished run, or another process is writing into it.
+    MissingDataError
+        An older version wrote the folder, which does not hold enough.
+    FormatError
+        What it holds is damaged.
+    """
+    root = Path(folder)
+    begin = time.perf_counter()
+    with one_blas_thread(), locked(root):
+        taken, _ = consistent(root, read_taken)
+        effective = read_options(root)
+        wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
+        said = check_json(effective, wanted, str(root / CONFIG))["run"]
+        settings: cfg.RunConfig = cfg.build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+        back = _back_end(taken.log, settings, said["solver"])
+        submaps = read_submaps(root, load_grid=load_npz if _with_grids(settings) else None)
+        seconds = {"load": time.perf_counter() - begin}
+        for s in tqdm(submaps, desc=str(said["source"]), unit="submap", disable=not progress, leave=False):
+            back.add(s)
+        work = FrontEndWork(0.0, len(submaps), np.zeros(0))
+        result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
+        return write_outputs(root, result)
+
+
+def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str) -> BackEnd:
+    """A back end that has its IMUs, and the fixes that are to be used."""
+    back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu))
+    gps = gps_stream(log)
+    if gps is not None and settings.gps.use != "none":
+        back.add_gps(split(gps, settings.gps)[0], settings.gps)
+    return back
+
+
+def _with_grids(settings: cfg.RunConfig) -> bool:
+    """Are the grids of stored submaps needed?"""
+    return bool(settings.backend.loops or settings.map.fuse)
+
+
+def _solved(
+    taken: Taken,
+    settings: cfg.RunConfig,
+    submaps: list[Submap],
+    back: BackEnd,
+    seconds: dict[str, float],
+    begin: float,
+    work: FrontEndWork,
+    effective: dict[str, Any],
+    undo: Sequence[int | Decision],
+) -> Run:
+    """The run of a back end that has all submaps."""
+    solution = back.finish(undo)
+    seconds["frontend"] = work.seconds
+    seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}
+    seconds["backend"] = sum(back.seconds.values())
+    seconds["total"] = time.perf_counter() - begin
+    return _judge(taken, settings, submaps, back, solution, seconds, work, effective)
+
+
+def load_log_source(source: str | Path | SensorLog, **options: Any) -> SensorLog:
+    """A log from a card name, a folder on disk, or itself; ``options`` are for the reader."""
+    if isinstance(source, SensorLog):
+        return source
+    log = load(source, **options)
+    if not isinstance(log, SensorLog):
+        raise MissingDataError(
+            f"{source} holds no sensor log", got=type(log).__name__, wanted="a log of sensor streams"
+        )
+    return log
+
+
+def gps_stream(log: SensorLog) -> Gps | None:
+    """The GPS stream of a log, if it has one."""
+    name = log.of_type(Gps)
+    return None if name is None else log[name]
+
+
+def effective_config(
+    source: str, frontend: str, solver: str, seed: int, front_config: Any, settings: cfg.RunConfig
+) -> dict[str, Any]:
+    """What ``config.toml`` holds: names, seed, and every option with its value."""
+    run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
+    return {
+        "run": run_part,
+        "frontend": cfg.as_dict(front_config),
+        "backend": cfg.as_dict(settings.backend),
+        "gps": cfg.as_dict(settings.gps),
+        "imu": cfg.as_dict(settings.imu),
+        "map": cfg.as_dict(settings.map),
+    }
+
+
+def _judge(
+    taken: Taken,
+    settings: cfg.RunConfig,
+    submaps: list[Submap],
+    back: BackEnd,
+    solution: Solution,
+    seconds: dict[str, float],
+    work: FrontEndWork,
+    effective: dict[str, Any],
+) -> Run:
+    """Metrics, residuals, and the value that the user gets."""
+    log, drops = taken.log, DropCounter()
+    gps = gps_stream(log)
+    hits = back.landmark_hits(submaps)
+    global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
+    out = Metrics()
+    front_end_metrics(out, submaps)
+    solution_metrics(out, solution, len(global_map.landmarks))
+    imu_metrics(out, back.graph, drops)
+    fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
+    if fused is not None:
+        fused.metrics(out)
+        seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
+        seconds["total"] += seconds["map"]
+    scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
+    time_metrics(out, seconds, log.duration, scans, work.per_scan)
+    residuals = {}
+    reckoned = dead_reckoning(log, global_map.trajectory)
+    if gps is not None:
+        withheld = ~used_fixes(gps, settings.gps)
+        residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
+        if back.graph.dim == 2:
+            dead_reckoning_metrics(out, reckoned, gps)
+    truth, identities = map_truth(log, submaps), "run"
+    true_path = truth_path(log, global_map.trajectory.times, submaps[0])
+    identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
+    checks = check_without_truth(out, back.graph, identified, global_map.base_poses, gps, settings)
+    if truth is not None:
+        known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
+        if back.graph.dim == 2:
+            truth_metrics(out, solution, truth, identities=known, path=true_path)
+        else:
+            truth_metrics_in_space(out, solution, truth, path=true_path)
+        identities = "truth" if known else "run"
+    if taken.identities is not None:
+        audit_association(out, taken.identities, *back.observation_labels(submaps))
+    report = {
+        "format": "graphslam.run/1",
+        **effective["run"],
+        "backend": effective["backend"],
+        "gps": effective["gps"],
+        "imu": effective["imu"],
+        "T_world_base": true_first_base(log, submaps[0]),
+        "versions": versions(),
+        "seconds": seconds,
+        "resumed_submaps": work.resumed,
+        "flagged_submaps": flag_counts(submaps),
+        "records_read": dict(log.read),
+        "records_dropped": {**log.dropped, **drops.counts},
+        "source_meta": dict(log.meta),
+        "identities": identities,
+        "covariance_scale": settings.backend.covariance_scale,
+        "objective": solution.objective,
+        "converged": solution.converged,
+        "graph": graph_facts(back.graph, checks.classes),
+    }
+    if why_not:
+        report["map_left_out"] = why_not
+    used = frozenset().union(*(s.uses for s in submaps))
+    streams = stream_use(log, back.graph, settings, {**log.dropped, **drops.counts}, used)
+    report["streams"] = [s.as_row() for s in streams]
+    metrics = out.table()
+    figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
+    reports = [s.report for s in submaps]
+    seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
+    report["verdict"] = verdict_json([*observed(streams, taken.noticed, submaps), *seen, *verdict(figures)])
+    return Run(
+        name=log.name,
+        submaps=identified,
+        map=global_map,
+        metrics=metrics,
+        report=report,
+        events=list(back.graph.events),
+        ledger=back.graph.ledger.table(),
+        gps=residuals,
+        fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
+        taken=taken,
+        truth=truth,
+        truth_path=true_path,
+        dead_reckoning=reckoned,
+        solution=solution,
+        graph=back.graph,
+        checks=checks,
+        fused=fused,
+    )
+
+
+def _fused_map(
+    submaps: list[Submap], m: GlobalMap, config: cfg.MapConfig, effective: Mapping[str, Any]
+) -> tuple[RunMap | None, str]:
+    """The fused map of submaps with grids; or None, and why where there could have been one."""
+    if not (config.fuse and has_grids(submaps)):
+        return None, ""
+    try:
+        return make_run_map(submaps, m, reach=sensor_reach(effective), config=config), ""
+    except GraphSlamError as error:  # a run that is solved is not thrown away for its map
+        logger.warning("no fused map: %s", error)
+        return None, str(error)
+
+
+def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
+    """Trajectory at full rate, nodes, and the landmarks seen at least ``confirmed`` times."""
+    n = np.array([hits.get(int(i), 0) for i in solution.landmark_ids], dtype=np.int64)
+    keep = n >= confirmed
+    return GlobalMap(
+        trajectory=solution.trajectory(),
+        node_times=solution.node_times,
+        node_poses=solution.poses,
+        node_covariances=solution.node_covariances(),
+        landmark_ids=solution.landmark_ids[keep],
+        landmarks=solution.landmarks[keep],
+        landmark_covariances=solution.landmark_covariances()[keep],
+        landmark_hits=n[keep],
+        T_gps_world=solution.T_gps_world,
+        base_nodes=np.append(solution.base_nodes, solution.exit_nodes[-1]).astype(np.int64),
+    )

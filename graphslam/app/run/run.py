@@ -1,0 +1,178 @@
+"""A finished run as a value: what a notebook holds in its hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.core.findings import Finding, findings_of_json
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.markup import element, frame, join
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps import GpsResiduals
+
+if TYPE_CHECKING:
+    from graphslam.app.run.maps import RunMap
+    from graphslam.app.run.taken import Taken
+    from graphslam.app.run.without_truth import WithoutTruth
+    from graphslam.graph.pose_graph import PoseGraph
+    from graphslam.solve.solution import Solution
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The solved map, in the frame of the first base.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Full rate, ``T_world_base(t)`` with covariances.
+    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3|7), (m + 1, d, d)
+        Bases of the submaps, their inner nodes, and the end of the last.
+    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
+        Confirmed landmarks.
+    landmark_hits : (n,)
+        Sightings over all submaps.
+    T_gps_world : (3,) or (7,) or None
+        Map → GPS frame, where GPS was in the graph.
+    base_nodes : (k + 1,) int or None
+        Which nodes are bases of submaps or the end of the last; None: all.
+    """
+
+    trajectory: Trajectory
+    node_times: Array
+    node_poses: Array
+    node_covariances: Array
+    landmark_ids: Ints
+    landmarks: Array
+    landmark_covariances: Array
+    landmark_hits: Ints
+    T_gps_world: Array | None = None
+    base_nodes: Ints | None = None
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.trajectory.dim
+
+    @property
+    def base_poses(self) -> Array:
+        """Bases of the submaps and the end of the last ``(k + 1, 3|7)``."""
+        return self.node_poses if self.base_nodes is None else self.node_poses[self.base_nodes]
+
+    @property
+    def base_times(self) -> Array:
+        """When the body was there ``(k + 1,)`` [s]."""
+        return self.node_times if self.base_nodes is None else self.node_times[self.base_nodes]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Result of :func:`graphslam.run` or :func:`graphslam.open_run`.
+
+    Parameters
+    ----------
+    name : str
+    submaps : list of Submap
+        With the landmark identities that the back end gave them.
+    map : GlobalMap
+    metrics : DataFrame
+        ``key, value, unit, direction``.
+    report : dict
+        ``run.json``: versions, seed, counts of records read, used and dropped; and the seconds of ``timings.json``.
+    events : list of dict
+    ledger : DataFrame or None
+        Which factor spent which stream when.
+    gps : mapping of str to GpsResiduals
+        ``all`` and, where GPS was in the graph, ``withheld``; empty for a run read back from disk.
+    fixes : Gps or None
+        What of GPS became factors.
+    folder : Path or None
+    log : SensorLog or None
+    taken : Taken or None
+        What of the log the graph and the figures were made of; None for a run read back from disk.
+    truth : MapTruth or None
+        Ends of the submaps and landmarks.
+    truth_path, dead_reckoning : Trajectory or None
+        In the frame of the first base.
+    solution, graph : Solution, PoseGraph or None
+        The solver's own view; None for a run read back from disk.
+    checks : WithoutTruth or None
+        What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
+    fused : RunMap or None
+        Fused evidence grid of submaps that have grids. For a run read back from disk: ``run_maps.map_of_folder``.
+    """
+
+    name: str
+    submaps: Sequence[Submap]
+    map: GlobalMap
+    metrics: pd.DataFrame
+    report: dict[str, Any]
+    events: list[dict[str, Any]] = field(default_factory=list)
+    ledger: pd.DataFrame | None = None
+    gps: dict[str, GpsResiduals] = field(default_factory=dict)
+    fixes: Gps | None = None
+    folder: Path | None = None
+    log: SensorLog | None = None
+    taken: Taken | None = None
+    truth: MapTruth | None = None
+    truth_path: Trajectory | None = None
+    dead_reckoning: Trajectory | None = None
+    solution: Solution | None = None
+    graph: PoseGraph | None = None
+    checks: WithoutTruth | None = None
+    fused: RunMap | None = None
+
+    def metric(self, key: str) -> float:
+        """Value of one metric.
+
+        Raises
+        ------
+        KeyError
+        """
+        return metric_value(self.metrics, key)
+
+    @property
+    def verdict(self) -> list[Finding]:
+        """What the run says of itself: is it solved, honest, whole, and was everything used that was asked for."""
+        return findings_of_json(self.report.get("verdict"))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""
+        from graphslam.app.run.figures import draw_map
+
+        return draw_map(self, ax)
+
+    def __repr__(self) -> str:
+        return f"Run({self.name!r}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks)"
+
+    def _repr_html_(self) -> str:
+        where = f" in {self.folder.name}" if self.folder else ""
+        said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
+        return join([element("b", f"Run of {self.name}"), said, frame(self.metrics[["key", "value", "unit"]])])
+
+
+def metric_value(metrics: pd.DataFrame, key: str) -> float:
+    """Value of one row of a table of metrics (``key, value, …``).
+
+    Raises
+    ------
+    KeyError
+        There is no such metric.
+    """
+    row = metrics[metrics["key"] == key]
+    if row.empty:
+        raise KeyError(key)
+    return float(row["value"].iloc[0])

@@ -1,0 +1,114 @@
+"""What became of every stream of a log in a run: records offered, records used, and why the others were not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from graphslam.app.run.config import RunConfig
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Gps
+from graphslam.graph.gps import GpsConfig as GpsFactorConfig
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import GpsRecord
+
+Role = Literal["input", "gps", "imu", "unused"]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamUse:
+    """What became of one stream.
+
+    Parameters
+    ----------
+    name : str
+    role : {"input", "gps", "imu", "unused"}
+        What it was there for: ``input`` of the front end; GPS or IMU of the graph; or nothing in this run.
+    offered : int
+        Records that the log holds.
+    used : int
+        Records whose time and stream a factor spends (the ledger).
+    asked : bool
+        The configuration asks for it by a setting of its own.
+    why : str
+        Why records were not used; empty where all were.
+    """
+
+    name: str
+    role: Role
+    offered: int
+    used: int
+    asked: bool
+    why: str = ""
+
+    def in_words(self) -> str:
+        """``laser 7249 of 7249``."""
+        return f"{self.name} {self.used} of {self.offered}"
+
+    def as_row(self) -> dict[str, Any]:
+        """JSON object for ``run.json``."""
+        return {k: getattr(self, k) for k in ("name", "role", "offered", "used", "asked", "why")}
+
+
+def stream_use(
+    log: SensorLog, graph: PoseGraph, settings: RunConfig, dropped: Mapping[str, int], streams_used: frozenset[str]
+) -> list[StreamUse]:
+    """Use of every stream of a log.
+
+    Parameters
+    ----------
+    log : SensorLog
+    graph : PoseGraph
+        Finished; its ledger says what was spent.
+    settings : RunConfig
+    dropped : mapping of str to int
+        Records dropped by the front end and the graph, per ``"stream: reason"``.
+    streams_used : frozenset of str
+        Streams that the submaps say they used.
+    """
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for e in graph.ledger.entries():
+        spans.setdefault(e.stream, []).append((e.t_start, e.t_end))
+    left_out = {e["stream"]: str(e["why"]) for e in graph.events if e.get("event") == "imu-not-used"}
+    out = []
+    for name, stream in log.streams.items():
+        times = np.asarray(stream.times, dtype=np.float64)
+        lost = {k.partition(": ")[2]: n for k, n in dropped.items() if k.startswith(f"{name}: ")}
+        spent = np.zeros(len(times), dtype=np.bool_)
+        for a, b in spans.get(name, []):
+            i, j = np.searchsorted(times, a, "left"), np.searchsorted(times, b, "right")
+            spent[i:j] = True
+        used = int(spent.sum())
+        role: Role = "unused"
+        asked, why = False, ""
+        if name in streams_used:
+            role = "input"
+        elif isinstance(stream, Gps):
+            asked = settings.gps.use != "none"
+            role = "gps"
+            factors = sum(isinstance(r, GpsRecord) for r in graph.records.values())
+            used = min(used, factors)  # fixes that wait for a datum to the end are in the ledger, and in no factor
+            if not asked:
+                why = "gps.use is none"
+            elif used == 0 and spent.any():
+                why = (
+                    f"its {int(spent.sum())} fixes on the path span less than {GpsFactorConfig().baseline:g} m, on the "
+                    "ground or in the map, so that the heading of their frame stays unknown"
+                )
+            elif used < len(times) and settings.gps.use != "all":
+                why = f"gps.use is {settings.gps.use}: the others are kept back to test with"
+        elif isinstance(stream, Imu):
+            asked = settings.imu.use == name or settings.imu.use == "auto"
+            role, why = "imu", left_out.get(name, "") if asked else "imu.use is none"
+        if used < len(times) and not why:
+            reasons = [f"{n} {k}" for k, n in lost.items()]
+            outside = len(times) - used
+            if outside and role != "unused":
+                reasons.append(f"{outside} at times that no factor spends")
+            why = ", ".join(reasons) or ("nothing in this run reads it" if role == "unused" else "")
+        out.append(StreamUse(name, role, len(times), used, asked, why))
+    return out

@@ -1,0 +1,312 @@
+"""The verdict of a run: is it solved, is it honest, is it whole, and was everything used that was asked for.
+
+"Reported" means: a line here. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
+shows them. What follows from the stored figures is worked out anew wherever it is shown (:func:`stated`); what only the
+run itself saw (:func:`observed`) is read from ``run.json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from scipy import stats
+
+from graphslam.app.run.stream_use import StreamUse
+from graphslam.core.findings import Finding, Level, findings_of_json
+from graphslam.core.submap import Submap
+from graphslam.evaluate.stream_checks import Noticed
+from graphslam.evaluate.without_truth import two_sided
+
+CONFIDENCE = 0.95
+CERTAIN = 0.999
+"""A test that an honest run fails less often than once in a thousand runs is no accident."""
+IN_WORDS = {
+    "consistent": "inside them: the errors are as large as the covariances say",
+    "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
+    "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
+}
+EXACT = 1e-12
+"""χ²/dof below which all measurements are met to the last digit, as in a chain that never closes."""
+SMALL_GAP = 1e-6
+"""Of the objective: an objective above the optimum by less is at it."""
+FLAGGED = 0.05
+"""Share of the submaps of honest runs that front ends may flag by chance."""
+QUARTER = 0.25
+"""Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
+MOSTLY = 0.95
+"""Share of the records of a stream below which the verdict asks to look at what became of the others."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the figures of a finished run are read from, in memory or from its folder.
+
+    Parameters
+    ----------
+    report : mapping
+        ``run.json`` or ``merge.json``.
+    metrics : mapping of str to float
+    events : sequence of mapping
+    sessions : sequence of mapping
+        Of a merge.
+    """
+
+    report: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    events: Sequence[Mapping[str, Any]] = ()
+    sessions: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+
+    def part(self, name: str) -> Mapping[str, Any]:
+        """A mapping inside the report; empty where it is none."""
+        found = self.report.get(name)
+        return found if isinstance(found, Mapping) else {}
+
+
+def verdict(figures: Figures) -> list[Finding]:
+    """All lines of a finished run.
+
+    Lines that the run saw itself are those of ``report["verdict"]`` that do not follow from the figures.
+    """
+    return stated(figures) + [f for f in findings_of_json(figures.report.get("verdict")) if f.code not in _STATED]
+
+
+def stated(figures: Figures) -> list[Finding]:
+    """Lines that follow from the stored figures."""
+    return [
+        _state(figures),
+        _chi2(figures),
+        *_nees(figures),
+        *_tests(figures),
+        _certificate(figures),
+        *_left_out(figures),
+    ]
+
+
+_STATED = frozenset(
+    {"state", "chi2", "nees", "consistency-test", "certificate", "map-left-out", "flagged", "imu-axes"}
+    | {"imu-contradicted", "session"}
+)
+
+
+def observed(
+    streams: Sequence[StreamUse], noticed: Sequence[Noticed] = (), submaps: Sequence[Submap] = ()
+) -> list[Finding]:
+    """Lines on what became of every stream, what was noticed in it, and what the front end says.
+
+    Parameters
+    ----------
+    streams : sequence of StreamUse
+    noticed : sequence of Noticed
+        Of the raw streams; what is bad in one that was not used is only worth a look.
+    submaps : sequence of Submap
+        Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
+    """
+    counts = "; ".join(s.in_words() for s in streams)
+    out = [Finding("", "streams", f"Records used of those offered: {counts}.")] if streams else []
+    for s in streams:
+        if s.used == 0 and s.asked:
+            out.append(Finding("bad", f"{s.role}-not-used", f"{s.name} was asked for and not used: {s.why}."))
+        elif s.used == 0 and s.role == "input":
+            text = f"Nothing of {s.name} was used ({s.offered} records): {s.why}."
+            out.append(Finding("look", "stream-not-used", text))
+        elif (s.asked and s.used < QUARTER * s.offered) or (s.role == "input" and s.used < MOSTLY * s.offered):
+            out.append(Finding("look", "stream-part-used", f"Only {s.in_words()}: {s.why}."))
+    used = {s.name for s in streams if s.used}
+    for n in noticed:
+        level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
+        out.append(replace(n.finding, level=level))
+    for submap in submaps:
+        out += [f for row in submap.report.get("findings", ()) if (f := Finding.from_row(row))]
+    return out
+
+
+def class_rows(figures: Figures) -> list[dict[str, Any]]:
+    """χ² of each class of factors with its bounds: from the report, or as far as metrics of older runs hold it."""
+    found = figures.part("graph").get("classes")
+    if isinstance(found, list):
+        return [r for r in found if isinstance(r, dict)]
+    m = figures.metrics
+    out = []
+    for key, ratio in m.items():
+        if not (key.startswith("honesty_") and key.endswith("_chi2_per_dof")):
+            continue
+        stem = key.removesuffix("_chi2_per_dof")
+        dof = m.get(f"{stem}_dof", math.nan)
+        row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
+        if dof > 0:
+            row["low"], row["high"], row["verdict"] = two_sided(ratio, dof, CONFIDENCE)
+        out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
+    return out
+
+
+def whole_chi2(figures: Figures) -> tuple[float, float] | None:
+    """χ² and degrees of freedom of all classes that have any; None where that is not known."""
+    rows = [r for r in class_rows(figures) if number(r.get("dof")) and number(r.get("chi2_per_dof"))]
+    dof = sum(float(r["dof"]) for r in rows)
+    return (sum(float(r["chi2"]) for r in rows if number(r.get("chi2"))), dof) if dof > 0 else None
+
+
+def bounded(ratio: float, dof: float) -> tuple[str, Level]:
+    """A ratio with its bounds in words, and the level of its line."""
+    low, high, said = two_sided(ratio, dof, CONFIDENCE)
+    text = f"{ratio:.3g}, {CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({dof:.4g} degrees of freedom); "
+    level: Level = "good"
+    if said != "consistent":  # one honest run in forty is outside on either side: bad is what one in a thousand is not
+        level = "bad" if ratio > two_sided(ratio, dof, CERTAIN)[1] else "look"
+    return text + IN_WORDS[said], level
+
+
+def number(value: Any) -> bool:
+    """Is it a finite number?"""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _state(figures: Figures) -> Finding:
+    m = figures.metrics
+    converged = figures.report.get("converged", m.get("converged"))
+    if converged is None:
+        return Finding("bad", "state", "Whether it is solved is not known: the folder does not say.")
+    if not converged:
+        return Finding("bad", "state", "Not solved: the graph is not at its optimum.")
+    objective, gap = m.get("objective", m.get("join_chi2")), m.get("gap")
+    value = "" if objective is None else f", objective {objective:.6g} (Σ rᵀ P⁻¹ r)"
+    if gap is None:
+        text = f"Solved: at the optimum by the solver's own test{value}; no gap to a batch solution was measured."
+        return Finding("good", "state", text)
+    scale = max(abs(objective or 0.0), 1.0)
+    small = gap <= SMALL_GAP * scale
+    text = "no higher than" if small else f"{gap:.3g} above"
+    return Finding(
+        "good" if small else "look",
+        "state",
+        f"Solved: at the optimum{value}, {text} what a batch solution reaches from there.",
+    )
+
+
+def _chi2(figures: Figures) -> Finding:
+    found = whole_chi2(figures)
+    if found is None:
+        text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
+        return Finding("", "chi2", text)
+    chi2, dof = found
+    if chi2 < EXACT * dof:
+        return Finding("", "chi2", "χ² of the whole graph is 0: nothing in it is redundant that could contradict.")
+    text, level = bounded(chi2 / dof, dof)
+    return Finding(level, "chi2", f"χ²/dof of the whole graph: {text}.")
+
+
+def _nees(figures: Figures) -> list[Finding]:
+    m = dict(figures.metrics)
+    judged = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
+    bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
+    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
+        m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
+        judged += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
+    out: list[Finding] = []
+    for key, gauge in judged:
+        if number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0:
+            text, level = bounded(m[f"{key}_per_dof"], m[f"{key}_dof"])
+            line = f"NEES/dof against the truth ({gauge}): {text}. One run: a sample, not a proof."
+            out.append(Finding(level, "nees", line))
+    none = "No truth was known, or none to compare with: nothing is said of the true error."
+    return out or [Finding("", "nees", none)]
+
+
+def _tests(figures: Figures) -> list[Finding]:
+    """Tests without truth that an honest run hardly ever fails; those that it passes are in the metrics."""
+    out: list[Finding] = []
+
+    def judge(what: str, value: Any, dof: Any, cause: str) -> None:
+        if not (number(value) and number(dof) and dof > 0):
+            return
+        high = two_sided(float(value), float(dof), CERTAIN)[1]
+        if value > high:
+            limit = f"an honest run exceeds {high:.3g} less than once in a thousand runs"
+            out.append(Finding("bad", "consistency-test", f"{what} is {value:.3g}, and {limit}: {cause}"))
+
+    for row in class_rows(figures):
+        cause = "these measurements contradict the others, or state too little noise."
+        judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), row.get("dof"), cause)
+        if row.get("class") == "gps" and number(row.get("chi2_per_dof")) and number(row.get("dof")):
+            out += _too_small(float(row["chi2_per_dof"]), float(row["dof"]))
+    m = figures.metrics
+    cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
+    judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
+    alike, white = m.get("gps_nis_joint_autocorrelation"), m.get("gps_nis_joint_white")
+    if alike is not None and white is not None and abs(alike) > white * stats.norm.isf(0.5e-3) / stats.norm.isf(0.025):
+        text = f"Errors of withheld fixes are alike from one to the next (correlation {alike:.2f}; independent ones "
+        text += f"stay within ± {white:.2f} in 95 % of the runs): {_LASTS}"
+        out.append(Finding("look", "gps-correlated", text))
+    cause = (
+        "submaps that saw the same landmarks disagree by more than they say; noise, mounting or association is wrong."
+    )
+    judge("Disagreement of loops over its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
+    return out
+
+
+_LASTS = (
+    "errors of the receiver last for longer than the time between fixes, and every fix counts as new. State them with "
+    "gps.bias_sigma, or a larger gps.sigma."
+)
+
+
+def _too_small(ratio: float, dof: float) -> list[Finding]:
+    """Fixes that lie nearer to the map than they say."""
+    low = two_sided(ratio, dof, CERTAIN)[0] if dof > 0 else 0.0
+    if ratio >= low:
+        return []
+    text = (
+        f"Fixes lie nearer to the map than they say (χ²/dof {ratio:.3g}, an honest run stays above {low:.3g} in 999 of "
+    )
+    text += f"1000 runs). Either their σ is stated too large, which costs accuracy only; or {_LASTS}"
+    return [Finding("look", "gps-correlated", text)]
+
+
+def _certificate(figures: Figures) -> Finding:
+    found = figures.report.get("certificate")
+    if found is None:
+        text = "Whether the optimum is the global one is not known: no certificate was asked for."
+        return Finding("", "certificate", text)
+    text = str(found.get("verdict", found) if isinstance(found, Mapping) else found)
+    return Finding("good" if text.startswith("certified") else "look", "certificate", f"Global optimum: {text}")
+
+
+def _flagged(figures: Figures) -> list[Finding]:
+    """Submaps that the front end flags: honest ones are flagged now and then, by chance."""
+    counts = figures.part("flagged_submaps")
+    flagged, n = counts.get("any", 0), figures.metrics.get("submaps", 0.0)
+    if not (number(flagged) and flagged):
+        return []
+    why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and number(v))
+    text = f"{flagged:g} of {n:g} submaps were flagged by the front end ({why})"
+    usual = stats.binom.ppf(CERTAIN, int(n), FLAGGED) if n else 0.0
+    if flagged <= usual:
+        return [Finding("", "flagged", f"{text}: not more than chance flags.")]
+    return [Finding("look", "flagged", f"{text}; chance flags more than {usual:g} in one honest run of a thousand.")]
+
+
+def _left_out(figures: Figures) -> list[Finding]:
+    out: list[Finding] = []
+    if figures.report.get("map_left_out"):
+        out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
+    out += _flagged(figures)
+    for e in figures.events:
+        if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
+            out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))
+        if e.get("event") == "imu-axes" and e.get("verdict") == "not checked":
+            why = f"could not be checked ({e.get('why')})"
+            text = f"IMU {e.get('stream')}: whether its axes are those of its mounting {why}."
+            out.append(Finding("", "imu-axes", text))
+        if e.get("event") == "imu-contradicted":
+            text = f"IMU {e.get('stream', '')}".strip()
+            line = f"{text} and submaps contradict each other: one of them states too little noise."
+            out.append(Finding("bad", "imu-contradicted", line))
+    for s in figures.sessions:
+        common, rejected = s.get("common_landmarks"), s.get("rejected")
+        if isinstance(common, int) and isinstance(rejected, int) and rejected > common:
+            text = f"{common} common landmarks agree, {rejected} do not: it may not be the same place."
+            out.append(Finding("bad", "session", f"Session {s.get('name')}: {text}"))
+    return out

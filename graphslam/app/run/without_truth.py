@@ -1,0 +1,122 @@
+"""The checks of a run that need no truth: χ² per class, withheld GPS and its prediction, loops against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from graphslam.app.run.config import RunConfig
+from graphslam.app.run.gps_use import split
+from graphslam.app.run.metrics import Metrics
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.markup import frame
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
+from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
+from graphslam.evaluate.loop_consistency import LoopConsistency, find_loops, loop_consistency
+from graphslam.evaluate.without_truth import ClassConsistency, class_consistency
+from graphslam.graph.pose_graph import PoseGraph
+
+
+@dataclass(frozen=True)
+class WithoutTruth:
+    """What a run says of its own honesty.
+
+    Parameters
+    ----------
+    classes : dict of str to ClassConsistency
+        χ² and effective dof of every class of factors.
+    gps : GpsInnovations or None
+        Withheld fixes; None where none were withheld or the graph has no GPS.
+    loops : LoopConsistency or None
+        None where no two submaps share two landmarks.
+    """
+
+    classes: dict[str, ClassConsistency]
+    gps: GpsInnovations | None
+    loops: LoopConsistency | None
+
+    def table(self) -> pd.DataFrame:
+        """One row a test: value (honest: 1), two-sided bounds, verdict, and the dof behind the bounds."""
+        columns = ["test", "value", "low", "high", "verdict", "dof"]
+        rows = []
+        for c in self.classes.values():
+            r = c.as_row()
+            rows.append((f"chi2 of {c.name}", r["chi2_per_dof"], r["low"], r["high"], r["verdict"], r["dof"]))
+        if self.gps is not None:
+            for r in self.gps.tests().to_dict("records"):
+                rows.append((f"withheld GPS, {r['test']}", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
+        if self.loops is not None:
+            r = self.loops.test()
+            rows.append(("loops", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
+        return pd.DataFrame(rows, columns=columns)
+
+    def _repr_html_(self) -> str:
+        return frame(self.table())
+
+
+def check_without_truth(
+    out: Metrics,
+    graph: PoseGraph,
+    submaps: Sequence[Submap],
+    poses: Array,
+    gps: Gps | None,
+    settings: RunConfig,
+) -> WithoutTruth:
+    """Run the checks and add their figures to the metrics.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        At its optimum.
+    submaps : sequence of Submap
+        Identified.
+    poses : (m + 1, 3|7)
+        Solved bases of the submaps and end of the last.
+    gps : Gps or None
+        The log's fixes, used and withheld.
+    """
+    classes = class_consistency(graph)
+    for name, c in classes.items():
+        row = c.as_row()
+        if not np.isfinite(c.ratio):
+            continue
+        out.add(f"honesty_{name}_chi2_per_dof", c.ratio, "", "one")
+        out.add(f"honesty_{name}_dof", c.dof)
+        out.add(f"honesty_{name}_low", row["low"])
+        out.add(f"honesty_{name}_high", row["high"])
+        if c.least_weight < 1.0:
+            out.add(f"honesty_{name}_mean_weight", c.mean_weight)
+    innovations = _innovations(graph, gps, settings) if graph.dim == 2 else None
+    if innovations is not None:
+        for row in innovations.tests().to_dict("records"):
+            for key in ("value", "low", "high", "dof", "autocorrelation", "white", "inside"):
+                direction = "one" if key == "value" else "none"
+                out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)
+    loops = None
+    if graph.dim == 3:  # neither landmarks to compare loops by, nor a prediction of fixes
+        return WithoutTruth(classes, None, None)
+    try:
+        found = find_loops(submaps, poses, covariance_scale=settings.backend.covariance_scale)
+        loops = loop_consistency(found)
+    except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
+        return WithoutTruth(classes, innovations, None)
+    test = loops.test()
+    for key in ("value", "low", "high", "dof", "loops", "inside", "shape"):
+        out.add(f"loops_{key}", test[key], "", "one" if key in ("value", "shape") else "none")
+    return WithoutTruth(classes, innovations, loops)
+
+
+def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsInnovations | None:
+    if gps is None or graph.values.datum is None:
+        return None
+    c = settings.gps
+    withheld = split(gps, c)[1]
+    try:
+        return gps_innovations(graph, withheld, sigma=c.sigma, bias_sigma=c.bias_sigma, segment_gap=c.segment_gap)
+    except DataError:  # no withheld fix on the path: the counts of the GPS residuals say so
+        return None

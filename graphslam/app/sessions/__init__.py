@@ -1,0 +1,1 @@
+"""Several sessions in one map: continue, merge, localise."""

@@ -1,0 +1,204 @@
+"""A session of dense submaps tied to one that is in the graph: by places that look alike and agree, or by GPS."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from graphslam.app.sessions.dense import DenseSession, put
+from graphslam.core.errors import DataError, SolverError
+from graphslam.core.poses import group_of
+from graphslam.graph.noise import Robust
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
+from graphslam.loops.candidates import CandidateConfig, proximity_candidates
+from graphslam.loops.graph_relative import GraphRelative
+from graphslam.loops.measure import Loop
+from graphslam.loops.places import Ints
+from graphslam.loops.session_ties import TieConfig, Ties, TwoSessions, start_of
+from graphslam.solve.registry import Solver
+
+logger = logging.getLogger(__name__)
+SESSION = "session"
+"""Class of the factors between sessions."""
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A session that was tied to another one in a graph.
+
+    Parameters
+    ----------
+    first_node : int
+    known : DenseSession
+        What it was tied to.
+    ties : Ties or None
+        By appearance; None where GPS said where the session lies.
+    used : list of Loop
+        Ties in the graph at the end, those by proximity included; nodes of the graph.
+    dropped : int
+        Ties that the solved graph contradicted.
+    """
+
+    first_node: int
+    known: DenseSession
+    ties: Ties | None
+    used: list[Loop]
+    dropped: int
+
+
+def attach(
+    graph: PoseGraph,
+    solver: Solver,
+    known: DenseSession,
+    known_node: int,
+    new: DenseSession,
+    *,
+    config: TieConfig | None = None,
+    found: tuple[TwoSessions, Ties] | None = None,
+    use_gps: bool = True,
+    progress: bool = False,
+) -> Attached:
+    """Tie a session to one that is in the graph, and solve.
+
+    First by places that look alike and agree; then, when it is known where it lies, by places that are near each other,
+    each of which the graph has to expect.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    solver : Solver
+        Of the graph, which is at its optimum.
+    known : DenseSession
+        One that is in the graph.
+    known_node : int
+        Node of its first base.
+    new : DenseSession
+    config : TieConfig, optional
+    found : (TwoSessions, Ties), optional
+        What was found already.
+    use_gps : bool
+        With the new session's fixes, if it has any.
+    progress : bool
+
+    Raises
+    ------
+    DataError
+        The two do not overlap as far as can be seen. The graph is as it was.
+    SolverError
+        The graph contradicts what ties them; it holds the session all the same, and is of no use any more.
+    """
+    c = TieConfig() if config is None else config
+    if found is None:
+        two = TwoSessions(known.map, new.map)
+        found = two, two.find(c, progress=progress)
+    two, ties = found
+    if ties.why:
+        raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
+    start = start_of(ties.chosen, graph.values.poses[known_node:], new.chain)
+    node = put(graph, new, start, use_gps=use_gps)
+    apart = two.thinned(ties.chosen, CandidateConfig().stretch)
+    here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
+    factors = {_add(graph, x, known, new): x for x in here}
+    solver.solve_to_optimum()
+    dropped = _winnow(graph, solver, factors)
+    if 2 * len(factors) < len(here):
+        raise SolverError(
+            f"{new.name}: of {len(here)} ties to {known.name} that agree with each other the graph bears "
+            f"{len(factors)}, wanted half of them"
+        )
+    for x in _near(graph, two, known_node, node, here, progress):
+        factors[_add(graph, x, known, new)] = x
+    solver.solve_to_optimum()
+    dropped += _winnow(graph, solver, factors)
+    logger.info("%s hangs on %s by %d ties", new.name, known.name, len(factors))
+    return Attached(node, known, ties, list(factors.values()), dropped)
+
+
+def attach_by_gps(
+    graph: PoseGraph,
+    solver: Solver,
+    known: DenseSession,
+    known_node: int,
+    new: DenseSession,
+    *,
+    places: bool = True,
+    progress: bool = False,
+) -> Attached:
+    """Tie a session to one that is in the graph by the fixes that both have, and solve.
+
+    Parameters
+    ----------
+    places : bool
+        Then also by places that are near each other.
+
+    Raises
+    ------
+    DataError
+        One of them has no GPS in its graph.
+    """
+    ends = []
+    for s in (known, new):
+        if s.fixes is None or s.T_gps_base is None:
+            raise DataError("no GPS in the graph of this run", where=s.name, wanted="gps.use other than none")
+        ends.append(s.T_gps_base)
+    g = group_of(known.map.increments)
+    T_known_new = g.between(ends[0], ends[1])
+    node = put(graph, new, g.compose(graph.values.poses[known_node], T_known_new))
+    solver.solve_to_optimum()
+    factors: dict[int, Loop] = {}
+    dropped = 0
+    if places:
+        two = TwoSessions(known.map, new.map)
+        factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], progress)}
+        solver.solve_to_optimum()
+        dropped = _winnow(graph, solver, factors)
+    logger.info("%s hangs on %s by GPS and %d ties", new.name, known.name, len(factors))
+    return Attached(node, known, None, list(factors.values()), dropped)
+
+
+def _add(graph: PoseGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
+    return graph.add_between(
+        x.i, x.j, x.T_ij, x.covariance, streams=[f"{known.name}/scan", f"{new.name}/scan"], evidence="shared-scan",
+        robust=Robust("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
+    )  # fmt: skip
+
+
+def _winnow(graph: PoseGraph, solver: Solver, factors: dict[int, Loop]) -> int:
+    """Take out, worst first, ties that the solved graph contradicts; how many."""
+    g = graph.values.group
+    limit, taken = float(stats.chi2.ppf(0.9999, g.dof)), 0
+    while factors:
+        chi2 = {}
+        for fid in factors:
+            r = graph.records[fid]
+            assert isinstance(r, BetweenRecord)
+            e = g.log(g.between(r.T_ij, g.between(graph.values.poses[r.i], graph.values.poses[r.j])))
+            chi2[fid] = float(np.sum((r.whitener @ e) ** 2))
+        worst = max(chi2, key=lambda k: chi2[k])
+        if chi2[worst] <= limit:
+            break
+        graph.remove(worst, reason=f"contradicted by the graph: χ² {chi2[worst]:.1f} > {limit:.1f}")
+        del factors[worst]
+        taken += 1
+        solver.solve_to_optimum()
+    return taken
+
+
+def _near(
+    graph: PoseGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
+) -> list[Loop]:
+    """More ties, where places of the two sessions are near each other by now; nodes of the graph."""
+    shift = np.where(np.arange(len(two.places)) < len(two.known.places), known_node, node - two.offset)
+    places = replace(two.places, node=(two.places.node + shift).astype(np.int64))
+    row: dict[int, int] = {int(n): k for k, n in enumerate(places.node)}
+    before = [(row[x.i], row[x.j]) for x in tied if x.i in row and x.j in row]
+    config = CandidateConfig(least_gain=0.0, keep=40)
+    found = proximity_candidates(places, GraphRelative(graph), config, exclude=two.within, tried=before)
+    measured = [x for x in two.measurer.measure(found, progress=progress) if not x.why]
+    nodes: Ints = places.node
+    return [replace(x, i=int(nodes[x.i]), j=int(nodes[x.j])) for x in measured]

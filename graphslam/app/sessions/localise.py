@@ -1,0 +1,212 @@
+"""Where a submap, or a stretch of a log, lies in a saved map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.folders.generations import outputs
+from graphslam.app.run.files import read_options
+from graphslam.app.run.front_ends import make_front_end
+from graphslam.app.run.outputs import open_run
+from graphslam.app.run.pipeline import load_log_source
+from graphslam.app.run.run import Run
+from graphslam.app.sessions.dense import DenseSession, back_end_config, is_dense, put, session_of, with_grids
+from graphslam.app.sessions.dense_ties import attach
+from graphslam.app.threads import one_blas_thread
+from graphslam.core.errors import DataError, MissingDataError, SolverError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.measure import Loop
+from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions
+from graphslam.solve.registry import make_solver
+
+
+@dataclass(frozen=True, slots=True)
+class Localisation:
+    """Where something lies in a saved map, or why that is not known.
+
+    Parameters
+    ----------
+    why : str
+        Why nothing is known; empty if it was found.
+    ties : Ties
+        Every place that was tried, and what came of it.
+    used : list of Loop
+        Ties that the pose rests on.
+    T_map_base, covariance : (7,) or (3,), (d, d); or None
+        The first base of what was looked for, in the frame of the map's first base; right tangent. What the map itself
+        does not know of that place is in it.
+    T_map_end, end_covariance : same
+        Where the body was at the end of it.
+    """
+
+    why: str
+    ties: Ties
+    used: list[Loop]
+    T_map_base: Array | None = None
+    covariance: Array | None = None
+    T_map_end: Array | None = None
+    end_covariance: Array | None = None
+
+    @property
+    def found(self) -> bool:
+        """Whether the pose is known."""
+        return not self.why
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row a candidate, with the reason for or against it."""
+        return self.ties.rows()
+
+    def __repr__(self) -> str:
+        if self.T_map_base is None or self.covariance is None:
+            return f"Localisation(not found: {self.why})"
+        sigma = np.sqrt(np.diag(self.covariance))
+        at = self.T_map_base[: 2 if len(self.T_map_base) == 3 else 3]
+        return f"Localisation(base at {np.round(at, 2)}, σ {np.round(sigma, 3)}, {len(self.used)} ties)"
+
+
+def localise(
+    run: Run | str | Path,
+    source: Submap | Sequence[Submap] | SensorLog,
+    *,
+    config: TieConfig | None = None,
+    solver: str = "batch",
+    progress: bool = False,
+) -> Localisation:
+    """Find a submap, a chain of them, or a stretch of a log in the map of a finished run.
+
+    Nothing is assumed of where it may lie. Places of the map that look like places of it are registered; the pose is
+    believed if enough of them agree with each other, and then solved for in the graph of the run.
+
+    Parameters
+    ----------
+    run : Run or run folder
+        Of dense submaps.
+    source : Submap, sequence of Submap, or SensorLog
+        A log goes through the front end of the run, with its options: slice it to the stretch that is to be found.
+    config : TieConfig, optional
+    solver : str
+    progress : bool
+        Show progress bars on stderr.
+
+    Raises
+    ------
+    DataError
+        A run or submaps that cannot be used. That a place is not found is an answer, not an error.
+    """
+    opened = run if isinstance(run, Run) else open_run(run)
+    if not is_dense(opened):
+        raise DataError("only maps of dense submaps are localised in", where=opened.name, wanted="submaps with grids")
+    with one_blas_thread():
+        if isinstance(source, SensorLog):
+            submaps = window_submaps(opened, source)
+        else:
+            submaps = [source] if isinstance(source, Submap) else list(source)
+        return _localise(opened, submaps, config or TieConfig(), solver, progress)
+
+
+def source_of(
+    source: str | Path, keys: Sequence[int] = (), begin: float | None = None, end: float | None = None
+) -> Sequence[Submap] | SensorLog:
+    """What is to be found: submaps of a run folder, or a stretch of a log.
+
+    Parameters
+    ----------
+    source : path or card name
+    keys : sequence of int
+        Of a run folder, only these submaps, which must follow one another.
+    begin, end : float, optional
+        Of a log [s].
+
+    Raises
+    ------
+    DataError
+        Keys that are not there, or not in a row; a stretch without records.
+    """
+    path = Path(source)
+    if (outputs(path) / "run.json").is_file():
+        run = open_run(path)
+        known = [s.key for s in run.submaps]
+        rows = [known.index(k) for k in keys if k in known]
+        if len(rows) != len(keys) or any(b != a + 1 for a, b in pairwise(rows)):
+            raise DataError(
+                "submaps do not follow one another in this run", where=str(path), got=list(keys), wanted=known
+            )
+        submaps = with_grids(run)
+        return submaps if not rows else [submaps[k] for k in rows]
+    log = load_log_source(source)
+    a, b = log.interval
+    part = log.slice(a if begin is None else begin, b if end is None else end)
+    if not any(len(s.times) for s in part.streams.values()):
+        raise DataError("no records in this stretch", where=log.name, got=(begin, end), wanted=log.interval)
+    return part
+
+
+def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
+    """Submaps that the front end of a run makes of a log, with the options of the run.
+
+    Raises
+    ------
+    MissingDataError
+        The log gives none.
+    """
+    folder = None if run.folder is None else Path(run.folder) / "config.toml"
+    if folder is None or not folder.is_file():
+        raise DataError("a run without a folder does not say its front end's options", where=run.name)
+    options = read_options(folder.parent)
+    front: Any = make_front_end(str(run.report["frontend"]), options.get("frontend", {}))
+    seed = SeedTree(int(run.report["seed"])).child("localise")
+    submaps = list(front.submaps(log, seed=seed, after=None, drops=DropCounter()))
+    if not submaps:
+        raise MissingDataError("the log gave no submap", where=log.name)
+    return submaps
+
+
+def _localise(run: Run, submaps: list[Submap], config: TieConfig, solver_name: str, progress: bool) -> Localisation:
+    known = session_of(run, "map")
+    new = _query(run, known, submaps)
+    two = TwoSessions(known.map, new.map)
+    ties = two.find(config, progress=progress)
+    if ties.why:
+        return Localisation(ties.why, ties, [])
+    graph = PoseGraph(known.submaps[0].dim)
+    solver = make_solver(solver_name, graph)
+    put(graph, known)
+    solver.solve_to_optimum()
+    try:
+        at = attach(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
+    except SolverError as error:
+        return Localisation(str(error), ties, [])
+    end = graph.submaps[-1].exit_node
+    P = graph.covariance()
+    poses = graph.values.poses
+    return Localisation(
+        "", ties, at.used, poses[at.first_node].copy(), P.marginal(f"x{at.first_node}"),
+        poses[end].copy(), P.marginal(f"x{end}"),
+    )  # fmt: skip
+
+
+def _query(run: Run, known: DenseSession, submaps: list[Submap]) -> DenseSession:
+    """What is looked for, as a session of the run's graph: keys and clock go on after the map's."""
+    config = back_end_config(run)
+    last = known.submaps[-1]
+    shift = max(0.0, last.interval[1] + 1000.0 - submaps[0].interval[0]) if submaps else 0.0
+    out = []
+    for k, s in enumerate(submaps):
+        a, b = s.interval
+        path = s.trajectory
+        moved = None if path is None else replace(path, times=path.times + shift)
+        uses = frozenset(f"here/{u}" for u in s.uses)
+        out.append(
+            replace(s, key=last.key + 1 + k, interval=(a + shift, b + shift), trajectory=moved, matches=(), uses=uses)
+        )
+    return DenseSession("here", out, config, SessionMap(out, config.node_spacing), [], shift)

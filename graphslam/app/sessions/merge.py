@@ -1,0 +1,331 @@
+"""Several runs, of several robots or days, merged into one map by the landmarks they share."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.app.run.outputs import open_run
+from graphslam.app.run.run import GlobalMap, Run, metric_value
+from graphslam.app.sessions.dense import is_dense
+from graphslam.app.sessions.merge_align import By, align_runs, of_session
+from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
+from graphslam.app.sessions.merge_metrics import merge_metrics
+from graphslam.app.threads import one_blas_thread
+from graphslam.association.identity import doubtful_identities
+from graphslam.association.merging import mahalanobis_merges
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.core.markup import element, frame, join
+from graphslam.evaluate.gauge import gauge_directions, inner_covariance
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.join.submap_blocks import scale_covariances
+from graphslam.loops.sessions import Alignment
+from graphslam.solve.registry import make_solver
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+Ints = npt.NDArray[np.int64]
+IDENTITY_GATE = 25.0
+MERGE_GATE = 11.8
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One run inside a merged map.
+
+    Parameters
+    ----------
+    name : str
+        Unique among the sessions.
+    run : Run
+    keys : tuple of int
+        Keys of its submaps in the common graph.
+    first_node : int
+        Node of its first base.
+    alignment : Alignment or None
+        Start value from the landmarks; None for the session whose first base is fixed.
+    map : GlobalMap
+        Its path in the common frame, with all landmarks of the merged map.
+    """
+
+    name: str
+    run: Run
+    keys: tuple[int, ...]
+    first_node: int
+    alignment: Alignment | None
+    map: GlobalMap
+
+
+@dataclass(frozen=True)
+class MergedMap:
+    """Result of :func:`graphslam.merge`: everything in the frame of the first run's first base.
+
+    Parameters
+    ----------
+    sessions : list of Session
+    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
+    landmark_sessions : (n,) int64
+        How many sessions saw it.
+    solution : Solution
+        One least-squares problem over all chains.
+    graph : PoseGraph
+    metrics : DataFrame
+    report : dict
+    """
+
+    sessions: list[Session]
+    landmark_ids: Ints
+    landmarks: Array
+    landmark_covariances: Array
+    landmark_sessions: Ints
+    solution: Solution
+    graph: PoseGraph
+    metrics: pd.DataFrame
+    report: dict[str, Any] = field(default_factory=dict)
+
+    def metric(self, key: str) -> float:
+        """Value of one metric; KeyError if there is none."""
+        return metric_value(self.metrics, key)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Landmarks and the path of every session; the ellipses say how well the *shape* of the map is known."""
+        from graphslam.plots.merged import plot_merged
+
+        columns = self.solution.covariance.layout.columns_of([f"l{i}" for i in self.landmark_ids.tolist()])
+        centred = self.landmarks - self.landmarks.mean(axis=0)
+        P = inner_covariance(self.solution.covariance.columns(columns), gauge_directions(np.zeros((0, 3)), centred))
+        k = 2 * np.arange(len(centred))[:, None] + np.arange(2)
+        blocks = P[k[:, :, None], k[:, None, :]] + 1e-12 * np.eye(2)
+        paths = {s.name: s.map.trajectory for s in self.sessions}
+        return plot_merged(ax, paths, self.landmarks, blocks, self.landmark_sessions)
+
+    def __repr__(self) -> str:
+        shared = int(np.sum(self.landmark_sessions > 1))
+        return f"MergedMap({len(self.sessions)} sessions, {len(self.landmarks)} landmarks, {shared} of them shared)"
+
+    def _repr_html_(self) -> str:
+        return join([element("b", repr(self)), frame(self.metrics[["key", "value", "unit"]])])
+
+
+def merge(
+    runs: Sequence[Run | str | Path],
+    *,
+    by: By = "auto",
+    solver: str = "batch",
+    identity_gate: float = IDENTITY_GATE,
+    tolerance: float = 0.5,
+    out: str | Path | None = None,
+    anew: bool = False,
+) -> MergedMap | MergedSubmaps:
+    """Merge runs into one map: align them by common landmarks, then solve all their submaps together.
+
+    The first base of the first run is fixed, the first bases of the others are free. Every submap of every run is one
+    factor with the covariance that it had in its own run.
+
+    Parameters
+    ----------
+    runs : sequence of Run or run folder
+        At least two. A run joins when it shares landmarks with those that are in already, most shared first.
+    by : {"auto", "identity", "constellation", "places", "gps"}
+        Landmarks are the same by their identities, or by the pattern they form. ``auto``: by identity where every run
+        took the identities of its log, else by constellation. Dense submaps are tied by ``places`` or by ``gps``
+        (:func:`graphslam.app.sessions.merge_dense.merge_dense`).
+    solver : str
+        Registered solver.
+    identity_gate : float
+        At the end, sightings that contradict the map by this χ² (2 dof) are split off; 0 = never.
+    tolerance : float
+        Landmarks of two maps within this distance after alignment agree [m].
+    out : path, optional
+        Folder for the merged map.
+    anew : bool
+        ``out`` may hold a merged map already: then this is its new state.
+
+    Raises
+    ------
+    ConfigError
+        Fewer than two runs, or an unknown option.
+    RunFolderError
+        ``out`` holds something already, or is being written by another process.
+    DataError
+        Runs that share fewer than two landmarks, or whose landmarks do not say how they lie; names the run.
+    """
+    opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
+    if len(opened) < 2:
+        raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
+    if out is None:
+        return _merged(opened, by, solver, identity_gate, tolerance)
+    from graphslam.app.sessions.merge_outputs import merged_folder, write_merged
+
+    with merged_folder(out, anew=anew) as folder:
+        merged = _merged(opened, by, solver, identity_gate, tolerance)
+        write_merged(folder, merged)
+    return merged
+
+
+def _merged(opened: list[Run], by: By, solver: str, gate: float, tolerance: float) -> MergedMap | MergedSubmaps:
+    with one_blas_thread():
+        if all(is_dense(r) for r in opened):
+            return merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
+        if by not in ("auto", "identity", "constellation"):
+            raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
+        if by == "auto":
+            by = "identity" if all(r.report.get("identities") == "truth" for r in opened) else "constellation"
+        return _merge(opened, by, solver, gate, tolerance)
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """A name a run, fit for a file, each once."""
+    out: list[str] = []
+    for r in runs:
+        stem = re.sub(r"[^A-Za-z0-9_.-]+", "-", r.name).strip("-.") or "run"
+        name, k = stem, 2
+        while name in out:
+            name, k = f"{stem}-{k}", k + 1
+        out.append(name)
+    return out
+
+
+def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: float) -> MergedMap:
+    start = time.perf_counter()
+    names = _names(runs)
+    graph = PoseGraph()
+    order, alignments, renamed = align_runs(runs, names, by, tolerance)
+    keys: dict[int, tuple[int, ...]] = {}
+    first: dict[int, int] = {}
+    next_key = 0
+    for r in order:
+        first[r] = 0
+        alignment = alignments[r]
+        if alignment is not None:
+            first[r] = graph.start_session(alignment.T_reference_map)
+        scale = float(runs[r].report.get("covariance_scale", 1.0))
+        submaps = list(runs[r].submaps)
+        for s in submaps if scale == 1.0 else scale_covariances(submaps, scale):
+            graph.add_submap(of_session(s, next_key, names[r], renamed[r]))
+            keys[r] = (*keys.get(r, ()), next_key)
+            next_key += 1
+    solver = make_solver(solver_name, graph)
+    solver.solve_to_optimum()
+    fused = 0
+    if by == "constellation":
+        while pairs := mahalanobis_merges(graph, MERGE_GATE, distance=tolerance):
+            for kept, dropped in pairs:
+                graph.merge_landmarks(kept, dropped)
+            fused += len(pairs)
+            solver.solve_to_optimum()
+    split = 0
+    while gate > 0 and split < 10 * next_key and (doubts := doubtful_identities(graph, gate)):
+        graph.split_landmark(doubts[0].factor_id, doubts[0].entry)
+        solver.solve_to_optimum()
+        split += 1
+    solution = solver.solution()
+    sessions = _sessions(runs, names, keys, first, alignments, graph, solution)
+    hits, seen_by = _sightings(sessions, graph, solution)
+    confirmed = max(_confirmed(r) for r in runs)
+    keep: npt.NDArray[np.bool_] = np.asarray(hits >= confirmed)
+    P = solution.landmark_covariances()
+    sessions = [replace(s, map=_with_landmarks(s.map, solution, P, hits, keep)) for s in sessions]
+    report = {
+        "format": "graphslam.merge/1",
+        "by": by,
+        "solver": solver_name,
+        "sessions": [
+            {
+                "name": s.name,
+                "source": s.run.name,
+                "submaps": len(s.keys),
+                "T_world_first_base": solution.poses[s.first_node].tolist(),
+                "common_landmarks": None if s.alignment is None else len(s.alignment.pairs),
+                "rejected": None if s.alignment is None else s.alignment.rejected,
+                "runner_up": None if s.alignment is None else s.alignment.runner_up,
+                "alignment_rms": None if s.alignment is None else s.alignment.rms,
+            }
+            for s in sessions
+        ],
+        "landmarks_fused": fused,
+        "sightings_split": split,
+        "seconds": time.perf_counter() - start,
+    }
+    metrics = merge_metrics(sessions, solution, keep, seen_by, split, identities=by == "identity")
+    return MergedMap(
+        sessions=sessions,
+        landmark_ids=solution.landmark_ids[keep],
+        landmarks=solution.landmarks[keep],
+        landmark_covariances=P[keep],
+        landmark_sessions=seen_by[keep],
+        solution=solution,
+        graph=graph,
+        metrics=metrics,
+        report=report,
+    )
+
+
+def _confirmed(run: Run) -> int:
+    """Sightings that a landmark of the run's own map had at least."""
+    return int(run.map.landmark_hits.min(initial=1)) if len(run.map.landmark_hits) else 1
+
+
+def _sessions(
+    runs: list[Run],
+    names: list[str],
+    keys: dict[int, tuple[int, ...]],
+    first: dict[int, int],
+    alignments: dict[int, Alignment | None],
+    graph: PoseGraph,
+    solution: Solution,
+) -> list[Session]:
+    node_covariances = solution.node_covariances()
+    none = np.zeros(0, dtype=np.int64)
+    out = []
+    for r, run in enumerate(runs):
+        nodes = np.arange(first[r], first[r] + len(keys[r]) + 1)
+        m = GlobalMap(
+            trajectory=solution.trajectory(keys=set(keys[r])),
+            node_times=run.map.node_times,
+            node_poses=solution.poses[nodes],
+            node_covariances=node_covariances[nodes],
+            landmark_ids=none,
+            landmarks=np.zeros((0, 2)),
+            landmark_covariances=np.zeros((0, 2, 2)),
+            landmark_hits=none,
+        )
+        out.append(Session(names[r], run, keys[r], first[r], alignments[r], m))
+    return out
+
+
+def _sightings(sessions: list[Session], graph: PoseGraph, solution: Solution) -> tuple[Ints, Ints]:
+    """Sightings, and number of sessions, of every landmark of the solution."""
+    row = {int(i): k for k, i in enumerate(solution.landmark_ids)}
+    hits = np.zeros(len(row), dtype=np.int64)
+    seen = np.zeros((len(sessions), len(row)), dtype=np.bool_)
+    for n, session in enumerate(sessions):
+        for key, submap in zip(session.keys, session.run.submaps):
+            if submap.landmarks is None:
+                continue
+            rows = np.array([row[int(i)] for i in graph.landmark_ids_of(key)], dtype=np.intp)
+            sightings = submap.landmarks.sightings
+            counts = np.ones(len(rows)) if sightings is None else np.bincount(sightings[:, 1], minlength=len(rows))
+            np.add.at(hits, rows, counts.astype(np.int64))
+            seen[n, rows] = True
+    return hits, seen.sum(axis=0).astype(np.int64)
+
+
+def _with_landmarks(m: GlobalMap, solution: Solution, P: Array, hits: Ints, keep: npt.NDArray[np.bool_]) -> GlobalMap:
+    return replace(
+        m,
+        landmark_ids=solution.landmark_ids[keep],
+        landmarks=solution.landmarks[keep],
+        landmark_covariances=P[keep],
+        landmark_hits=hits[keep],
+    )

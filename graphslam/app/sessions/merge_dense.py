@@ -1,0 +1,280 @@
+"""Runs of dense submaps merged into one graph: tied by GPS, by places that both have seen, or by both."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from graphslam.app.run.metrics import Metrics
+from graphslam.app.run.plan_view import plan_path
+from graphslam.app.run.run import Run, metric_value
+from graphslam.app.sessions.dense import DenseSession, put, session_of
+from graphslam.app.sessions.dense_ties import SESSION, Attached, attach, attach_by_gps
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.trajectory_error import ate
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.session_ties import TieConfig
+from graphslam.plots.paths import plot_paths
+from graphslam.solve.registry import make_solver
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+By = Literal["auto", "places", "gps"]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedSession:
+    """One run inside a merged graph.
+
+    Parameters
+    ----------
+    name : str
+    run : Run
+    session : DenseSession
+        Its submaps with the keys and the clock of the common graph.
+    first_node : int
+    attached : Attached or None
+        How it hangs on another session; None for the one whose first base is fixed.
+    trajectory : Trajectory
+        Its path in the common frame, on its own clock, with covariances.
+    T_world_base, covariance : (7,) or (3,), (d, d)
+        Its first base in the common frame; zeros for the one that is fixed.
+    """
+
+    name: str
+    run: Run
+    session: DenseSession
+    first_node: int
+    attached: Attached | None
+    trajectory: Trajectory
+    T_world_base: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class MergedSubmaps:
+    """Result of merging runs of dense submaps: everything in the frame of the first run's first base.
+
+    Parameters
+    ----------
+    sessions : list of PlacedSession
+    solution : Solution
+        One least-squares problem over all chains.
+    graph : PoseGraph
+    metrics : DataFrame
+    report : dict
+    """
+
+    sessions: list[PlacedSession]
+    solution: Solution
+    graph: PoseGraph
+    metrics: pd.DataFrame
+    report: dict[str, Any] = field(default_factory=dict)
+
+    def metric(self, key: str) -> float:
+        """Value of one metric; KeyError if there is none."""
+        return metric_value(self.metrics, key)
+
+    def plot(self, ax: Any = None) -> Any:
+        """The paths of all sessions from above, with their ellipses."""
+        paths = {s.name: s.trajectory for s in self.sessions}
+        if self.graph.dim == 3:
+            paths = {k: plan_path(v) for k, v in paths.items()}
+        ties = sum(len(s.attached.used) for s in self.sessions if s.attached is not None)
+        return plot_paths(ax, paths, title=f"{len(paths)} sessions, {ties} ties between them")
+
+    def __repr__(self) -> str:
+        return f"MergedSubmaps({len(self.sessions)} sessions, {len(self.graph.submaps)} submaps)"
+
+
+def merge_dense(
+    runs: Sequence[Run],
+    names: Sequence[str],
+    *,
+    by: By = "auto",
+    solver: str = "batch",
+    config: TieConfig | None = None,
+    progress: bool = False,
+) -> MergedSubmaps:
+    """Merge runs of dense submaps into one graph, and solve it as one problem.
+
+    The first base of the first run is fixed. Every other run hangs on one that is in already: by GPS where both have
+    fixes in their graphs (their frames must be one), by places that look alike, register and agree, or by both. Chains,
+    re-entries and loops of every run are those of its own graph.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    names : sequence of str
+        Of the sessions, each once.
+    by : {"auto", "places", "gps"}
+        ``auto``: GPS where both have it, and then places that it brings together; else places.
+    solver : str
+    config : TieConfig, optional
+        When ties by places are believed.
+    progress : bool
+        Show progress bars on stderr.
+
+    Raises
+    ------
+    DataError
+        A run that nothing ties to the others; names it, and says what was tried. Nothing is guessed.
+    ConfigError
+        An unknown option.
+    """
+    if by not in ("auto", "places", "gps"):
+        raise ConfigError(f"by = {by!r}; known for dense submaps: auto, places, gps")
+    begin = time.perf_counter()
+    sessions: list[DenseSession] = []
+    key, clock = 0, -np.inf
+    for run, name in zip(runs, names):
+        s = session_of(run, name, first_key=key, after=clock)
+        sessions.append(s)
+        key, clock = key + len(s.submaps), s.submaps[-1].interval[1]
+    dims = {s.submaps[0].dim for s in sessions}
+    if len(dims) > 1:
+        raise DataError("runs in the plane and in space cannot be merged", got=sorted(dims))
+    graph = PoseGraph(dims.pop())
+    solve = make_solver(solver, graph)
+    put(graph, sessions[0], use_gps=by != "places")
+    solve.solve_to_optimum()
+    first: dict[int, int] = {0: 0}
+    how: dict[int, Attached] = {}
+    waiting = list(range(1, len(sessions)))
+    while waiting:
+        errors: dict[int, list[str]] = {}
+        for k in list(waiting):
+            for at in list(first):
+                try:
+                    how[k] = _tie(graph, solve, sessions[at], first[at], sessions[k], by, config, progress)
+                except DataError as error:
+                    errors.setdefault(k, []).append(error.what)
+                    continue
+                first[k] = how[k].first_node
+                waiting.remove(k)
+                break
+        if len(errors) and set(waiting) <= set(errors) and len(waiting) == len(errors):
+            k = waiting[0]
+            raise DataError(f"cannot be merged with the other runs: {'; '.join(errors[k])}", where=names[k])
+    solution = solve.solution()
+    placed = _placed(runs, sessions, first, how, solution)
+    metrics = _metrics(placed, solution)
+    report = {
+        "format": "graphslam.merge/1",
+        "by": by,
+        "solver": solver,
+        "sessions": [_said(s) for s in placed],
+        "seconds": time.perf_counter() - begin,
+    }
+    return MergedSubmaps(placed, solution, graph, metrics, report)
+
+
+def _tie(
+    graph: PoseGraph,
+    solver: Any,
+    known: DenseSession,
+    known_node: int,
+    new: DenseSession,
+    by: By,
+    config: TieConfig | None,
+    progress: bool,
+) -> Attached:
+    both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
+    if by == "gps" or (by == "auto" and both):
+        return attach_by_gps(graph, solver, known, known_node, new, places=by == "auto", progress=progress)
+    return attach(graph, solver, known, known_node, new, config=config, use_gps=by == "auto", progress=progress)
+
+
+def _placed(
+    runs: Sequence[Run], sessions: list[DenseSession], first: dict[int, int], how: dict[int, Attached], s: Solution
+) -> list[PlacedSession]:
+    P, out = s.node_covariances(), []
+    for k, (run, session) in enumerate(zip(runs, sessions)):
+        path = s.trajectory(keys={m.key for m in session.submaps})
+        own = Trajectory(path.times - session.shift, path.poses, path.covariances)
+        node = first[k]
+        out.append(PlacedSession(session.name, run, session, node, how.get(k), own, s.poses[node], P[node]))
+    return out
+
+
+def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFrame:
+    """Figures of a merged graph.
+
+    ``path_rmse_aligned`` is one alignment of all sessions together onto one truth, where the logs share its world: what
+    is askew between the sessions is not excused. ``<name>_path_rmse_alone`` is what that run had, aligned by itself.
+    """
+    out = Metrics()
+    out.add("sessions", len(placed))
+    out.add("submaps", sum(len(s.session.submaps) for s in placed))
+    out.add("objective", solution.objective)
+    out.add("converged", float(solution.converged), "", "higher")
+    if SESSION in solution.score.classes:
+        score = solution.score[SESSION]
+        out.add("ties", score.factors)
+        out.add("ties_chi2", score.chi2)
+        out.add("ties_chi2_per_residual", score.chi2 / max(score.rows, 1), "", "one")
+    for s in placed[1:]:
+        g = group_of(s.T_world_base)
+        at, turn = s.covariance[g.position, g.position], s.covariance[g.heading, g.heading]
+        out.add(f"{s.name}_base_sigma", float(np.sqrt(np.trace(at))), "m", "lower")
+        out.add(f"{s.name}_base_heading_sigma", float(np.rad2deg(np.sqrt(turn))), "deg", "lower")
+        if s.attached is not None:
+            out.add(f"{s.name}_ties", len(s.attached.used))
+            out.add(f"{s.name}_ties_dropped", s.attached.dropped)
+    _score(out, placed)
+    return out.table()
+
+
+def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
+    """Errors against truths that share a world."""
+    bases = [s.run.report.get("T_world_base") for s in placed]
+    shared = all("T_world_frame" in s.run.report.get("source_meta", {}) for s in placed)
+    if not shared or any(b is None for b in bases) or any(s.run.truth_path is None for s in placed):
+        return
+    g = group_of(placed[0].T_world_base)
+    times, estimated, true, shift = [], [], [], 0.0
+    for s, base in zip(placed, bases):
+        T = g.between(np.asarray(bases[0], dtype=np.float64), np.asarray(base, dtype=np.float64))
+        truth = s.run.truth_path
+        assert truth is not None
+        path = s.trajectory
+        keep = (path.times >= truth.times[0]) & (path.times <= truth.times[-1])
+        times.append(path.times[keep] + shift)
+        estimated.append(path.poses[keep])
+        true.append(truth.transformed(T).interpolate(path.times[keep]))
+        shift = times[-1][-1] + 1.0 - min(path.times[0], 0.0)
+        if s.attached is not None:
+            e = g.log(g.between(s.T_world_base, T))
+            out.add(f"{s.name}_base_error", float(np.linalg.norm(e[g.position])), "m", "lower")
+            out.add(f"{s.name}_base_nees", float(e @ np.linalg.solve(s.covariance, e)))
+            out.add(f"{s.name}_base_nees_dof", g.dof)
+        if "path_rmse_aligned" in set(s.run.metrics["key"]):
+            out.add(f"{s.name}_path_rmse_alone", s.run.metric("path_rmse_aligned"), "m", "lower")
+    both = Trajectory(np.concatenate(times), np.concatenate(estimated))
+    whole = ate(both, Trajectory(both.times, np.concatenate(true)), alignment="se")
+    out.add("path_rmse_aligned", whole.statistics.rmse, "m", "lower")
+    out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
+
+
+def _said(s: PlacedSession) -> dict[str, Any]:
+    a = s.attached
+    return {
+        "name": s.name,
+        "source": s.run.name,
+        "submaps": len(s.session.submaps),
+        "T_world_first_base": s.T_world_base.tolist(),
+        "hangs_on": None if a is None else a.known.name,
+        "gps": s.session.fixes is not None,
+        "ties": None if a is None else len(a.used),
+        "ties_dropped": None if a is None else a.dropped,
+        "candidates": [] if a is None or a.ties is None else a.ties.rows(),
+    }

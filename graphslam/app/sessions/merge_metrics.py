@@ -1,0 +1,109 @@
+"""Figures of a merged map: how well the runs fit together, and, where the truth is known, how far off it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.app.run.metrics import Metrics
+from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, se2_transform
+from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.trajectory_error import associate
+from graphslam.solve.solution import Solution
+
+if TYPE_CHECKING:
+    from graphslam.app.sessions.merge import Session
+
+
+def merge_metrics(
+    sessions: Sequence[Session],
+    solution: Solution,
+    keep: npt.NDArray[np.bool_],
+    seen_by: npt.NDArray[np.int64],
+    split: int,
+    *,
+    identities: bool,
+) -> pd.DataFrame:
+    """Score of a merged map; with the truth's identities also errors and NEES, all after *one* rigid alignment.
+
+    The alignment is that of the landmarks of the whole map to the truth; the paths are judged in it, too, so a robot
+    whose path is well shaped but lies askew in the common map is not excused. ``<name>_landmark_rmse_alone`` is what
+    that run had by itself, aligned by itself.
+    """
+    out = Metrics()
+    out.add("sessions", len(sessions))
+    out.add("submaps", sum(len(s.keys) for s in sessions))
+    out.add("landmarks", int(keep.sum()))
+    out.add("landmarks_shared", int(np.sum(seen_by[keep] > 1)))
+    out.add("sightings_split", split)
+    score = solution.score["submap"]
+    out.add("join_chi2", score.chi2)
+    out.add("join_dof", score.dof)
+    out.add("join_chi2_per_dof", score.chi2_per_dof, "", "one")
+    out.add("converged", float(solution.converged), "", "higher")
+    out.add("states", solution.states)
+    for s in sessions:
+        if s.alignment is not None:
+            out.add(f"{s.name}_common_landmarks", len(s.alignment.pairs))
+            out.add(f"{s.name}_alignment_rms", s.alignment.rms, "m", "lower")
+            sigma = np.sqrt(np.diag(s.map.node_covariances[0]))
+            out.add(f"{s.name}_base_sigma", float(np.hypot(*sigma[:2])), "m", "lower")
+    truth = sessions[0].run.truth
+    if truth is not None and identities and len(truth.landmark_ids):
+        _score(out, sessions, solution, keep, truth.landmark_ids, truth.landmarks)
+    return out.table()
+
+
+def _score(
+    out: Metrics,
+    sessions: Sequence[Session],
+    solution: Solution,
+    keep: npt.NDArray[np.bool_],
+    true_ids: npt.NDArray[np.int64],
+    true_points: Array,
+) -> None:
+    """Errors against a truth in the frame of the first session's first base."""
+    rows = np.flatnonzero(keep)
+    i, j = match_ids(solution.landmark_ids[rows], true_ids)
+    if len(i) < 2:
+        return
+    rows = rows[i]
+    ids, points = solution.landmark_ids[rows], solution.landmarks[rows]
+    fit = landmark_error(ids, points, true_ids, true_points, gauge="rigid")
+    out.add("landmark_rmse_aligned", fit.statistics.rmse, "m", "lower")
+    out.add("landmark_max_aligned", fit.statistics.maximum, "m", "lower")
+    columns = solution.covariance.layout.columns_of([f"l{k}" for k in ids.tolist()])
+    if len(ids) > 2:
+        error = (true_points[j] - points).ravel()
+        P = solution.covariance.columns(columns)
+        dof = len(error) - 3
+        nees = aligned_nees(error, P, gauge_directions(np.zeros((0, 3)), points))
+        out.add("nees_aligned_landmarks", nees)
+        out.add("nees_aligned_landmarks_dof", dof)
+        out.add("nees_aligned_landmarks_per_dof", nees / dof, "", "one")
+        out.add("ci_aligned_landmarks", nees / chi2_quantile(0.95, dof), "", "lower")
+    for s in sessions:
+        truth, path = s.run.truth, s.run.truth_path
+        if truth is None or path is None:
+            continue
+        # the same surveyed landmarks, seen from two first bases, say how the two true frames lie
+        try:
+            frames = landmark_error(truth.landmark_ids, truth.landmarks, true_ids, true_points, gauge="rigid")
+        except DataError:
+            continue
+        a, b = associate(path.times, s.map.trajectory.times)
+        if len(a) == 0:
+            continue
+        where = se2_transform(fit.T_truth_estimate, s.map.trajectory.positions[b])
+        error = np.linalg.norm(where - se2_transform(frames.T_truth_estimate, path.positions[a]), axis=1)
+        out.add(f"{s.name}_path_rmse", float(np.sqrt(np.mean(error**2))), "m", "lower")
+        for key, name in (("landmark_rmse_aligned", "landmark_rmse_alone"), ("path_rmse_aligned", "path_rmse_alone")):
+            if key in set(s.run.metrics["key"]):
+                out.add(f"{s.name}_{name}", s.run.metric(key), "m", "lower")

@@ -1,0 +1,130 @@
+"""What a merge leaves on disk: one state, written and replaced as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.app.folders.generations import Generation, is_empty, new_generation, outputs
+from graphslam.app.folders.lock import locked, make_folder
+from graphslam.app.report.report import report_beside
+from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
+from graphslam.app.run.graph_facts import graph_facts
+from graphslam.app.run.outputs import landmarks_csv
+from graphslam.app.sessions.merge import MergedMap
+from graphslam.app.sessions.merge_dense import MergedSubmaps
+from graphslam.core.atomic import write_npz
+from graphslam.core.errors import RunFolderError
+from graphslam.evaluate.without_truth import class_consistency
+from graphslam.io.tum import write_tum
+from graphslam.plots.save import save
+
+MOST_STATES = 6000
+"""Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
+
+
+SAME_BYTES = (
+    *("merge.json", "merged.npz", "landmarks.csv", "trajectory_*.tum", "events.jsonl", "metrics.json", "ledger.csv"),
+    "figures/map.png",
+)
+"""Files of a merged folder that are the same bytes whenever the same runs are merged."""
+
+
+@contextmanager
+def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
+    """Make the folder of a merge, or take one that is empty; no other process writes into it until the block ends.
+
+    Parameters
+    ----------
+    path : path
+    anew : bool
+        One that holds a merge already is taken too.
+
+    Raises
+    ------
+    RunFolderError
+        The folder holds something already, cannot be made, or is being written by another process.
+    """
+    folder = make_folder(path)
+
+    def check() -> None:
+        if not (anew and (outputs(folder) / "merge.json").is_file()) and not is_empty(folder):
+            raise RunFolderError(f"{folder}: not empty; choose another --out")
+
+    check()  # before a lock is put into somebody's folder
+    with locked(folder):
+        check()
+        yield folder
+
+
+def write_merged(path: Path, merged: MergedMap | MergedSubmaps) -> None:
+    """Write a merge, by landmarks or of dense submaps, as a new state of its folder.
+
+    ``merged.npz``, ``landmarks.csv`` of one by landmarks, one ``trajectory_<session>.tum`` each, metrics, events, a
+    picture, ``merge.json``.
+    """
+    with new_generation(path) as new:
+        if isinstance(merged, MergedMap):
+            _write_landmarks(new, merged)
+        else:
+            _write_dense(new, merged)
+        _finish(new, merged)
+
+
+def _write_landmarks(folder: Generation, merged: MergedMap) -> None:
+    path = folder.path
+    for s in merged.sessions:
+        write_tum(path / f"trajectory_{s.name}.tum", s.map.trajectory)
+    folder.write_text("landmarks.csv", landmarks_csv(merged.sessions[0].map))
+    columns = merged.solution.covariance.layout.columns_of([f"l{i}" for i in merged.landmark_ids.tolist()])
+    write_npz(
+        path / "merged.npz",
+        {
+            "format": MERGED_FORMAT,
+            "sessions": np.array([s.name for s in merged.sessions]),
+            "first_bases": merged.solution.poses[[s.first_node for s in merged.sessions]],
+            "first_base_covariances": np.array([s.map.node_covariances[0] for s in merged.sessions]),
+            "landmark_ids": merged.landmark_ids,
+            "landmarks": merged.landmarks,
+            "landmark_joint_covariance": merged.solution.covariance.columns(columns),
+            "landmark_sessions": merged.landmark_sessions,
+        },
+    )
+
+
+def _write_dense(folder: Generation, merged: MergedSubmaps) -> None:
+    path = folder.path
+    for s in merged.sessions:
+        write_tum(path / f"trajectory_{s.name}.tum", s.trajectory)
+    nodes = merged.solution.base_nodes
+    write_npz(
+        path / "merged.npz",
+        {
+            "format": MERGED_DENSE_FORMAT,
+            "sessions": np.array([s.name for s in merged.sessions]),
+            "session_of_submap": np.repeat(
+                np.arange(len(merged.sessions)), [len(s.session.submaps) for s in merged.sessions]
+            ),
+            "keys": np.concatenate([[m.key for m in s.run.submaps] for s in merged.sessions]),
+            "bases": merged.solution.poses[nodes],
+            "base_covariances": merged.solution.node_covariances()[nodes],
+            "nodes": merged.solution.poses,
+        },
+    )
+
+
+def _finish(folder: Generation, merged: MergedMap | MergedSubmaps) -> None:
+    """What both kinds of merged maps have."""
+    folder.write_lines("events.jsonl", merged.graph.events)
+    folder.write_json("metrics.json", merged.metrics.to_dict("records"))
+    save(merged.plot(), folder.figures / "map.png")
+    folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
+    classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
+    report = dict(merged.report)
+    seconds = float(report.pop("seconds"))
+    folder.write_json("timings.json", [{"key": "seconds_merge", "value": seconds, "unit": "s", "direction": "lower"}])
+    folder.write_json("merge.json", {**report, "graph": graph_facts(merged.graph, classes)})
+    report_beside(folder)

@@ -1,0 +1,1 @@
+"""Which landmark is which: one search for the graph and for joiners."""

@@ -1,0 +1,148 @@
+"""How an IMU enters a graph, and where the unit is on the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import SE3
+from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
+from graphslam.core.trajectory import Trajectory
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.state import Values
+from graphslam.graph.submap_node import SubmapNode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuConfig:
+    """How readings become factors.
+
+    Parameters
+    ----------
+    longest : float
+        Nodes that follow each other within so many seconds are tied by a preintegrated way; farther ones see gravity.
+    pause : float or None
+        No way over a pause of the readings that is longer [s]; None: five times the usual, and at least 0.1 s.
+    accelerometer : bool
+        False: the gyro alone, neither velocities nor gravity.
+    gravity : bool
+        Nodes without a way get the mean specific force about them.
+    window : float
+        Over so many seconds it is averaged.
+    acceleration : float
+        σ of the mean acceleration in a window where the body is not still, and what no path says [m/s²].
+    still : float
+        A body that moves less than this in a window may be still [m]; that it is, the readings must say, too.
+    axes : {"refuse", "warn", "ignore"}
+        What to do with an IMU whose readings contradict its mounting (:mod:`graphslam.graph.factors.imu.axes`).
+    robust : Robust
+        Kernel on every way.
+    """
+
+    longest: float = 10.0
+    pause: float | None = None
+    accelerometer: bool = True
+    gravity: bool = True
+    window: float = 1.0
+    acceleration: float = 0.3
+    still: float = 0.05
+    axes: Literal["refuse", "warn", "ignore"] = "refuse"
+    robust: Robust = NO_KERNEL
+
+    def __post_init__(self) -> None:
+        for name in ("longest", "pause", "window", "acceleration", "still"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"imu.{name} must be positive, got {value}")
+        if self.axes not in ("refuse", "warn", "ignore"):
+            raise ConfigError(f"imu.axes = {self.axes!r}; known: refuse, warn, ignore")
+
+    def pause_of(self, times: Array) -> float:
+        """Longest pause allowed in readings at ``times`` ``(n,)``, n ≥ 2."""
+        return max(0.1, 5.0 * float(np.median(np.diff(times)))) if self.pause is None else self.pause
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where the body is on a node, by the submap that holds both.
+
+    Parameters
+    ----------
+    time : float
+    T_node_body : (7,)
+    covariance : (6, 6)
+        Right tangent at the body.
+    moved : float
+        How far the body went in the window about ``time`` [m].
+    """
+
+    time: float
+    T_node_body: Array
+    covariance: Array
+    moved: float
+
+    def unit(self, T_base_imu: Array) -> tuple[Array, Array]:
+        """``T_node_imu`` ``(7,)`` and its covariance ``(6, 6)``, right tangent at the unit."""
+        A = se3_adjoint(se3_inverse(T_base_imu))
+        return SE3.compose(self.T_node_body, T_base_imu), A @ self.covariance @ A.T
+
+
+def places_of(submaps: Sequence[SubmapNode], window: float) -> dict[int, Place]:
+    """Where the body is on every node that a path says it of.
+
+    A base (or the node where one submap ends and the next begins) is a frame that may have been levelled: the body is
+    where the path that begins there says. On inner nodes it is the node itself. The last exit is where the last path
+    ends.
+    """
+    out: dict[int, Place] = {}
+    for s in submaps:
+        path = s.trajectory
+        if path is None or len(path) < 2 or path.dim != 3:
+            continue
+
+        def moved(t: float, path: Trajectory = path) -> float:
+            ends = np.clip([t - 0.5 * window, t + 0.5 * window], path.times[0], path.times[-1])
+            return float(np.linalg.norm(np.diff(path.interpolate(ends)[:, :3], axis=0)))
+
+        inner = [k for k in range(len(s.nodes) - 1) if path.times[0] <= s.times[k] <= path.times[-1]]
+        if inner:
+            T, P = s.local(s.times[inner], np.array(inner, dtype=np.intp))
+            P = np.zeros((len(inner), 6, 6)) if P is None else P
+            for k, Tk, Pk in zip(inner, T, P):
+                t = float(s.times[k])
+                out[s.nodes[k]] = Place(t, Tk, Pk if k == 0 else np.zeros((6, 6)), moved(t))
+        t = float(s.times[-1])
+        if path.times[0] <= t <= path.times[-1] + 1e-9:
+            T_end = path.interpolate(min(t, float(path.times[-1])))[0]
+            out[s.exit_node] = Place(t, SE3.between(s.T_base_node[-1], T_end), np.zeros((6, 6)), moved(t))
+    return out
+
+
+def path_of(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
+    """Path of the body in the level frame at the first base, by rigid submaps at their nodes.
+
+    Raises
+    ------
+    DataError
+        No submap has a path.
+    """
+    times, poses = [np.zeros(0)], [np.zeros((0, 7))]
+    level = SE3.identity.copy()
+    if values.tilt is not None:
+        level[3:] = so3_exp(-np.append(values.tilt, 0.0))
+    for s in submaps:
+        if s.trajectory is None:
+            continue
+        T = SE3.compose(level, values.poses[s.node])
+        new = s.trajectory.times > (times[-1][-1] if len(times[-1]) else -np.inf)
+        if np.any(new):
+            times.append(s.trajectory.times[new])
+            poses.append(SE3.compose(np.broadcast_to(T, s.trajectory.poses[new].shape), s.trajectory.poses[new]))
+    if len(times) == 1:
+        raise DataError("no submap has a path", wanted="submaps with trajectories")
+    return Trajectory(np.concatenate(times), np.concatenate(poses))

@@ -1,0 +1,223 @@
+"""Factors of an IMU: preintegrated ways between nodes, biases, specific forces. Residuals and Jacobians.
+
+With the unit at ``X = x · T_node_imu`` = (R, p), gravity ``g = -G u(τ)`` (:mod:`graphslam.graph.attitude` says what u
+is), velocities v of the unit in the frame of the first base, and ``δ = b_i - b̄``, the residual of a way is (Forster et
+al. 2017, eq. 45, and the walk of the biases)::
+
+    r_φ = Log((ΔR Exp(J_φ δ_g))ᵀ R_iᵀ R_j)
+    r_p = R_iᵀ (p_j - p_i - v_i T - ½ g T²) - Δp - J_p δ
+    r_v = R_iᵀ (v_j - v_i - g T) - Δv - J_v δ
+    r_b = b_j - b_i
+
+and that of a specific force about a node ``r = Rᵀ G u(τ) + b_a - f``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY
+from graphslam.core.se3 import (
+    matrix_to_quat,
+    quat_multiply,
+    quat_to_matrix,
+    se3_adjoint,
+    se3_compose,
+    se3_inverse,
+    skew,
+    so3_exp,
+    so3_left_jacobian,
+    so3_left_jacobian_inverse,
+    so3_log,
+)
+from graphslam.graph.attitude import up_turn
+from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
+from graphslam.graph.families import UniformFamily
+from graphslam.graph.state import Layout, Values
+
+WIDTHS = {"x_i": 6, "v_i": 3, "b_i": 6, "x_j": 6, "v_j": 3, "b_j": 6, "tilt": 2}
+XI, VI, BI, XJ, VJ, BJ, TILT = (
+    slice(a, b) for a, b in zip(np.cumsum([0, *WIDTHS.values()])[:-1], np.cumsum([*WIDTHS.values()]))
+)
+GYRO_ROWS = np.r_[0:3, 9:15]
+GYRO_COLUMNS = np.r_[XI, BI, XJ, BJ]
+
+
+class Ways:
+    """The constants of preintegrated ways, one row each (:class:`~graphslam.graph.factors.imu.records.ImuRecord`)."""
+
+    def __init__(self, records: Sequence[ImuRecord]) -> None:
+        self.T = np.array([r.seconds for r in records])
+        self.L_i = np.array([r.T_i_imu for r in records]).reshape(-1, 7)
+        self.L_j = np.array([r.T_j_imu for r in records]).reshape(-1, 7)
+        self.q = matrix_to_quat(np.array([r.R for r in records]).reshape(-1, 3, 3))
+        self.p = np.array([r.p for r in records]).reshape(-1, 3)
+        self.v = np.array([r.v for r in records]).reshape(-1, 3)
+        self.J = np.array([r.J for r in records]).reshape(-1, 9, 6)
+        self.bias = np.array([r.bias for r in records]).reshape(-1, 6)
+        self.ad_i, self.ad_j = se3_adjoint(se3_inverse(self.L_i)), se3_adjoint(se3_inverse(self.L_j))
+
+
+def way_terms(
+    ways: Ways, x_i: Array, v_i: Array, b_i: Array, x_j: Array, v_j: Array, b_j: Array, tilt: Array
+) -> tuple[Array, Array]:
+    """Residuals ``(k, 15)`` and Jacobians ``(k, 15, 32)`` on (x_i, v_i, b_i, x_j, v_j, b_j, tilt), not whitened.
+
+    Parameters
+    ----------
+    x_i, x_j : (k, 7)
+    v_i, v_j : (k, 3)
+    b_i, b_j : (k, 6)
+    tilt : (2,)
+    """
+    w, T = ways, ways.T[:, None]
+    X_i, X_j = se3_compose(x_i, w.L_i), se3_compose(x_j, w.L_j)
+    Rt, E = np.swapaxes(quat_to_matrix(X_i[:, 3:]), 1, 2), None
+    E = Rt @ quat_to_matrix(X_j[:, 3:])
+    turn, J_r = up_turn(tilt)
+    up = turn[:, 2]
+    du = -turn @ skew([0.0, 0.0, 1.0]) @ J_r  # u(τ + δ) = u - Exp(ω) [e_z]× J_r δ
+    d = b_i - w.bias
+    theta = np.einsum("kij,kj->ki", w.J[:, :3, :3], d[:, :3])
+    C = quat_multiply(w.q, so3_exp(theta))
+    e = quat_multiply(C * [-1.0, -1.0, -1.0, 1.0], matrix_to_quat(E))
+    phi = so3_log(e)
+    a_p = np.einsum("kij,kj->ki", Rt, X_j[:, :3] - X_i[:, :3] - T * v_i + 0.5 * GRAVITY * T**2 * up)
+    a_v = np.einsum("kij,kj->ki", Rt, v_j - v_i + GRAVITY * T * up)
+    moved = np.einsum("kij,kj->ki", w.J[:, 3:], d)
+    r = np.concatenate([phi, a_p - w.p - moved[:, :3], a_v - w.v - moved[:, 3:], b_j - b_i], axis=1)
+
+    k = len(r)
+    inverse = so3_left_jacobian_inverse(-phi)  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
+    U_i, U_j = np.zeros((k, 15, 6)), np.zeros((k, 15, 6))  # by right turns and shifts of the unit's own pose
+    U_i[:, :3, :3] = -inverse @ np.swapaxes(E, 1, 2)
+    U_i[:, 3:6, :3], U_i[:, 6:9, :3] = skew(a_p), skew(a_v)
+    U_i[:, 3:6, 3:] = -np.eye(3)
+    U_j[:, :3, :3] = inverse
+    U_j[:, 3:6, 3:] = E
+    J = np.zeros((k, 15, 32))
+    J[:, :, XI], J[:, :, XJ] = U_i @ w.ad_i, U_j @ w.ad_j
+    J[:, 3:6, VI] = -T[..., None] * Rt
+    J[:, 6:9, VI], J[:, 6:9, VJ] = -Rt, Rt
+    e_t = np.swapaxes(quat_to_matrix(e), 1, 2)
+    J[:, :3, BI][:, :, :3] = -inverse @ e_t @ so3_left_jacobian(-theta) @ w.J[:, :3, :3]
+    J[:, 3:9, BI] = -w.J[:, 3:]
+    J[:, 9:, BI], J[:, 9:, BJ] = -np.eye(6), np.eye(6)
+    J[:, 3:6, TILT] = 0.5 * GRAVITY * T[..., None] ** 2 * (Rt @ du)
+    J[:, 6:9, TILT] = GRAVITY * T[..., None] * (Rt @ du)
+    return r, J
+
+
+def force_terms(x: Array, L: Array, bias: Array, tilt: Array, force: Array) -> tuple[Array, Array]:
+    """Residuals ``(k, 3)`` and Jacobians ``(k, 3, 14)`` on (x, bias, tilt), not whitened.
+
+    Parameters
+    ----------
+    x, L : (k, 7)
+        Nodes, and the unit seen from them.
+    bias : (k, 6)
+    tilt : (2,)
+    force : (k, 3)
+    """
+    turn, J_r = up_turn(tilt)
+    Rt = np.swapaxes(quat_to_matrix(quat_multiply(x[:, 3:], L[:, 3:])), 1, 2)
+    h = GRAVITY * (Rt @ turn[:, 2])
+    J = np.zeros((len(x), 3, 14))
+    J[:, :, :6] = skew(h) @ se3_adjoint(se3_inverse(L))[:, :3]
+    J[:, :, 9:12] = np.eye(3)
+    J[:, :, 12:] = GRAVITY * (Rt @ (-turn @ skew([0.0, 0.0, 1.0]) @ J_r))
+    return h + bias[:, 3:] - force, J
+
+
+class ImuFamily(UniformFamily):
+    """Preintegrated ways."""
+
+    record = ImuRecord
+
+    def __init__(self, records: Sequence[ImuRecord], layout: Layout) -> None:
+        super().__init__(records, layout)
+        d = 9 if self.record is GyroRecord else 15
+        self._ways = Ways(records)
+        self._i, self._j = (np.array([getattr(r, n) for r in records], dtype=np.int64) for n in "ij")
+        self._v = np.array([r.velocities for r in records], dtype=np.int64).reshape(-1, 2)
+        self._b = np.array([r.biases for r in records], dtype=np.int64).reshape(-1, 2)
+        self._W = np.array([r.whitener for r in records]).reshape(-1, d, d)
+        columns = []
+        for side, nodes in enumerate((self._i, self._j)):
+            columns += [layout.pose_columns(nodes)]
+            columns += [layout.velocity_start + 3 * self._v[:, side, None] + np.arange(3)]
+            columns += [layout.imu_bias_start + 6 * self._b[:, side, None] + np.arange(6)]
+        columns += [np.broadcast_to(layout.tilt_start + np.arange(2), (len(records), 2))]
+        every = np.concatenate(columns, axis=1)
+        self._set_columns(every if d == 15 else every[:, GYRO_COLUMNS])
+
+    def terms(self, values: Values) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
+        r, J = self._plain(values)
+        return np.einsum("kij,kj->ki", self._W, r), self._W @ J
+
+    def _plain(self, values: Values) -> tuple[Array, Array]:
+        assert values.tilt is not None  # every way by the accelerometer brings it in
+        x, v, b = values.poses, values.velocities, values.imu_biases
+        (vi, vj), (bi, bj) = self._v.T, self._b.T
+        return way_terms(self._ways, x[self._i], v[vi], b[bi], x[self._j], v[vj], b[bj], values.tilt)
+
+
+class GyroFamily(ImuFamily):
+    """Preintegrated turns of the gyro alone."""
+
+    record = GyroRecord
+
+    def _plain(self, values: Values) -> tuple[Array, Array]:
+        x, b, none = values.poses, values.imu_biases, np.zeros((len(self), 3))
+        bi, bj = self._b.T
+        r, J = way_terms(self._ways, x[self._i], none, b[bi], x[self._j], none, b[bj], np.zeros(2))
+        return r[:, GYRO_ROWS], J[:, GYRO_ROWS][:, :, GYRO_COLUMNS]
+
+
+class ImuBiasFamily(UniformFamily):
+    """Biases at their start, and walks of biases over pauses."""
+
+    record = ImuBiasRecord
+
+    def __init__(self, records: Sequence[ImuBiasRecord], layout: Layout) -> None:
+        super().__init__(records, layout)
+        self._before = np.array([-1 if r.before is None else r.before for r in records], dtype=np.int64)
+        self._bias = np.array([r.bias for r in records], dtype=np.int64)
+        self._sigma = np.array([r.sigma for r in records]).reshape(-1, 6)
+        at = [layout.imu_bias_start + 6 * b[:, None] + np.arange(6) for b in (self._before, self._bias)]
+        self._set_columns(np.concatenate([np.where(self._before[:, None] < 0, -1, at[0]), at[1]], axis=1))
+
+    def terms(self, values: Values) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
+        b = values.imu_biases
+        start = np.where(self._before[:, None] < 0, 0.0, b[self._before])
+        W = np.eye(6) / self._sigma[:, None, :]
+        return (b[self._bias] - start) / self._sigma, np.concatenate([-W, W], axis=2)
+
+
+class ForceFamily(UniformFamily):
+    """Specific forces about nodes."""
+
+    record = ForceRecord
+
+    def __init__(self, records: Sequence[ForceRecord], layout: Layout) -> None:
+        super().__init__(records, layout)
+        self._node = np.array([r.node for r in records], dtype=np.int64)
+        self._bias = np.array([r.bias for r in records], dtype=np.int64)
+        self._L = np.array([r.T_node_imu for r in records]).reshape(-1, 7)
+        self._force = np.array([r.force for r in records]).reshape(-1, 3)
+        self._W = np.array([r.whitener for r in records]).reshape(-1, 3, 3)
+        bias = layout.imu_bias_start + 6 * self._bias[:, None] + np.arange(6)
+        tilt = np.broadcast_to(layout.tilt_start + np.arange(2), (len(records), 2))
+        self._set_columns(np.concatenate([layout.pose_columns(self._node), bias, tilt], axis=1))
+
+    def terms(self, values: Values) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
+        assert values.tilt is not None
+        x, b = values.poses[self._node], values.imu_biases[self._bias]
+        r, J = force_terms(x, self._L, b, values.tilt, self._force)
+        return np.einsum("kij,kj->ki", self._W, r), self._W @ J

@@ -1,0 +1,127 @@
+"""What readings of an IMU would become in a graph, and what is left out of them and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.imu import Imu
+from graphslam.graph.factors.imu.config import ImuConfig, Place
+from graphslam.graph.factors.imu.preintegration import longest_pause
+from graphslam.graph.factors.imu.records import ForceRecord, ImuRecord
+from graphslam.graph.records import Record
+from graphslam.graph.submap_node import SubmapNode
+
+FEWEST = 4
+"""Readings inside a way: with fewer Δp and Δv are not two things."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What readings become.
+
+    Parameters
+    ----------
+    pairs : list of (int, int)
+        Nodes to be tied by a way.
+    gravity : list of int
+        Nodes that see gravity.
+    dropped : Counter of str
+        What is left out, by reason.
+    """
+
+    pairs: list[tuple[int, int]]
+    gravity: list[int]
+    dropped: Counter[str]
+
+
+def plan_of(
+    submaps: Sequence[SubmapNode],
+    records: Collection[Record],
+    imu: Imu,
+    stream: str,
+    cfg: ImuConfig,
+    places: dict[int, Place],
+) -> Plan:
+    """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason."""
+    t, pause = imu.times, cfg.pause_of(imu.times)
+    had = {(r.i, r.j) for r in records if isinstance(r, ImuRecord) and r.stream == stream}
+    heard = {r.node for r in records if isinstance(r, ForceRecord) and r.stream == stream}
+    pairs: list[tuple[int, int]] = []
+    near, dropped = {n for pair in had for n in pair}, Counter[str]()
+    for s in submaps:
+        for a, b in zip(s.nodes, s.nodes[1:]):
+            if (a, b) in had:
+                continue
+            why = _why_not(places.get(a), places.get(b), t, cfg.longest, pause)
+            if why:
+                dropped[why] += 1
+            else:
+                pairs.append((a, b))
+                near |= {a, b}
+    gravity: list[int] = []
+    last = -np.inf
+    for n, place in sorted(places.items(), key=lambda item: item[1].time):
+        if not (cfg.gravity and cfg.accelerometer) or n in near or n in heard:
+            continue
+        begin, end = window_of(place.time, cfg)
+        if not (t[0] <= begin and end <= t[-1]):
+            dropped["gravity outside the readings"] += 1
+        elif longest_pause(t, np.array([begin]), np.array([end]))[0] > pause:
+            dropped["gravity in a pause of the readings"] += 1
+        elif begin >= last:
+            gravity.append(n)
+            last = end
+    return Plan(pairs, gravity, dropped)
+
+
+def window_of(t: float, cfg: ImuConfig) -> tuple[float, float]:
+    """Over which the specific force about an instant is averaged."""
+    return float(t) - 0.5 * cfg.window, float(t) + 0.5 * cfg.window
+
+
+def joined(old: Imu, new: Imu, stream: str) -> Imu:
+    """One IMU's readings in two portions.
+
+    Raises
+    ------
+    DataError
+        Readings that were given before, or another unit.
+    """
+    if len(new.times) == 0:
+        return old
+    if new.times[0] <= old.times[-1]:
+        raise DataError(
+            "readings of this IMU were given before", where=stream, got=f"from {new.times[0]:.3f} s on",
+            wanted=f"after {old.times[-1]:.3f} s",
+        )  # fmt: skip
+    if not np.array_equal(old.T_base_imu, new.T_base_imu) or old.noise != new.noise:
+        raise DataError("noise or mounting of this IMU has changed", where=stream, wanted="one unit a stream")
+    return replace(
+        old,
+        times=np.concatenate([old.times, new.times]),
+        angular_rate=np.concatenate([old.angular_rate, new.angular_rate]),
+        specific_force=np.concatenate([old.specific_force, new.specific_force]),
+        attitude=None,
+    )
+
+
+def _why_not(a: Place | None, b: Place | None, t: Array, longest: float, pause: float) -> str:
+    """Why there is no way between two nodes; empty if there is one."""
+    if a is None or b is None:
+        return "the path does not reach the node"
+    if b.time - a.time > longest:
+        return "too far apart"
+    if a.time < t[0]:
+        return "before the first reading"
+    if b.time > t[-1]:
+        return "after the last reading"
+    if longest_pause(t, np.array([a.time]), np.array([b.time]))[0] > pause:
+        return "a pause in the readings"
+    inside = int(np.searchsorted(t, b.time) - np.searchsorted(t, a.time))
+    return "too few readings" if inside < FEWEST else ""

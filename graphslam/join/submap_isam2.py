@@ -1,0 +1,89 @@
+"""A chain of identified submaps through iSAM2, in the form that joiners return, so that all stand in one table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+from tqdm import tqdm
+
+from graphslam.core.geometry import rotation2
+from graphslam.core.submap import Submap
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.join.submap_blocks import check_identified
+from graphslam.join.submap_solver import SubmapEstimate
+from graphslam.solve.isam2 import Isam2Solver
+
+
+def solve_submaps_isam2(
+    submaps: Sequence[Submap],
+    *,
+    relinearize_threshold: float = 0.1,
+    relinearize_angle: float = 0.01,
+    covariance_scale: float = 1.0,
+    polish: bool = True,
+    progress: bool = False,
+) -> SubmapEstimate:
+    """Add the submaps one by one, updating iSAM2 after each; then go to the optimum.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        In order, every landmark identified.
+    relinearize_threshold, relinearize_angle : float
+        See :class:`~graphslam.solve.isam2.Isam2Solver`.
+    covariance_scale : float
+        Factor on every submap's covariance.
+    polish : bool
+        End at the batch optimum; ``objective`` is always that of iSAM2 before, so the difference is its gap.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    SubmapEstimate
+        ``seconds`` counts everything, ``iterations`` the updates.
+
+    Raises
+    ------
+    DataError
+        No submap, or a landmark without an id.
+    """
+    check_identified(submaps)
+    start = time.perf_counter()
+    graph = PoseGraph()
+    solver = Isam2Solver(graph, relinearize_threshold=relinearize_threshold, relinearize_angle=relinearize_angle)
+    for submap in tqdm(submaps, desc="iSAM2", unit="submap", disable=not progress):
+        graph.add_submap(submap, covariance_scale=covariance_scale)
+        solver.update()
+    objective = graph.objective().total
+    polished = None
+    if polish:
+        solver.solve_to_optimum()
+        polished = graph.objective().total
+    here = solver.solution(gap=False)
+    values = graph.values
+    return SubmapEstimate(
+        poses=values.poses.copy(),
+        landmark_ids=values.landmark_ids.copy(),
+        landmarks=values.landmarks.copy(),
+        information=_vector_information(graph),
+        objective=objective,
+        objective_polished=polished,
+        iterations=solver.updates,
+        converged=here.converged,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _vector_information(graph: PoseGraph) -> sp.csc_matrix:
+    """Gauss–Newton matrix with poses as (x, y, θ) vectors: ``Gᵀ A G``, ``G = blkdiag(R(θ)ᵀ, 1)`` per pose."""
+    values = graph.values
+    A = graph.flat().evaluate(values, dense=False).A
+    blocks = np.zeros((len(values.poses) - 1, 3, 3))
+    blocks[:, :2, :2] = np.swapaxes(rotation2(values.poses[1:, 2]), 1, 2)  # tangent step = R(θ)ᵀ · world step
+    blocks[:, 2, 2] = 1.0
+    G = sp.block_diag([*blocks, sp.eye(2 * len(values.landmarks))], format="csc")
+    return sp.csc_matrix(G.T @ A @ G)

@@ -1,0 +1,287 @@
+"""Gauss–Newton over submaps, with damping when a step does not pay: the least-squares optimum every method is held to.
+
+Used by the batch solver from the chain of submaps, and by the joiners as the polish that turns a once-linearised map
+into the optimum.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from graphslam.core.errors import SolverError, UnknownNameError
+from graphslam.core.geometry import Array, ArrayLike, wrap_angle
+from graphslam.core.markup import element, join
+from graphslam.core.submap import Submap
+from graphslam.join.submap_blocks import SubmapProblem
+from graphslam.linear.symmetric_factor import SymmetricFactor
+
+logger = logging.getLogger(__name__)
+Index = npt.NDArray[np.intp]
+
+
+def dense_inverse(matrix: sp.csc_matrix) -> Array:
+    """Whole inverse of a sparse symmetric positive-definite matrix, dense and symmetric."""
+    A = matrix.toarray()
+    factor, info = la.lapack.dpotrf(A, lower=1, overwrite_a=1)
+    if info == 0:
+        A, info = la.lapack.dpotri(factor, lower=1, overwrite_c=1)
+    if info != 0:
+        raise SolverError(f"information matrix is not positive definite (LAPACK info {info})")
+    lower = np.tril(A, -1)
+    return np.asarray(lower + lower.T + np.diag(np.diag(A)))
+
+
+@dataclass(frozen=True)
+class SubmapEstimate:
+    """A joined map: poses, landmarks, and the information of all of them in the gauge "first base fixed".
+
+    The state vector is ``[x_1 … x_m, l_1 … l_L]``, poses as (x, y, θ) *vectors* in the frame of the first base (not
+    right tangents), landmarks as (x, y).
+
+    Parameters
+    ----------
+    poses : (m + 1, 3)
+        Bases in the frame of the first, which is ``poses[0] = 0``; ``poses[k + 1]`` is the end of submap k.
+    landmark_ids : (L,) int64
+    landmarks : (L, 2)
+    information : csc_matrix (3m + 2L, 3m + 2L) or None
+        None where the method carries a dense covariance instead (the EKF).
+    objective : float
+        ``Σ rᵀ P⁻¹ r`` of this map (before polishing, where there is a polish).
+    objective_polished : float or None
+        The same at the least-squares optimum, where that was asked for.
+    iterations : int
+    converged : bool
+        Whether the map stands at its least-squares optimum.
+    seconds : float
+        Wall time of the solution, polish included.
+    covariance : (3m + 2L, 3m + 2L) or None
+        Exactly one of ``information`` and ``covariance`` is given.
+    """
+
+    poses: Array
+    landmark_ids: npt.NDArray[np.int64]
+    landmarks: Array
+    information: sp.csc_matrix | None
+    objective: float
+    objective_polished: float | None
+    iterations: int
+    converged: bool
+    seconds: float
+    covariance: Array | None = None
+
+    @property
+    def states(self) -> int:
+        """Free scalars; the fixed first base is not among them."""
+        return 3 * (len(self.poses) - 1) + 2 * len(self.landmark_ids)
+
+    @property
+    def nnz(self) -> int:
+        """Stored entries of the matrix that carries the uncertainty, both triangles."""
+        return self.states**2 if self.information is None else int(self.information.nnz)
+
+    @property
+    def vector(self) -> Array:
+        """The state vector ``(states,)``."""
+        return np.concatenate([self.poses[1:].ravel(), self.landmarks.ravel()])
+
+    @cached_property
+    def _factor(self) -> SymmetricFactor:
+        assert self.information is not None
+        return SymmetricFactor(self.information)
+
+    def pose_indices(self, k: int) -> Index:
+        """Where ``poses[k]`` stands in the state vector (k ≥ 1)."""
+        if not 1 <= k < len(self.poses):
+            raise UnknownNameError("pose", str(k), (f"1 … {len(self.poses) - 1} (pose 0 is fixed)",))
+        return 3 * (k - 1) + np.arange(3)
+
+    def landmark_indices(self, landmark_id: int) -> Index:
+        """Where the landmark of that id stands in the state vector."""
+        at = np.flatnonzero(self.landmark_ids == landmark_id)
+        if len(at) == 0:
+            raise UnknownNameError("landmark", str(landmark_id), (f"{len(self.landmark_ids)} ids",))
+        return 3 * (len(self.poses) - 1) + 2 * int(at[0]) + np.arange(2)
+
+    def covariance_block(self, indices: npt.ArrayLike) -> Array:
+        """Joint covariance of the scalars ``indices`` of the state vector, by sparse solves."""
+        if self.covariance is not None:
+            return self.covariance[np.ix_(np.asarray(indices), np.asarray(indices))]
+        return self._factor.inverse_block(indices)
+
+    def pose_covariance(self, k: int) -> Array:
+        """Covariance ``(3, 3)`` of ``poses[k]`` as a vector (x, y, θ)."""
+        return self.covariance_block(self.pose_indices(k))
+
+    def landmark_covariance(self, landmark_id: int) -> Array:
+        """Covariance ``(2, 2)`` of a landmark."""
+        return self.covariance_block(self.landmark_indices(landmark_id))
+
+    def joint_covariance(self) -> Array:
+        """The whole covariance ``(states, states)``: dense, O(states³), for evaluation."""
+        if self.covariance is not None:
+            return self.covariance
+        assert self.information is not None
+        return dense_inverse(self.information)
+
+    def _repr_html_(self) -> str:
+        polished = "" if self.objective_polished is None else f", polished {self.objective_polished:.4f}"
+        said = (
+            f": {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
+            f"objective {self.objective:.4f}{polished}, {self.iterations} iterations, {self.seconds:.3f} s"
+        )
+        return join([element("b", "Joined map"), said])
+
+
+# A step is halved no further than this before its direction is given up and damped.
+_SHORTEST = 0.05
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """What :func:`minimise` found.
+
+    Parameters
+    ----------
+    x : (n,)
+        Values in the order of :class:`~graphslam.join.submap_blocks.SubmapProblem`.
+    objective : float
+    iterations : int
+        Linearisations whose step was tried.
+    converged : bool
+    data : (nnz,)
+        Values of ``JᵀΩJ`` at ``x`` in the problem's pattern.
+    history : list of float
+        Objective before every iteration, and at the end.
+    """
+
+    x: Array
+    objective: float
+    iterations: int
+    converged: bool
+    data: Array
+    history: list[float] = field(default_factory=list)
+
+
+def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_iterations: int = 50) -> Minimum:
+    """Damped Gauss–Newton.
+
+    A step is tried as a straight line and along the chain (:meth:`SubmapProblem.bent`), and the lower end is taken:
+    after a long loop the correction of one heading moves kilometres of map along a circle, not along its tangent.
+    A step that does not lower the objective is halved a few times; if that does not help, Levenberg–Marquardt damping
+    on the diagonal grows until one does. The search ends when the decrease that the linear model still promises,
+    ``gᵀ H⁻¹ g``, is below ``rtol · max(objective, 1)``: the objective is a χ², so 1 is its natural unit where it
+    vanishes.
+
+    Parameters
+    ----------
+    problem : SubmapProblem
+    x : (n,)
+        Values to start from.
+    rtol : float
+    max_iterations : int
+
+    Raises
+    ------
+    SolverError
+        If the objective is not finite.
+    """
+    x = np.array(x, dtype=np.float64)
+    headings = np.arange(2, 3 * problem.m, 3)
+    pattern = problem.pattern
+    damping, converged, iterations = 0.0, False, 0
+    f, g, data = problem.linearise(x)
+    history = [f]
+    if not np.isfinite(f):
+        raise SolverError(f"objective is {f} at the start; wanted a finite number")
+    while iterations < max_iterations:
+        iterations += 1
+        step = -pattern.factor(data, damping).solve(g)
+        promised = float(-(g @ step))  # = gᵀ H⁻¹ g, the decrease of the linear model, when there is no damping
+        small = promised <= rtol * max(f, 1.0)
+        f_trial, trial = _lowest(problem, x, step)
+        shorter = 0.5
+        while not small and f_trial > f and shorter > _SHORTEST:  # costs no factorisation
+            f_trial, trial = _lowest(problem, x, shorter * step)
+            shorter *= 0.5
+        trial[headings] = wrap_angle(trial[headings])
+        if np.isfinite(f_trial) and f_trial <= f + (rtol * max(f, 1.0) if small else 0.0):
+            x = trial
+            damping = 0.0 if damping < 1e-6 else damping / 10.0
+            f, g, data = problem.linearise(x)
+            history.append(f)
+            if small and damping == 0.0:
+                converged = True
+                break
+        elif small and damping == 0.0:
+            converged = True  # rounding: the promised decrease is below what the objective resolves
+            break
+        else:
+            damping = max(10.0 * damping, 1e-5)
+            if damping > 1e12:
+                break
+        logger.debug("iteration %d: objective %.9g, promised %.3g, damping %.1g", iterations, f, promised, damping)
+    if not converged:
+        logger.warning("no convergence after %d iterations: objective %.9g", iterations, f)
+    return Minimum(x, f, iterations, converged, data, history)
+
+
+def _lowest(problem: SubmapProblem, x: Array, step: Array) -> tuple[float, Array]:
+    """The better end of a step, straight or along the chain, and its objective (infinite where it has none)."""
+    ends = [(problem.objective(t), t) for t in (x + step, problem.bent(x, step))]
+    return min(((f if np.isfinite(f) else np.inf, t) for f, t in ends), key=lambda end: end[0])
+
+
+def solve_submaps(
+    submaps: Sequence[Submap],
+    *,
+    initial_poses: ArrayLike | None = None,
+    initial_landmarks: ArrayLike | None = None,
+    scale: ArrayLike | None = None,
+    rtol: float = 1e-12,
+    max_iterations: int = 50,
+) -> SubmapEstimate:
+    """Least-squares optimum of a chain of landmark submaps (see :class:`SubmapProblem` and :func:`minimise`).
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        With global landmark ids.
+    initial_poses : (m, 3), optional
+        End poses to start from; default the chain.
+    initial_landmarks : (L, 2), optional
+        In the order of first sighting; default the first sighting under the initial poses.
+    scale : (m,) or float, optional
+        Factor on the covariance of each submap.
+    rtol, max_iterations
+        See :func:`minimise`.
+
+    Raises
+    ------
+    DataError, CovarianceError, SolverError
+    """
+    start = time.perf_counter()
+    problem = SubmapProblem(submaps, scale=scale)
+    best = minimise(
+        problem, problem.initial(initial_poses, initial_landmarks), rtol=rtol, max_iterations=max_iterations
+    )
+    return SubmapEstimate(
+        poses=np.vstack([np.zeros((1, 3)), best.x[: 3 * problem.m].reshape(-1, 3)]),
+        landmark_ids=problem.ids,
+        landmarks=best.x[3 * problem.m :].reshape(-1, 2).copy(),
+        information=problem.pattern.matrix(best.data),
+        objective=best.objective,
+        objective_polished=best.objective,
+        iterations=best.iterations,
+        converged=best.converged,
+        seconds=time.perf_counter() - start,
+    )

@@ -1,0 +1,137 @@
+"""Sparse Cholesky factorisation of matrices made of node blocks, with the symbolic part kept apart from the numbers.
+
+Made for the joiners, which factorise many matrices of a few hundred to a few ten thousand scalars: nodes instead of
+scalars are ordered and analysed, only one triangle is computed, and columns of the inverse cost a forward substitution
+that visits only the way to the root. SuperLU (:mod:`~graphslam.linear.symmetric_factor`) serves matrices of other
+kinds.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.linear import multifrontal_kernels as analysis
+from graphslam.linear import multifrontal_solve_kernels as solving
+
+Index = npt.NDArray[np.int64]
+
+# Zeros that a supernode may take in for the sake of larger dense blocks.
+_SLACK = 48
+
+
+class BlockSymbolic:
+    """What a factorisation needs to know before the numbers: pattern, order, supernodes.
+
+    Parameters
+    ----------
+    order : (N,)
+        ``order[k]`` is the node that is eliminated k-th.
+    width : (N,)
+        Scalars of each node; node i begins at ``sum(width[:i])`` in vectors.
+    ptr : (N + 1,)
+    neighbours : (nb,)
+        Pairs of nodes that share a block, each at least one way; the diagonal is included.
+
+    Attributes
+    ----------
+    nnz : int
+        Entries of the factor.
+    size : int
+        Scalars.
+    """
+
+    def __init__(self, order: Index, width: Index, ptr: Index, neighbours: Index) -> None:
+        self._ptr, self._idx = ptr, neighbours
+        self._parts = analysis.analyse(order, width, ptr, neighbours, _SLACK)
+        post, offset, first, parent, row_ptr, rows, panel_ptr, sizes = self._parts
+        self.nnz = int(sizes[2])
+        self.size = int(offset[-1])
+        self._entries, self._most = int(panel_ptr[-1]), int(sizes[0])
+        self._node_at = np.cumsum(width) - width  # caller's scalars
+        start, row = analysis.panel_scalars(offset, row_ptr, rows)
+        self._solve = (offset[first], start, row)
+        self._parent, self._panel_ptr = parent, panel_ptr
+        self._post, self._offset = post, offset
+
+    @cached_property
+    def permutation(self) -> Index:
+        """``permutation[i]`` is the caller's number of the scalar that is eliminated i-th."""
+        width = np.diff(self._offset)
+        begin = np.repeat(self._node_at[self._post] - self._offset[:-1], width)
+        return np.asarray(begin + np.arange(self.size))
+
+    @cached_property
+    def _place(self) -> Index:
+        place = np.empty(self.size, dtype=np.int64)
+        place[self.permutation] = np.arange(self.size)
+        return place
+
+    def factor(self, block: Index, value: Array, damping: float = 0.0) -> BlockFactor:
+        """Factorise ``A + damping · diag(A)``.
+
+        Parameters
+        ----------
+        block : (nb,)
+            Where the block of each pair of ``neighbours`` begins in ``value``: rows of the node whose list it is in,
+            columns of the neighbour, row-major. Of a pair that is given both ways the one of the node that is
+            eliminated first is read.
+        value : (k,)
+        damping : float
+
+        Raises
+        ------
+        IndeterminateError
+            If the matrix is not positive definite.
+        """
+        L = np.empty(self._entries)
+        bad = analysis.factorise(*self._parts, self._ptr, self._idx, block, value, damping, L)
+        if bad:
+            node = int(self._post[bad - 1])
+            raise IndeterminateError(
+                f"information matrix ({self.size}, {self.size}) is not positive definite at scalar "
+                f"{int(self._node_at[node])}"
+            )
+        return BlockFactor(self, L)
+
+
+class BlockFactor:
+    """``A = L Lᵀ``; made by :meth:`BlockSymbolic.factor`."""
+
+    def __init__(self, symbolic: BlockSymbolic, L: Array) -> None:
+        self._symbolic, self._L = symbolic, L
+
+    @property
+    def nnz(self) -> int:
+        """Entries of the factor."""
+        return self._symbolic.nnz
+
+    def solve(self, rhs: Array) -> Array:
+        """``A⁻¹ rhs`` for ``rhs`` ``(n,)``, in the caller's order."""
+        s = self._symbolic
+        x = np.asarray(rhs, dtype=np.float64)[s.permutation]
+        solving.forward(*s._solve, s._panel_ptr, self._L, x)
+        solving.backward(*s._solve, s._panel_ptr, self._L, x)
+        out = np.empty_like(x)
+        out[s.permutation] = x
+        return out
+
+    def inverse_block(self, indices: npt.ArrayLike) -> Array:
+        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, never the whole inverse (Algorithm 1)."""
+        s = self._symbolic
+        unit = s._place[np.asarray(indices, dtype=np.intp)]
+        W, _ = solving.forward_units(*s._solve, s._parent, s._panel_ptr, self._L, unit)
+        return np.asarray(W.T @ W)
+
+    def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:
+        """Blocks ``(k, width, width)`` on the diagonal of ``A⁻¹`` that begin at the scalars ``first`` ``(k,)``.
+
+        A block lies inside one node. By selected inversion: about the work of one factorisation for all of them.
+        """
+        s = self._symbolic
+        begin = s._place[np.asarray(first, dtype=np.intp)]
+        return np.asarray(solving.inverse_diagonal(*s._solve, s._parent, s._panel_ptr, self._L, begin, width, s._most))

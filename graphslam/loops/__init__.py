@@ -1,0 +1,1 @@
+"""Loops between submaps and ties between sessions: candidates, gates, consistency, ledger."""

@@ -1,0 +1,143 @@
+"""Loop candidates by what places look like, for drift that proximity cannot bear."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, upright
+from graphslam.loops.candidates import APPEARANCE, Candidate
+from graphslam.loops.places import Places
+from graphslam.registration.place_descriptor import Descriptors, similarity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AppearanceConfig:
+    """Which places that look alike are tried."""
+
+    top: int = 2
+    """Of each place, so many others at most, in different stretches."""
+    least: float = 0.5
+    """Correlation of descriptors, at least …"""
+    lead: float = 0.05
+    """… and so much better than the next stretch that is not given: where many places look the same, none is tried."""
+    least_way: float = 30.0
+    """Places nearer along the way are not tried [m]."""
+    stretch: float = 12.0
+    """Places nearer than this along the way are one stretch [m]."""
+    sigma: float = 2.0
+    """σ of the position that a descriptor predicts [m] …"""
+    height: float = 1.0
+    """… of its height [m] …"""
+    angle: float = 0.1
+    """… and of its heading [rad]."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not math.isfinite(value) or value < 0 or (value == 0 and f.name not in ("lead", "least", "least_way")):
+                raise ConfigError(f"loop candidates by appearance: {f.name} = {value}; wanted a positive number")
+
+
+def appearance_candidates(
+    places: Places,
+    descriptors: Descriptors,
+    config: AppearanceConfig | None = None,
+    *,
+    exclude: Collection[tuple[int, int]] = (),
+) -> list[Candidate]:
+    """Pairs of places in different submaps that look alike, most alike first; one place of a stretch, not all.
+
+    Parameters
+    ----------
+    places : Places
+    descriptors : Descriptors
+        Of these places.
+    config : AppearanceConfig, optional
+    exclude : collection of (int, int)
+        Pairs of submaps, either way round, that are not tried.
+
+    Returns
+    -------
+    list of Candidate
+        ``T_ij`` has no translation but the heading at which the two look most alike; its covariance is the stated one.
+        ``facts``: ``correlation`` and ``lead``, by how much it is better than what was not taken.
+    """
+    c = AppearanceConfig() if config is None else config
+    if len(descriptors) != len(places):
+        raise DataError("descriptors do not belong to the places", got=len(descriptors), wanted=len(places))
+    shut = {tuple(sorted(pair)) for pair in exclude}
+    keys = descriptors.ring_keys()
+    tree = cKDTree(keys)
+    g = group_of(places.T_base_node)
+    covariance = _covariance(c, g.dim)
+    found: list[Candidate] = []
+    for j in range(len(places)):
+        if places.way[j] < c.least_way:
+            continue
+        rows = np.sort(tree.query(keys[j], min(descriptors.config.shortlist, len(places)))[1]).astype(np.int64)
+        usable = places.way[j] - places.way[rows] >= c.least_way
+        usable &= places.submap[rows] != places.submap[j]
+        usable &= [tuple(sorted((int(s), int(places.submap[j])))) not in shut for s in places.submap[rows]]
+        rows = rows[usable]
+        if not len(rows):
+            continue
+        correlation, turn = similarity(descriptors, j, descriptors, rows)
+        best = _stretches(places.way[rows], correlation, c.stretch, c.top + 1)
+        # the best as a group must stand out from the next stretch, else this place looks like many
+        beaten = float(correlation[best[c.top]]) if len(best) > c.top else -1.0
+        for k in best[: c.top]:
+            lead = float(correlation[k]) - beaten
+            if correlation[k] < c.least or lead < c.lead:
+                break
+            found.append(
+                Candidate(
+                    i=int(rows[k]),
+                    j=j,
+                    source=APPEARANCE,
+                    T_ij=np.array([0.0, 0.0, turn[k]]) if g.dim == 2 else upright(np.zeros(3), turn[k]),
+                    covariance=covariance,
+                    gain=math.nan,
+                    score=float(correlation[k]),
+                    facts={"correlation": float(correlation[k]), "lead": lead},
+                )
+            )
+    return _thinned(places, sorted(found, key=lambda x: -x.score), c.stretch)
+
+
+def _covariance(c: AppearanceConfig, dim: int) -> Array:
+    if dim == 2:
+        return np.diag([c.sigma**2, c.sigma**2, c.angle**2])
+    tilt = 0.03
+    return np.diag([tilt**2, tilt**2, c.angle**2, c.sigma**2, c.sigma**2, c.height**2])
+
+
+def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int]:
+    """The best of ``score``, one a stretch."""
+    left = np.ones(len(way), bool)
+    out: list[int] = []
+    for k in np.argsort(-score, kind="stable").tolist():
+        if left[k]:
+            out.append(k)
+            left &= np.abs(way - way[k]) >= stretch
+        if len(out) == count:
+            break
+    return out
+
+
+def _thinned(places: Places, found: list[Candidate], stretch: float) -> list[Candidate]:
+    """One pair of two stretches, the best."""
+    kept: list[Candidate] = []
+    for x in found:
+        if all(
+            abs(places.way[x.i] - places.way[y.i]) >= stretch or abs(places.way[x.j] - places.way[y.j]) >= stretch
+            for y in kept
+        ):
+            kept.append(x)
+    return kept

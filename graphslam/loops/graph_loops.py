@@ -1,0 +1,130 @@
+"""A pose graph of dense submaps as loops see it: its places, its chain, and the verbs that decisions need."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.graph.noise import Robust
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.records import BetweenRecord
+from graphslam.graph.relative import relative_poses
+from graphslam.loops.measure import Loop
+from graphslam.loops.places import Ints, Places, places_at_nodes
+
+GROUP = "loop"
+"""Class under which the graph's objective reports loops."""
+
+
+class GraphSolver(Protocol):
+    """A solver of a pose graph."""
+
+    def solve_to_optimum(self) -> None: ...
+
+
+def places_of_graph(graph: PoseGraph) -> Places:
+    """Bases and inner nodes of all submaps of a graph of one chain; place k is node k.
+
+    Raises
+    ------
+    DataError
+        No submap, one without nodes of its own, or more than one session.
+    """
+    if not graph.submaps:
+        raise DataError("a graph without submaps has no places")
+    for k, s in enumerate(graph.submaps):
+        wanted = 0 if k == 0 else graph.submaps[k - 1].exit_node
+        if not s.nodes or s.nodes != tuple(range(wanted, wanted + len(s.nodes))):
+            raise DataError(
+                f"submap {s.key} does not go on where the one before ended: loops need one chain of dense submaps",
+                got=s.nodes[:1],
+                wanted=wanted,
+            )
+    return places_at_nodes([s.T_base_node for s in graph.submaps], [s.times for s in graph.submaps])
+
+
+def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
+    """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
+
+    The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
+
+    Raises
+    ------
+    DataError
+        A factor of the chain was removed.
+    """
+    T, P = [], []
+    for s in graph.submaps:
+        for k, fid in enumerate(s.factor_ids[: len(s.nodes) - 1]):
+            r = graph.records.get(fid)
+            if not isinstance(r, BetweenRecord) or (r.i, r.j) != (s.nodes[k], s.nodes[k + 1]):
+                raise DataError(f"the chain of submap {s.key} is not whole", got=f"factor {fid}")
+            T.append(r.T_ij)
+            P.append(s.stated[k])
+    return np.stack(T), np.stack(P)
+
+
+class GraphLoops:
+    """A :class:`~graphslam.loops.loops.LoopGraph` of a pose graph.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Of one chain of dense submaps; may hold GPS and attitudes too.
+    solver : GraphSolver
+        Of that graph.
+
+    Raises
+    ------
+    DataError
+        See :func:`places_of_graph`.
+    """
+
+    def __init__(self, graph: PoseGraph, solver: GraphSolver) -> None:
+        self.graph, self.solver = graph, solver
+        self.places = places_of_graph(graph)
+
+    def relative(self, i: Ints, j: Ints) -> tuple[Array, Array]:
+        """See :class:`~graphslam.loops.loops.LoopGraph`."""
+        nodes, at = np.unique(np.concatenate([i, j]), return_inverse=True)
+        layout, d = self.graph.flat().layout, self.graph.values.group.dof
+        columns = layout.pose_columns(nodes.astype(np.int64))
+        free = np.flatnonzero(columns[:, 0] >= 0)
+        S = np.zeros((len(nodes), d, len(nodes), d))
+        if len(free):
+            block = self.graph.covariance().columns(columns[free].ravel())
+            S[free[:, None], :, free[None, :]] = block.reshape(len(free), d, len(free), d).transpose(0, 2, 1, 3)
+        a, b = at[: len(i)], at[len(i) :]
+        x = self.graph.values.poses
+        return relative_poses(x[i], x[j], S[a, :, a], S[a, :, b], S[b, :, b])
+
+    def add_loop(self, loop: Loop, robust: Robust) -> int:
+        """A between-factor of declared ``shared-scan`` evidence."""
+        s = self.graph.submaps[int(self.places.submap[loop.j])]
+        return self.graph.add_between(
+            loop.i,
+            loop.j,
+            loop.T_ij,
+            loop.covariance,
+            streams=["match"],
+            interval=s.interval,
+            evidence="shared-scan",
+            robust=robust,
+            group=GROUP,
+        )
+
+    def remove_loop(self, factor_id: int) -> None:
+        """See :class:`~graphslam.loops.loops.LoopGraph`."""
+        self.graph.remove(factor_id, reason="loop switched off")
+
+    def solve(self) -> None:
+        """See :class:`~graphslam.loops.loops.LoopGraph`."""
+        self.solver.solve_to_optimum()
+
+    def chi2(self) -> dict[int, float]:
+        """See :class:`~graphslam.loops.loops.LoopGraph`."""
+        blocks = self.graph.flat().factor_blocks(self.graph.values)
+        return {r.factor_id: float(v) for r, v in zip(blocks.records, blocks.d2)}

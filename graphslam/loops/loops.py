@@ -1,0 +1,400 @@
+"""Which loops are believed: each is tried against the graph, against the others, and by what it does once it is in.
+
+One wrong loop ruins a map, so a loop passes, in this order,
+
+1. the gates of its registration (:mod:`graphslam.registration.gates`);
+2. the χ² of the chain of submaps alone, and all other loops two by two: the largest set that agrees (pairwise
+   consistency);
+3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
+4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
+   are in, every one is asked what the graph *without* it says of it;
+5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
+   and by what a second opinion says that judges all of them together;
+6. of two groups that cannot both be right the one is believed that the rest of the graph bears out, whatever their
+   number; neither, if it cannot tell (:mod:`~graphslam.loops.disputes`).
+
+With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
+without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
+solution is needed for it. Every step writes a :class:`~graphslam.loops.ledger.Decision`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from graphslam.association.consistent_set import Chain, ConsistentSet, LoopArrays, chain_chi2, consistent_loops
+from graphslam.core.errors import DataError
+from graphslam.core.gaussian import check_covariance
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.graph.noise import Robust
+from graphslam.loops.disputes import CLASH, SHUTS_OUT, disputes, weigh
+from graphslam.loops.ledger import Decision, LoopLedger, Verdict
+from graphslam.loops.measure import Loop
+from graphslam.loops.places import Ints
+from graphslam.loops.rules import Judge, LoopConfig, LoopGraph, chi2_without
+from graphslam.registration.submap_pairs import prediction_chi2
+
+
+class LoopCloser:
+    """Decides on loops, and keeps the ledger.
+
+    Parameters
+    ----------
+    graph : LoopGraph
+    increments, covariances : (n, 7|3), (n, d, d)
+        The chain alone, from node to node, right tangents: what pairwise consistency goes by.
+    config : LoopConfig, optional
+    ledger : LoopLedger, optional
+        To go on with.
+    judge : callable, optional
+        Which of all loops the chain and the others bear out, judged together: from increments, covariances and the
+        loops' ends, relative poses and covariances to ``(l,) bool``
+        (:func:`graphslam.loops.judge.settled_loops`).
+    """
+
+    def __init__(
+        self,
+        graph: LoopGraph,
+        increments: Array,
+        covariances: Array,
+        config: LoopConfig | None = None,
+        ledger: LoopLedger | None = None,
+        judge: Judge | None = None,
+    ) -> None:
+        self.graph = graph
+        self.increments, self.covariances = increments, covariances
+        self.config = LoopConfig() if config is None else config
+        self.ledger = LoopLedger() if ledger is None else ledger
+        self.judge = judge
+        self.loops: dict[int, Loop] = {}
+        self._dof = group_of(increments).dof
+
+    # ---------------------------------------------------------------- deciding
+
+    @property
+    def accepted(self) -> list[int]:
+        """Numbers of the loops that are in the graph."""
+        return [d.loop for d in self.ledger.current() if d.verdict == "accepted"]
+
+    def propose(self, loops: Sequence[Loop]) -> list[Decision]:
+        """Decide on new loops, and again on those that are in or were refused by the company they were in.
+
+        Returns
+        -------
+        list of Decision
+            In force for the new ones, in their order.
+
+        Raises
+        ------
+        CovarianceError
+            A loop that passed its gates without a covariance.
+        """
+        first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
+        numbers = list(range(first, first + len(loops)))
+        usable = []
+        for n, loop in zip(numbers, loops):
+            self.loops[n] = loop
+            if loop.why:
+                self._write(n, "rejected", f"registration: {loop.why}")
+            else:
+                check_covariance(loop.covariance, what=f"covariance of loop {n}", dim=self._dof)
+                usable.append(n)
+        if usable:
+            self._decide(usable)
+        return [self.ledger.of(n) for n in numbers]
+
+    def undo(self, loop: int, why: str = "asked for") -> Decision:
+        """Take a loop out of the graph, and solve without it.
+
+        Raises
+        ------
+        DataError
+            It is not in the graph.
+        """
+        d = self.ledger.of(loop)
+        if d.verdict != "accepted":
+            raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
+        before = sum(self.graph.chi2().values())
+        self.graph.remove_loop(d.factor_id)
+        self.graph.solve()
+        effect = sum(self.graph.chi2().values()) - before
+        self.ledger.write(replace(d, verdict="undone", why=why, weight=0.0, factor_id=-1, effect=effect))
+        return self.ledger.of(loop)
+
+    def _decide(self, new: list[int]) -> None:
+        """Rounds: what the graph refuses of the largest set that agrees has no say about the others any more."""
+        out: set[int] = set()
+        while True:
+            refused = self._round(new, out)
+            refused |= self._reconsider()
+            if not refused:
+                break
+            out |= refused
+        if self._exchange():
+            self._reconsider()
+        if self._second_opinion():
+            self._reconsider()
+        if self._disputes():
+            self._reconsider()
+        self._say_weights()
+
+    def _round(self, new: list[int], out: set[int]) -> set[int]:
+        """One round over all loops but ``out``; those of the largest set that agrees which the graph refused."""
+        # loops that disagreed with others may turn out right when more are there
+        again = [n for n in self._refused_by_company() if n not in new]
+        numbers = [n for n in sorted({*new, *self.accepted, *again}) if n not in out]
+        if not numbers:
+            return set()
+        chain = dict(zip(numbers, self._against_chain(numbers)))
+        limit = float(stats.chi2.ppf(self.config.chain, self._dof))
+        inside = set(self.accepted)
+        for n in numbers:
+            if n not in inside and not chain[n] <= limit:
+                self._refuse(n, f"chain: χ² {chain[n]:.1f} > {limit:.1f}", chain[n])
+        numbers = [n for n in numbers if n in inside or chain[n] <= limit]
+        if not numbers:
+            return set()
+        found = self._consistent(numbers)
+        left = []
+        for k, n in enumerate(numbers):
+            if found.accepted[k]:
+                if n not in inside:
+                    left.append((chain[n], n))
+            elif n in inside:
+                self.switch_off(n, f"pairwise: {found.reasons[k]}")
+            else:
+                self._refuse(n, f"pairwise: {found.reasons[k]}", chain[n])
+        tried = [n for _, n in sorted(left)]
+        self._one_by_one(tried)
+        return set(tried) - set(self.accepted)
+
+    def _refuse(self, n: int, why: str, chi2: float) -> None:
+        """Write a refusal, unless that is what the ledger says already."""
+        last = [d for d in self.ledger.decisions if d.loop == n][-1:]
+        if not last or last[0].why != why:
+            self._write(n, "rejected", why, chi2=chi2)
+
+    def _one_by_one(self, numbers: list[int]) -> None:
+        for n in numbers:  # each against the graph as it is by then
+            verdict, why, facts = self._try(n)
+            self._write(n, verdict, why, **facts)
+
+    def _try(self, n: int) -> tuple[Verdict, str, dict[str, float]]:
+        """Add one loop if the graph bears it: verdict, reason, figures."""
+        c, d, loop = self.config, self._dof, self.loops[n]
+        limit = float(stats.chi2.ppf(c.level, d))
+        earlier_limit = float(stats.chi2.ppf(c.earlier, d))
+        expected = float(self._against_graph([n])[0])
+        if not expected <= limit:  # NaN is not
+            return "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", {"chi2": expected}
+        before = self.graph.chi2()
+        fid = self.graph.add_loop(loop, self._kernel())
+        self.graph.solve()
+        after = self.graph.chi2()
+        effect = sum(after.values()) - sum(before.values())
+        earlier = sum(after[f] - before[f] for f in before)
+        facts = {"chi2": expected, "effect_predicted": expected, "effect": effect, "effect_earlier": earlier}
+        if not earlier <= earlier_limit:
+            self.graph.remove_loop(fid)
+            self.graph.solve()
+            worst = max(before, key=lambda f: after[f] - before[f])
+            why = f"effect: χ² of earlier factors rises by {earlier:.1f} > {earlier_limit:.1f} (most: factor {worst})"
+            return "switched-off", why, facts
+        weight = float(self._kernel().weight(np.array([after[fid]]))[0])
+        return "accepted", found_why(expected, d), {**facts, "factor_id": fid, "weight": weight}
+
+    def _exchange(self) -> bool:
+        """Were more loops shut out by the company of others than these are? Then they take the others' place.
+
+        Pairs are compared with the chain between them, which may bear much; loops that agree two by two may still not
+        fit into one graph together with a group that is wrong, and each of them is refused by itself.
+        """
+        inside, outside = self.accepted, self._refused_by_company()
+        outside = [n for n in outside if self._bears(n)]
+        if not inside or len(outside) < 2:
+            return False
+        agreed = self._consistent(outside).accepted
+        outside = [n for n, good in zip(outside, agreed) if good]
+        both = self._consistent([*inside, *outside])
+        clash = both.chi2[: len(inside), len(inside) :] > both.limit
+        # a right pair disagrees now and then by chance: rivals are those that shut out many
+        rivals = [n for n, row in zip(inside, clash) if row.mean() > SHUTS_OUT]
+        return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
+
+    def _second_opinion(self) -> bool:
+        """What all loops together say, judged without regard to which came first."""
+        inside = self.accepted
+        asked = sorted({*inside, *(n for n in self._refused_by_company() if self._bears(n))})
+        if self.judge is None or not inside or len(asked) < 2:
+            return False
+        good = self.judge(self.increments, self.covariances, self._arrays(asked))
+        believed = {n for n, yes in zip(asked, good) if yes}
+        rivals, outside = [n for n in inside if n not in believed], sorted(believed - set(inside))
+        return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
+
+    def _swap(self, rivals: list[int], outside: list[int]) -> bool:
+        """Take loops out and try others instead; back as it was if not more of them fit."""
+        for n in rivals:
+            self.graph.remove_loop(self.ledger.of(n).factor_id)
+        self.graph.solve()
+        added = {}
+        for _, n in sorted(zip(self._against_chain(outside), outside)):
+            verdict, why, facts = self._try(n)
+            if verdict == "accepted":
+                added[n] = (why, facts)
+        if len(added) > len(rivals):
+            for n in rivals:
+                why = f"exchange: shut out {len(added)} that agree with each other, {len(rivals)} did"
+                self.ledger.write(replace(self.ledger.of(n), verdict="switched-off", why=why, weight=0.0, factor_id=-1))
+            for n, (why, facts) in added.items():
+                self._write(n, "accepted", why, **facts)
+            return True
+        for _, facts in added.values():
+            self.graph.remove_loop(int(facts["factor_id"]))
+        for n in rivals:
+            fid = self.graph.add_loop(self.loops[n], self._kernel())
+            self.ledger.write(replace(self.ledger.of(n), factor_id=fid))
+        self.graph.solve()
+        return False
+
+    def _disputes(self) -> bool:
+        """Groups that cannot both be right: the one that the rest of the graph bears out, or neither."""
+        inside = self.accepted
+        outside = [n for n in self._refused_by_company() if self._bears(n)]
+        if not inside or len(outside) < 2:
+            return False
+        both = [*inside, *outside]
+        ends = self._arrays(both)[0]
+        limit = float(stats.chi2.ppf(CLASH, self._dof))
+        changed = False
+        for rows, columns in disputes(self._consistent(both).chi2, len(inside), ends, limit):
+            a, b = [both[k] for k in rows], [both[k] for k in columns]
+            if not set(a) <= set(self.accepted):
+                continue  # another dispute has changed that
+            for n in a:
+                self.graph.remove_loop(self.ledger.of(n).factor_id)
+            self.graph.solve()
+            other = self._against_graph(b)
+            outcome, why = weigh(self._against_graph(a), other)
+            for n in a:
+                d = self.ledger.of(n)
+                if outcome == "stays":
+                    fid = self.graph.add_loop(self.loops[n], self._kernel())
+                    self.ledger.write(replace(d, factor_id=fid))
+                else:
+                    self.ledger.write(replace(d, verdict="switched-off", why=why, weight=0.0, factor_id=-1))
+            if outcome == "changes":
+                self._one_by_one(b)
+            elif outcome == "ambiguous":
+                for n, value in zip(b, other):
+                    self._refuse(n, why, float(value))
+            self.graph.solve()
+            changed |= outcome != "stays"
+        return changed
+
+    def _against_graph(self, numbers: list[int]) -> Array:
+        """χ² of loops that are not in the graph, each by itself ``(k,)``."""
+        x = [self.loops[n] for n in numbers]
+        T, P = self.graph.relative(np.array([a.i for a in x]), np.array([a.j for a in x]))
+        return np.array([prediction_chi2(a.T_ij, a.covariance, T[k], P[k]) for k, a in enumerate(x)])
+
+    def _bears(self, n: int) -> bool:
+        """Whether the chain alone bears a loop."""
+        return self._against_chain([n])[0] <= float(stats.chi2.ppf(self.config.chain, self._dof))
+
+    def _reconsider(self) -> set[int]:
+        """Switch off, worst first, what the rest of the graph contradicts; which these were."""
+        limit = float(stats.chi2.ppf(self.config.off, self._dof))
+        gone: set[int] = set()
+        while inside := self.accepted:
+            alone = self.without(inside)
+            worst = int(np.argmax(alone))
+            if not alone[worst] > limit:
+                break
+            n = inside[worst]
+            self.switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
+            gone.add(n)
+        return gone
+
+    def _say_weights(self) -> None:
+        """The kernels' weights have changed since loops were taken."""
+        chi2 = self.graph.chi2()
+        for n in self.accepted:
+            d = self.ledger.of(n)
+            weight = float(self._kernel().weight(np.array([chi2[d.factor_id]]))[0])
+            if abs(weight - d.weight) > 0.01:
+                self.ledger.write(replace(d, weight=weight))
+
+    def without(self, numbers: Sequence[int]) -> Array:
+        """χ² of loops that are in the graph against the graph without them ``(k,)``, each by itself.
+
+        ``rᵀ (R - P)⁻¹ r`` with the residual r and the posterior P of the relative pose
+        (:func:`~graphslam.loops.rules.chi2_without`).
+        """
+        loops = [self.loops[n] for n in numbers]
+        T, P = self.graph.relative(np.array([x.i for x in loops]), np.array([x.j for x in loops]))
+        return np.array([chi2_without(x, T[k], P[k]) for k, x in enumerate(loops)])
+
+    # ---------------------------------------------------------------- writing
+
+    def switch_off(self, n: int, why: str, chi2: float = math.nan) -> None:
+        """Take a loop that is in the graph out of it, since something contradicts it, and solve without it."""
+        d = self.ledger.of(n)
+        before = sum(self.graph.chi2().values())
+        self.graph.remove_loop(d.factor_id)
+        self.graph.solve()
+        effect = sum(self.graph.chi2().values()) - before
+        value = d.chi2 if math.isnan(chi2) else chi2
+        self.ledger.write(
+            replace(d, verdict="switched-off", why=why, weight=0.0, factor_id=-1, effect=effect, chi2=value)
+        )
+
+    def _write(self, n: int, verdict: Verdict, why: str, **facts: float) -> None:
+        x = self.loops[n]
+        known: dict[str, float] = dict(facts)
+        measured = bool(np.all(np.isfinite(x.covariance)))
+        fid = int(known.pop("factor_id", -1))
+        self.ledger.write(
+            Decision(
+                loop=n, verdict=verdict, why=why, i=int(x.i), j=int(x.j), submap_i=int(x.submaps[0]),
+                submap_j=int(x.submaps[1]), source=x.source, score=x.score, gain=x.gain, gates=x.gates, factor_id=fid,
+                T_ij=x.T_ij.tolist() if measured else [], covariance=x.covariance.tolist() if measured else [],
+                **known,
+            )  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def _refused_by_company(self) -> list[int]:
+        verdicts = ("rejected", "switched-off")
+        return [
+            d.loop
+            for d in self.ledger.current()
+            if d.verdict in verdicts and d.loop in self.loops and not self.loops[d.loop].why
+        ]
+
+    def _arrays(self, numbers: list[int]) -> tuple[Ints, Array, Array]:
+        x = [self.loops[n] for n in numbers]
+        ends = np.array([[a.i, a.j] for a in x], dtype=np.int64)
+        return ends, np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
+
+    def _against_chain(self, numbers: list[int]) -> list[float]:
+        chain = Chain.of(self.increments, self.covariances)
+        return [float(v) for v in chain_chi2(chain, LoopArrays.of(chain, *self._arrays(numbers)))]
+
+    def _consistent(self, numbers: list[int]) -> ConsistentSet:
+        return consistent_loops(
+            self.increments, self.covariances, self._arrays(numbers), self.config.pairwise, against_chain=False
+        )
+
+    def _kernel(self) -> Robust:
+        return self.config.robust(self._dof)
+
+
+def found_why(chi2: float, dof: int) -> str:
+    """Why a loop was accepted, in words."""
+    return f"agrees with the graph: χ² {chi2:.1f} of {dof}"

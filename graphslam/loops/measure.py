@@ -1,0 +1,111 @@
+"""From candidates to measured loops: every pair is registered, judged, and hung on the nearest places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from tqdm import tqdm
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.core.submap import Submap
+from graphslam.loops.candidates import FRONT_END, TIE, Candidate
+from graphslam.loops.places import Places
+from graphslam.registration.pair_config import PairConfig
+from graphslam.registration.submap_pairs import MapGrid, PreparedMap, match_pair
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """A measured loop, before it is decided on.
+
+    Parameters
+    ----------
+    i, j : int
+        Places, which are nodes of the chain.
+    T_ij : (7,) or (3,)
+    covariance : (d, d)
+        Right tangent; NaN where the registration came to nothing.
+    source : str
+        Who proposed it.
+    score, gain : float
+        Of the candidate.
+    why : str
+        Gates of the registration that it fails; empty for one that may be taken.
+    gates : dict
+        Figures that were judged; JSON-serialisable.
+    submaps : (int, int)
+        Keys of the submaps of i and j.
+    """
+
+    i: int
+    j: int
+    T_ij: Array
+    covariance: Array
+    source: str
+    score: float = float("nan")
+    gain: float = float("nan")
+    why: str = ""
+    gates: dict[str, Any] = field(default_factory=dict)
+    submaps: tuple[int, int] = (-1, -1)
+
+
+class LoopMeasurer:
+    """Registers candidates; maps are prepared once.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        With grids.
+    places : Places
+    config : PairConfig, optional
+    """
+
+    def __init__(self, submaps: Sequence[Submap], places: Places, config: PairConfig | None = None) -> None:
+        self.submaps, self.places = submaps, places
+        self.config = PairConfig() if config is None else config
+        self._maps: dict[int, PreparedMap] = {}
+
+    def prepared(self, k: int) -> PreparedMap:
+        """The map of submap ``k`` of the chain.
+
+        Raises
+        ------
+        DataError
+            It has none.
+        """
+        if k not in self._maps:
+            grid = self.submaps[k].grid
+            if grid is None:
+                raise DataError(f"submap {self.submaps[k].key} has no grid to be matched", wanted="an evidence grid")
+            self._maps[k] = PreparedMap(cast(MapGrid, grid), self.config)
+        return self._maps[k]
+
+    def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
+        """Loops of candidates, in their order; a front end's match or a tie is one already."""
+        return [self.one(c) for c in tqdm(candidates, "matching submaps", disable=not progress, leave=False)]
+
+    def one(self, c: Candidate) -> Loop:
+        """The loop of one candidate, accepted by the gates or not."""
+        p = self.places
+        a, b = int(p.submap[c.i]), int(p.submap[c.j])
+        keys = (self.submaps[a].key, self.submaps[b].key)
+        if c.source in (FRONT_END, TIE):
+            return Loop(
+                i=c.i, j=c.j, T_ij=c.T_ij, covariance=c.covariance, source=c.source, score=c.score, gain=c.gain,
+                gates=dict(c.facts), submaps=keys,
+            )  # fmt: skip
+        g = group_of(c.T_ij)
+        target_prior = g.compose(p.T_base_node[c.i], c.T_ij)
+        m = match_pair(self.prepared(b), p.T_base_node[c.j], self.prepared(a), target_prior, c.covariance)
+        i = c.i
+        if m.registration is not None:
+            # what the place sees there was mapped from the nearest stretch of the target's path
+            i = p.nearest(a, m.T_target_source[: g.dim])
+        return Loop(
+            i=i, j=c.j, T_ij=g.between(p.T_base_node[i], m.T_target_source), covariance=m.covariance, source=c.source,
+            score=c.score, gain=c.gain, why=m.why, gates={**m.gates(), **c.facts}, submaps=keys,
+        )  # fmt: skip

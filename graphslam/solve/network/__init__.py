@@ -1,0 +1,1 @@
+"""Pose networks from files: starts, solvers, robust solvers, certificates."""

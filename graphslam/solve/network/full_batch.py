@@ -1,0 +1,179 @@
+"""Landmark SLAM without submaps: every scan pose and every landmark of a log in one least-squares problem.
+
+It is the floor that submap methods are measured against: their optimum can be no better informed than this one, and a
+submap that loses something loses it here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from graphslam.core.errors import DataError, SolverError
+from graphslam.core.geometry import Array, ArrayLike, rotation2, se2_adjoint, se2_compose, se2_inverse
+from graphslam.core.network import PoseNetwork
+from graphslam.core.records import LandmarkObservations
+from graphslam.linear.symmetric_factor import SymmetricFactor
+from graphslam.solve.network.batch import is_converged, polish
+from graphslam.solve.network.model import Layout, linearise
+from graphslam.solve.network.sparse import SparseProblem
+
+Ids = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FullBatch:
+    """The optimum over all scan poses and landmarks.
+
+    Parameters
+    ----------
+    poses : (n + 1, 3)
+        Bases at the start and at every scan, in the frame of the first.
+    landmark_ids : (l,) int64
+    landmarks : (l, 2)
+    objective : float
+        Σ rᵀ Ω r at the optimum.
+    dof : int
+        Measured minus free scalars.
+    information : csc_matrix
+        Of [right tangents of poses 1 … n, landmarks]; the poses are those of the *sensor* where it is not at the base.
+    iterations : int
+    converged : bool
+    seconds : float
+    """
+
+    poses: Array
+    landmark_ids: Ids
+    landmarks: Array
+    objective: float
+    dof: int
+    information: sp.csc_matrix
+    iterations: int
+    converged: bool
+    seconds: float
+    sensor: Array
+    _cache: dict[str, SymmetricFactor] = field(default_factory=dict, repr=False, compare=False)
+
+    def _factor(self) -> SymmetricFactor:
+        return self._cache.setdefault("factor", SymmetricFactor(self.information))
+
+    def pose_covariances(self, indices: ArrayLike) -> Array:
+        """Covariances ``(k, 3, 3)`` of bases ``indices`` ``(k,)`` ≥ 1, as plain vectors x, y, θ of the first frame."""
+        k = np.atleast_1d(np.asarray(indices, dtype=np.intp))
+        if np.any(k < 1) or np.any(k >= len(self.poses)):
+            raise DataError("no such free pose", got=k.tolist(), wanted=f"1 … {len(self.poses) - 1}")
+        P = self._factor().inverse_diagonal_blocks(3 * (k - 1), 3)
+        R = np.zeros((len(k), 3, 3))
+        R[:, :2, :2], R[:, 2, 2] = rotation2(self.poses[k, 2]), 1.0
+        G = R @ se2_adjoint(self.sensor)  # tangent at the sensor → tangent at the base → plain vector
+        return np.asarray(G @ P @ G.swapaxes(1, 2))
+
+    def landmark_covariance(self) -> Array:
+        """Joint covariance ``(2 l, 2 l)`` of all landmarks."""
+        first = 3 * (len(self.poses) - 1)
+        return self._factor().inverse_block(first + np.arange(2 * len(self.landmarks)))
+
+
+def full_batch(
+    increments: ArrayLike,
+    covariances: ArrayLike,
+    observations: LandmarkObservations,
+    *,
+    initial_poses: ArrayLike,
+    initial_landmarks: Mapping[int, ArrayLike],
+    max_iterations: int = 100,
+) -> FullBatch:
+    """Least squares over a whole log with known association.
+
+    Parameters
+    ----------
+    increments, covariances : (n, 3), (n, 3, 3)
+        Dead reckoning into every scan (right tangent at the later pose); the first from the base.
+    observations : LandmarkObservations
+        n scans; observations without identity (-1) are not used.
+    initial_poses : (n, 3)
+        Bases at the scans in the frame of the first base. Dead reckoning over kilometres is too poor a start: give the
+        path of a solved submap graph.
+    initial_landmarks : mapping of id to (2,)
+    max_iterations : int
+
+    Returns
+    -------
+    FullBatch
+
+    Raises
+    ------
+    DataError
+        Lengths differ, no identities, or a landmark without a start.
+    SolverError
+        Gauss-Newton finds no minimum.
+    """
+    start = time.perf_counter()
+    u, Q = np.asarray(increments, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+    x0, n = np.asarray(initial_poses, dtype=np.float64), len(observations.times)
+    if observations.ids is None:
+        raise DataError("full batch needs identities", got="none", wanted="landmark ids")
+    if len(u) != n or len(x0) != n:
+        raise DataError("there must be one increment and one initial pose a scan", got=(len(u), len(x0)), wanted=n)
+    rows = np.flatnonzero(observations.ids >= 0)
+    scan = np.searchsorted(observations.offsets, rows, side="right") - 1
+    ids, landmark = np.unique(observations.ids[rows], return_inverse=True)
+    missing = [int(i) for i in ids if int(i) not in initial_landmarks]
+    if missing:
+        raise DataError(f"{len(missing)} landmarks have no start", got=missing[:5], wanted="an initial position each")
+    # The network sees from its vertices, so its vertices are the sensor's poses: x_s = x ∘ T_base_sensor.
+    sensor = observations.T_base_sensor
+    back = se2_adjoint(se2_inverse(sensor))
+    measured = se2_compose(se2_inverse(sensor), se2_compose(u, sensor))
+    poses = se2_compose(np.vstack([np.zeros((1, 3)), x0]), sensor)
+    network = PoseNetwork(
+        dim=2,
+        ids=np.arange(n + 1),
+        poses=poses,
+        has_initial=np.ones(n + 1, dtype=bool),
+        edges=np.column_stack([np.arange(n), np.arange(1, n + 1)]),
+        measurements=measured,
+        information=np.asarray(np.linalg.inv(back @ Q @ back.T), dtype=np.float64),
+        fixed=np.arange(n + 1) == 0,
+        landmark_ids=n + 1 + np.arange(len(ids)),
+        landmarks=np.array([initial_landmarks[int(i)] for i in ids], dtype=np.float64).reshape(-1, 2),
+        has_landmark=np.ones(len(ids), dtype=bool),
+        observations=np.column_stack([scan + 1, landmark]),
+        observation_values=np.column_stack([observations.bearings[rows], observations.ranges[rows]]),
+        observation_information=_diagonal(1.0 / observations.sigmas[rows, ::-1] ** 2),
+        observation_kind="bearing-range",
+        source="full batch",
+    )
+    problem = SparseProblem(network)
+    best = polish(problem, (network.poses, network.landmarks), max_iterations=max_iterations)
+    x, l = problem.arrays(best.values)
+    objective = problem.objective((x, l))
+    if not np.isfinite(objective):
+        raise SolverError(f"full batch diverged: objective {objective}; wanted a finite one")
+    layout = Layout.of(network)
+    J, r = linearise(network, x, l, layout)
+    return FullBatch(
+        poses=se2_compose(x, se2_inverse(sensor)),
+        landmark_ids=ids,
+        landmarks=l,
+        objective=objective,
+        dof=len(r) - layout.size,
+        information=sp.csc_matrix(J.T @ J),
+        iterations=best.iterations,
+        converged=is_converged(network, objective, problem.decrement((x, l))),
+        seconds=time.perf_counter() - start,
+        sensor=np.asarray(sensor, dtype=np.float64),
+    )
+
+
+def _diagonal(values: Array) -> Array:
+    """Diagonal matrices ``(m, d, d)`` of the rows of ``(m, d)``."""
+    out = np.zeros((*values.shape, values.shape[1]))
+    k = np.arange(values.shape[1])
+    out[:, k, k] = values
+    return out

@@ -1,0 +1,288 @@
+"""Truncated least squares on a pose network: which measurements are wrong, and the tight solve of the rest.
+
+A measurement pays at most ``s² χ²_d(p)`` (Yang, Antonante, Tzoumas & Carlone 2020, TLS cost), where s² is how far the
+file misstates its variance. Graduated non-convexity finds a good local minimum if it begins near one; least squares of
+everything, its usual start, is no such place when a third of the loops are wrong. So it begins from the loops that
+their neighbours bear out (:mod:`~graphslam.solve.network.consensus`), with the schedule as late as the residuals there
+allow. Plain trimming from every start is the competitor. What it ends with is settled by evidence, loop by loop and
+group by group (:mod:`~graphslam.solve.network.settle`), with the file's own limit, and the lowest truncated cost wins.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+from tqdm import tqdm
+
+from graphslam.core.errors import ConfigError, IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.solve.network.batch import BatchProblem, Polished, polish
+from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
+from graphslam.solve.network.diagnose import check_determined
+from graphslam.solve.network.model import edge_costs, observation_costs, subnetwork
+from graphslam.solve.network.settle import FEW, Settled, settle
+from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start
+
+log = logging.getLogger(__name__)
+
+Mask = npt.NDArray[np.bool_]
+ROUNDS = 12
+# The bulk of recorded loops says little of the tail: with an estimated scale, the limit is so many times wider until
+# the tail is known, though never beyond that of the stated noise.
+MARGIN = 20.0
+# Growth of μ, descent steps at each, and when to stop (Yang et al. 2020 use 1.4).
+GROWTH, STEPS, STAGES = 1.4, 2, 60
+# Residuals of the loops believed at the start are taken to be at most so many times the limit: μ starts there.
+WORST = 1e3
+# The guess is confirmed if fewer of all edges than this were believed at first and are outliers in the end.
+CONFIRMED = 0.001
+# Steps of a solve between two choices of inliers; the last solve goes to the end.
+TRIM_STEPS = 6
+FINAL_STEPS = 200
+# Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
+START_STEPS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Robust:
+    """Inliers and the solution of their least-squares problem.
+
+    Parameters
+    ----------
+    inliers : (m + k,) bool
+        Edges, then observations.
+    problem : BatchProblem
+        Of the inliers alone.
+    end : Polished
+        Its objective is that of the inliers.
+    truncated : float
+        Truncated cost here.
+    limit : (m + k,)
+        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
+    scale : float
+        True over stated variance of the edges, as estimated or given.
+    start : str
+        Which start led here.
+    reached : dict of str to float
+        Truncated cost by start.
+    """
+
+    inliers: Mask
+    problem: BatchProblem
+    end: Polished
+    truncated: float
+    limit: Array
+    scale: float
+    start: str
+    reached: dict[str, float]
+
+
+def truncated_cost(network: PoseNetwork, arrays: tuple[Array, Array], limit: Array) -> float:
+    """``Σ min(rᵀ Ω r, limit)`` over edges and observations."""
+    return float(np.minimum(_costs(network, *arrays), limit).sum())
+
+
+def truncated_least_squares(
+    problem: BatchProblem,
+    given: dict[str, Any] | None = None,
+    probability: float = 0.99,
+    *,
+    trust_odometry: bool = True,
+    noise_scale: float | None = None,
+    progress: bool = False,
+) -> Robust:
+    """Minimise ``Σ min(rᵀ Ω r, s² χ²_d(p))``.
+
+    Parameters
+    ----------
+    problem : BatchProblem
+        Of the whole network.
+    given : dict of str to gtsam.Values, optional
+        Further starts.
+    probability : float
+        An inlier is kept with this probability, if noise is Gaussian.
+    trust_odometry : bool
+        Edges between neighbours in id order are never outliers (they are not loop closures), if they join nearly all
+        vertices; where they do not, nothing is trusted.
+    noise_scale : float, optional
+        s², true over stated variance of the edges. Estimated from the network if not given. Observations of landmarks
+        are always taken at their word.
+
+    Raises
+    ------
+    ConfigError
+        Probability outside (0, 1), or a scale that is not positive.
+    IndeterminateError
+        No start could be made.
+    """
+    if not 0.0 < probability < 1.0:
+        raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
+    if noise_scale is not None and not (np.isfinite(noise_scale) and noise_scale > 0.0):
+        raise ConfigError(f"noise_scale must be positive, got {noise_scale}")
+    network, m = problem.network, len(problem.network.edges)
+    consensus = loop_consensus(network)
+    trusted = np.zeros(m + len(network.observations), dtype=np.bool_)
+    if trust_odometry:
+        trusted[:m] = odometry_edges(network)
+    starts: dict[str, tuple[gtsam.Values, Mask]] = {}
+    scale = 1.0 if noise_scale is None else noise_scale
+    for name, believed in (("consensus", consensus.likely), ("core", consensus.core)):
+        if believed.any() and not (name == "core" and (believed == consensus.likely).all()):
+            used = trusted | True
+            used[:m] = consensus.odometry | believed
+            begun = _least_squares(problem, used, chordal=True)
+            if begun is None:
+                continue
+            starts[name] = (begun, used)
+            if noise_scale is None:
+                scale = min(
+                    _scale(network, problem.arrays(begun), used, believed), scale if len(starts) > 1 else np.inf
+                )
+    if not starts and trusted.any():
+        used = trusted.copy()
+        used[m:] = True
+        begun = _least_squares(problem, used, chordal=False)
+        if begun is not None:
+            starts["odometry"] = (begun, used)
+    limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
+    starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
+    found: list[tuple[str, Settled]] = []
+    for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
+        if name not in starts:
+            continue
+        values, believed = starts[name]
+        trimmed = _trim(network, values, _costs(network, *problem.arrays(values)) <= limit, limit)
+        confirmed = (trimmed.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED
+        if not (name == "consensus" and confirmed):
+            weights, annealed = _anneal(network, values, limit, believed)
+            trimmed = min(trimmed, _trim(network, annealed, weights > 0.5, limit), key=lambda t: t.cost)
+        best = settle(
+            network,
+            trimmed.end.values,
+            trimmed.inliers,
+            limit,
+            probability=probability,
+            own_tail=noise_scale is None,
+        )
+        found.append((name, best))
+        if name == "consensus" and (best.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED:
+            starts.pop("core", None)  # the loops believed first are believed last
+    if not found:
+        raise IndeterminateError(f"{network.source}: no robust start could be made")
+    # one limit for all, that of the cleanest answer: wrong loops widen the tail that they are judged by
+    limit = np.min([f.limit for _, f in found], axis=0)
+    reached: dict[str, float] = {}
+    for name, settled in found:
+        arrays = settled.problem.arrays(settled.end.values)
+        reached[name] = min(truncated_cost(network, arrays, limit), reached.get(name, np.inf))
+    name, best = min(found, key=lambda f: reached[f[0]])
+    final = _trim(network, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
+    return Robust(final.inliers, final.problem, final.end, final.cost, best.limit, best.scale, name, reached)
+
+
+def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
+    """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
+    part = subnetwork(problem.network, used)
+    try:
+        check_determined(part)
+        if chordal and not len(part.observations):
+            arrays = chordal_start(part)
+        else:
+            poses = odometry_start(part)
+            arrays = poses, landmarks_from(part, poses)
+        return polish(BatchProblem(part), problem.values(*arrays), max_iterations=START_STEPS).values
+    except (IndeterminateError, RuntimeError) as error:
+        log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
+        return None
+
+
+def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
+    """True over stated variance of the loops, at most 1, from the median cost of those believed, after least squares.
+
+    More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then,
+    and where loops are few.
+
+    A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
+    left of ``rows``.
+    """
+    m = len(network.edges)
+    rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
+    left = max(rows - network.states, 1) / rows
+    costs = edge_costs(network, arrays[0])[believed]
+    costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
+    if len(costs) < FEW:
+        return 1.0
+    return min(1.0, float(np.median(costs)) / (left * float(stats.chi2.median(network.tangent_dim))))
+
+
+def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mask) -> Array:
+    limit = np.full(len(trusted), stats.chi2.ppf(probability, 2))
+    limit[: len(network.edges)] = scale * stats.chi2.ppf(probability, network.tangent_dim)
+    limit[trusted] = np.inf
+    return limit
+
+
+def _anneal(network: PoseNetwork, values: gtsam.Values, limit: Array, believed: Mask) -> tuple[Array, gtsam.Values]:
+    """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the values they lead to."""
+    m = len(network.edges)
+    problem = BatchProblem(network)
+    costs = _costs(network, *problem.arrays(values))
+    loose = np.isfinite(limit)
+    ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
+    worst = float(min(ratio[believed].max(initial=0.0), WORST))
+    mu = 1.0 / max(2.0 * worst - 1.0, 1.0)
+    weights = np.ones(len(limit))
+    for _ in range(STAGES):
+        fresh = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
+        fresh[ratio <= mu / (mu + 1.0)] = 1.0
+        fresh[ratio >= (mu + 1.0) / mu] = 0.0
+        weights = np.where(loose, fresh, 1.0)
+        weighted = replace(
+            network,
+            information=weights[:m, None, None] * network.information,
+            observation_information=weights[m:, None, None] * network.observation_information,
+        )
+        values = polish(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
+        costs = _costs(network, *problem.arrays(values))
+        ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
+        if not ((weights > 0.0) & (weights < 1.0)).any():
+            break
+        mu *= GROWTH
+    return weights, values
+
+
+@dataclass(frozen=True, slots=True)
+class _Trimmed:
+    inliers: Mask
+    problem: BatchProblem
+    end: Polished
+    cost: float
+
+
+def _trim(
+    network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
+) -> _Trimmed:
+    """Alternate least squares of the inliers and the choice of inliers until the choice stays.
+
+    Neither step raises the truncated cost, so it ends.
+    """
+    for _ in range(ROUNDS):
+        inner = BatchProblem(network, inliers)
+        end = polish(inner, values, max_iterations=steps)
+        costs = _costs(network, *inner.arrays(end.values))
+        fresh = costs <= limit
+        if (fresh == inliers).all():
+            break
+        inliers, values = fresh, end.values
+    return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
+
+
+def _costs(network: PoseNetwork, poses: Array, landmarks: Array) -> Array:
+    return np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])

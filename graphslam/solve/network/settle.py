@@ -1,0 +1,349 @@
+"""What is accepted in the end: every loop and every group of loops against the posterior of all the others.
+
+A loop's cost at the answer says little: a wrong loop that bends the map to itself is cheap there, and a right one that
+alone ties a stretch is dear without it. What counts is the evidence of the others. With the whitened residual r, the
+whitened Jacobian A and H the information of what is accepted, ``B = A H⁻¹ Aᵀ``, the fall of the objective if an
+accepted loop is taken out, and its rise if a refused one is taken in, are to first order
+
+    ``D² = rᵀ (I - B)⁻¹ r`` and ``D² = rᵀ (I + B)⁻¹ r``,
+
+the same number for the same loop: χ² of the loop against the posterior of all others (Cook 1979).
+
+Wrong loops that come from one mistaken place agree with each other, so ten of them are one piece of evidence and not
+ten. A group of loops that are neighbours is therefore judged by the one thing that all of them say together, the rigid
+motion of one stretch against the other. With ``G_k`` the whitened derivative of loop k by that motion, the χ² of the
+motion against all that is not of the group, which is what the objective would fall if the motion were free (accepted),
+or rise because it is not (refused), is
+
+    ``D² = gᵀ (Gᵀ (I - B) G)⁻¹ g``, ``g = Gᵀ r`` (accepted), and the same with ``r → (I + B)⁻¹ r`` and
+    ``I - B → (I + B)⁻¹`` (refused).
+
+The limit is the file's own: recorded loops have tails of their own kind, and the bulk says nothing about them. The tail
+of the accepted D² is followed as far as it is populated (Hill 1975).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy import stats
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from graphslam.core import geometry as se2
+from graphslam.core import se3
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.solve.network.batch import BatchProblem, Polished, polish
+from graphslam.solve.network.model import (
+    Layout,
+    edge_costs,
+    edge_jacobians,
+    linearise,
+    observation_costs,
+    square_root,
+    subnetwork,
+)
+from graphslam.solve.network.sparse import factor
+
+Mask = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+# Loops are neighbours if their ends are so many nodes apart, both together; larger groups are not judged as groups.
+NEAR, LARGEST = 4, 40
+# Refused loops that are looked at in every round, those of least cost; columns that are solved for at a time.
+TESTED, COLUMNS = 300, 400
+# Rounds of accepting and refusing; steps of a solve between two of them.
+ROUNDS, STEPS = 15, 20
+# In a round only what is within this factor of the worst is taken out: one wrong loop makes its neighbours look bad.
+WORST = 0.25
+# The tail is told by this share of the accepted loops, with the weight of so many more of a tail index in between that
+# of a Gaussian and a Cauchy; the limit is where so many right loops are expected beyond.
+TAIL, PRIOR, INDEX, BEYOND = 0.05, 5.0, 0.5, 0.5
+# … found by following the tail from the bulk's quantile, in so many steps.
+FOLLOWED, QUANTILE = 50, 0.9999
+# Fewer loops tell neither tail nor scale: the stated noise stands.
+FEW = 30
+# With more loops than this a right one is refused by chance as seldom as with so many, not more often.
+FAMILY = 100
+# After the first round, loops and groups below this quantile, in the scale of the bulk, are not looked at again.
+DULL = 0.95
+# B comes so close to 1 where nothing but the loop itself holds its ends.
+HELD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """Where accepting and refusing came to rest.
+
+    Parameters
+    ----------
+    inliers : (m + k,) bool
+        Edges, then observations.
+    problem : BatchProblem
+        Of the inliers alone.
+    end : Polished
+    limit : (m + k,)
+        What D² was compared with; infinite for trusted edges.
+    scale : float
+        True over stated variance of the edges, from the median D² of the accepted loops.
+    rounds : int
+        Until nothing changed; ``ROUNDS`` if something still did.
+    """
+
+    inliers: Mask
+    problem: BatchProblem
+    end: Polished
+    limit: Array
+    scale: float
+    rounds: int
+
+
+def family_quantile(probability: float, count: int) -> float:
+    """Probability that one of ``count`` right loops is kept, so that all are as likely kept as ``FAMILY`` of them are
+    with the probability given."""
+    return 1.0 - (1.0 - probability) * min(1.0, FAMILY / max(count, 1))
+
+
+def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, float]:
+    """Where the tail of right loops ends, and the noise scale of their bulk.
+
+    Parameters
+    ----------
+    D2 : (l,)
+        Of accepted loops, wrong ones perhaps among them.
+    dof : int
+        Of one.
+    quantile : float
+        Of χ², in the scale of the bulk: the limit is at least that.
+
+    Returns
+    -------
+    limit : float
+        Where the tail ``P(D² > x) ~ x^(-1/ξ)`` has half a loop beyond it. ξ is Hill's estimate from the top twentieth
+        of what is within the limit, so what lies beyond a gap that the tail does not bridge tells nothing about it.
+    scale : float
+        Median over that of χ².
+    """
+    x = np.sort(D2[np.isfinite(D2) & (D2 >= 0.0)])
+    if not len(x):
+        return float("inf"), 1.0
+    scale = max(float(np.median(x)) / float(stats.chi2.median(dof)), np.finfo(float).tiny)
+    least = limit = scale * float(stats.chi2.ppf(quantile, dof))
+    for _ in range(FOLLOWED):
+        n = int(np.searchsorted(x, limit, side="right"))
+        k = max(int(TAIL * n), 1)
+        if n <= k:
+            break
+        begin = x[n - k - 1]
+        if not begin > 0.0:
+            break
+        index = (float(np.log(x[n - k : n] / begin).sum()) + PRIOR * INDEX) / (k + PRIOR)
+        fresh = max(least, begin * (k / BEYOND) ** index)
+        if fresh <= limit * (1.0 + 1e-6) or np.searchsorted(x, fresh, side="right") == n:
+            limit = max(fresh, limit)
+            break
+        limit = fresh
+    return limit, scale
+
+
+def groups_of(ends: npt.ArrayLike, near: int = NEAR) -> Ints:
+    """Number of the group of every loop ``(l,)``: neighbours of neighbours, by the nodes that they join ``(l, 2)``."""
+    e = np.sort(np.asarray(ends, dtype=np.float64).reshape(-1, 2), axis=1)
+    if not len(e):
+        return np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(e).query_pairs(near, p=1, output_type="ndarray")
+    links = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(e), len(e)))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def loop_evidence(
+    network: PoseNetwork, inliers: Mask, rows: npt.ArrayLike, arrays: tuple[Array, Array], *, accepted: bool
+) -> tuple[Array, Array, Ints]:
+    """``D²`` of loops and of their groups against the posterior of what is accepted, themselves left out.
+
+    Parameters
+    ----------
+    network : PoseNetwork
+    inliers : (m + k,) bool
+        What is accepted.
+    rows : (l,) int
+        Edges, all of them accepted or all refused.
+    arrays : tuple
+        Poses and landmarks: a minimum of the accepted's objective.
+    accepted : bool
+        Whether ``rows`` are among the inliers.
+
+    Returns
+    -------
+    single : (l,)
+    group : (l,)
+        Of the group's common motion; that of the loop itself where it is alone or its group is too large.
+    label : (l,) int64
+        Which group.
+    """
+    at = np.asarray(rows, dtype=np.intp)
+    d, layout = network.tangent_dim, Layout.of(network)
+    label = groups_of(network.edges[at])
+    order = np.argsort(label, kind="stable")
+    poses, marks = arrays
+    J, _ = linearise(subnetwork(network, inliers), poses, marks, layout)
+    lu = factor(sp.csc_matrix(J.T @ J))
+    ordered = replace(
+        subnetwork(network, np.zeros_like(inliers)),
+        edges=network.edges[at[order]],
+        measurements=network.measurements[at[order]],
+        information=network.information[at[order]],
+    )
+    A, r = linearise(ordered, poses, marks, layout)
+    G = _common_motion(ordered, poses)
+    single, group = np.empty(len(at)), np.empty(len(at))
+    sign = -1.0 if accepted else 1.0
+    for first, last in _chunks(label[order], max(COLUMNS // d, 1)):
+        part = A[first * d : last * d]
+        S = np.eye((last - first) * d) + sign * np.asarray(part @ lu.solve(part.T.toarray()))
+        e = r[first * d : last * d]
+        n = last - first
+        own = S.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)] + HELD * np.eye(d)
+        x = e.reshape(n, d)
+        single[first:last] = np.einsum("ki,ki->k", x, np.linalg.solve(own, x[..., None])[..., 0])
+        names = label[order][first:last]
+        starts = np.flatnonzero(np.diff(names, prepend=-1))
+        for a, b in zip(starts, [*starts[1:], n], strict=True):
+            if b - a == 1 or b - a > LARGEST:
+                group[first + a : first + b] = single[first + a : first + b]
+                continue
+            W: Array = S[a * d : b * d, a * d : b * d]
+            g = G[(first + a) * d : (first + b) * d]
+            own_r = e[a * d : b * d]
+            if not accepted:
+                W = np.asarray(np.linalg.inv(W))
+                own_r = W @ own_r
+            u = g.T @ own_r
+            M = g.T @ W @ g
+            unit = np.sqrt(np.maximum(np.diag(g.T @ g), np.finfo(float).tiny))
+            M = M / np.outer(unit, unit) + HELD * np.eye(d)
+            group[first + a : first + b] = (u / unit) @ np.linalg.solve(M, u / unit)
+    back = np.argsort(order, kind="stable")
+    return single[back], group[back], label
+
+
+def _common_motion(network: PoseNetwork, poses: Array) -> Array:
+    """Whitened derivative ``(l d, d)`` of the loops' residuals by a motion of all later ends, a left tangent about the
+    middle of their positions (the condition of what follows is better there than about the origin)."""
+    d = network.tangent_dim
+    # a loop that runs back says the same of the inverse motion: the later end is the one that moves
+    later = np.max(network.edges, axis=1)
+    moved = poses[later].copy()
+    p = network.dim
+    moved[:, :p] -= moved[:, :p].mean(axis=0) if len(moved) else 0.0
+    ad = se2.se2_adjoint(se2.se2_inverse(moved)) if p == 2 else se3.se3_adjoint(se3.se3_inverse(moved))
+    _, J_i, J_j = edge_jacobians(network, poses)
+    blocks = square_root(network.information) @ np.where(
+        (network.edges[:, 0] > network.edges[:, 1])[:, None, None], J_i, J_j
+    )
+    return np.asarray((blocks @ ad).reshape(len(later) * d, d))
+
+
+def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
+    """Pieces of a sorted label array that cut no group of at most ``LARGEST``."""
+    starts = np.flatnonzero(np.diff(label, prepend=-1))
+    ends = np.append(starts[1:], len(label))
+    out: list[tuple[int, int]] = []
+    begin = 0
+    for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
+        if b - begin <= most:
+            continue
+        if a > begin:
+            out.append((begin, a))
+            begin = a
+        if b - a > LARGEST:
+            while b - begin > most:
+                out.append((begin, begin + most))
+                begin += most
+    if begin < len(label):
+        out.append((begin, len(label)))
+    return out
+
+
+def settle(
+    network: PoseNetwork,
+    values: gtsam.Values,
+    inliers: Mask,
+    limit: Array,
+    *,
+    probability: float = QUANTILE,
+    own_tail: bool = True,
+) -> Settled:
+    """Rounds of accepting and refusing by ``D²`` until nothing changes.
+
+    Parameters
+    ----------
+    network : PoseNetwork
+    values : gtsam.Values
+        Near a minimum of the inliers' objective.
+    inliers : (m + k,) bool
+        Believed so far.
+    limit : (m + k,)
+        Infinite for trusted edges; of observations.
+    probability : float
+        With which a right loop is kept (:func:`family_quantile`) if the stated noise is right: no limit is wider.
+    own_tail : bool
+        The limit of edges is the file's own (:func:`tail_limit`); that of ``limit`` if not.
+    """
+    m, d = len(network.edges), network.tangent_dim
+    w = np.linalg.eigvalsh(network.information)
+    judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
+    limit, scale, rounds = limit.copy(), 0.0, 0
+    dull = float(stats.chi2.ppf(DULL, d))
+    seen: set[bytes] = set()
+    back = False
+    single, worst = np.full(m, np.nan), np.full(m, np.nan)
+    for rounds in range(1, ROUNDS + 1):
+        problem = BatchProblem(network, inliers)
+        end = polish(problem, values, max_iterations=STEPS)
+        values, arrays = end.values, problem.arrays(end.values)
+        if back:
+            break
+        seen.add(inliers.tobytes())
+        fresh = inliers.copy()
+        fresh[m:] = observation_costs(network, *arrays) <= limit[m:]
+        inside = np.flatnonzero(judged & inliers[:m])
+        asked = inside[~(worst[inside] <= scale * dull)]
+        if len(asked):
+            single[asked], group, _ = loop_evidence(network, inliers, asked, arrays, accepted=True)
+            worst[asked] = np.maximum(single[asked], group)
+        if len(inside):
+            quantile = family_quantile(probability, len(inside))
+            most, scale = tail_limit(single[inside], d, quantile)
+            if own_tail:
+                stated = float(stats.chi2.ppf(quantile, d))
+                most = min(most, stated) if len(inside) >= FEW else stated
+                limit[:m] = np.where(np.isinf(limit[:m]), np.inf, most)
+            bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())
+            fresh[inside[bad]] = False
+            worst[inside[bad]] = np.nan
+        costs = edge_costs(network, arrays[0])
+        partial = ~judged & np.isfinite(limit[:m])
+        fresh[:m][partial] = costs[partial] <= limit[:m][partial]
+        outside = np.flatnonzero(judged & ~inliers[:m])
+        outside = outside[np.argsort(costs[outside], kind="stable")]
+        against = np.full(m, np.inf)
+        for first, last in ((0, TESTED), (TESTED, len(outside))):
+            # the dear ones only where nothing else changes: what the accepted do not hold may lie far off
+            some = outside[first:last]
+            if len(some) and (first == 0 or (fresh == inliers).all()):
+                against[some] = loop_evidence(network, inliers, some, arrays, accepted=False)[0]
+        # the group of a right loop is that of those that could be right: wrong ones may lie beside it
+        good = outside[against[outside] <= limit[outside]]
+        if len(good):
+            alone, group, _ = loop_evidence(network, inliers, good, arrays, accepted=False)
+            fresh[good[np.maximum(alone, group) <= limit[good]]] = True
+        if (fresh == inliers).all() or rounds == ROUNDS:
+            break
+        back = fresh.tobytes() in seen
+        inliers = fresh
+    return Settled(inliers, problem, end, limit, scale, rounds)

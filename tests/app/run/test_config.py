@@ -1,0 +1,134 @@
+"""Configuration: precedence, types, and keys that nobody knows."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from graphslam.app.run import config as cfg
+from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.worlds import simulate
+from graphslam.core.errors import ConfigError, UnknownNameError
+from graphslam.frontends.landmarks.config import RbpfEkfConfig
+from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
+
+
+def test_nested_options_are_built_and_checked():
+    c = cfg.build(
+        RbpfEkfConfig, {"particles": 7, "motion": {"speed": 1}, "noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}}
+    )
+    assert (c.particles, c.motion.speed, c.noise.range_sigma) == (7, 1.0, 0.1)
+    assert isinstance(c.motion.speed, float)
+
+
+def test_lists_of_any_length_and_of_a_given_one():
+    c = cfg.build(
+        SegSlamFrontEndConfig, {"segslam": {"registration": {"radii": [3, 1, 0.5]}}, "steps": {"scanners": ["a"]}}
+    )
+    assert (c.segslam.registration.radii, c.steps.scanners) == ((3.0, 1.0, 0.5), ("a",))
+    assert cfg.build(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"segslam": {"registration": {"radii": 3.0}}}, "radii = 3.0; wanted a list"),
+        ({"segslam": {"registration": {"radii": ["wide"]}}}, "radii = 'wide'"),
+        ({"filter": {"clamp": [0.1]}}, "clamp = [0.1]; wanted 2 values"),
+    ],
+)
+def test_wrong_lists_are_refused(values, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        cfg.build(SegSlamFrontEndConfig, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"particle": 7}, "frontend.particle"),
+        ({"motion": {"spede": 1.0}}, "frontend.motion.spede"),
+        ({"particles": "many"}, "frontend.particles"),
+        ({"particles": True}, "frontend.particles"),
+        ({"proposal": "3.0"}, "known: 2.0, 1.0"),
+        ({"motion": 3}, "table of options"),
+        ({"particles": 0}, "wanted ≥ 1"),
+        ({"noise": {"range_sigma": 0.1}}, "bearing_sigma"),
+    ],
+)
+def test_wrong_options_are_named_in_full(values, message):
+    with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
+        make_front_end("rbpf-ekf", values)
+
+
+def test_unknown_front_end_is_refused():
+    with pytest.raises(UnknownNameError, match="rbpf-ekf"):
+        make_front_end("nonsense", {})
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a.b=3", {"a": {"b": 3}}),
+        ("a=0.5", {"a": 0.5}),
+        ("gps.use=every-second", {"gps": {"use": "every-second"}}),
+        ('a="1.0"', {"a": "1.0"}),
+        ("a=true", {"a": True}),
+    ],
+)
+def test_settings_of_the_command_line(text, value):
+    assert cfg.parse_setting(text) == value
+
+
+@pytest.mark.parametrize("text", ["a", "=3", "a..b=1", ""])
+def test_malformed_settings_are_refused(text):
+    with pytest.raises(ConfigError, match="--set"):
+        cfg.parse_setting(text)
+
+
+def test_merge_is_deep_and_the_later_wins():
+    assert cfg.merge({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
+
+
+def test_effective_configuration_round_trips_through_toml():
+    front = make_front_end("rbpf-ekf", {"trim": 16.0, "smoothing_noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}})
+    text = cfg.dump_toml(cfg.as_dict(front.config))
+    assert make_front_end("rbpf-ekf", tomllib.loads(text)).config == front.config
+
+
+def test_simulated_log_brings_its_own_noise():
+    log = simulate("landmark-field", preset="quick", seed=0, sigma_speed=0.11)
+    options = recommended(log, "rbpf-ekf")
+    assert options["frontend"]["motion"]["speed"] == 0.11
+    assert options["frontend"]["association"] == "known"
+
+
+def test_presets_are_valid():
+    for name in ("victoria-park.rbpf-ekf", "landmark-field.rbpf-ekf"):
+        run = cfg.build(cfg.RunConfig, cfg.preset(name))
+        make_front_end("rbpf-ekf", run.frontend)
+    assert cfg.preset("never-heard-of") == {}
+
+
+def test_every_file_that_is_no_code_ships_in_the_wheel():
+    """Presets, cards and py.typed: what package-data does not name is missing from an installed package, in silence."""
+    root = Path(__file__).resolve().parents[3]
+    globs = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folders = {name: root.joinpath(*name.split(".")) for name in globs} | {"graphslam.cards": root / "datasets"}
+    shipped = {p for name, patterns in globs.items() for g in patterns for p in folders[name].glob(g)}
+    there = {p for top in ("graphslam", "frontends") for p in (root / top).rglob("*") if p.is_file()}
+    there |= set((root / "datasets").glob("*.toml"))
+    data = {p for p in there if p.suffix != ".py" and "__pycache__" not in p.parts}
+    assert len(data) > 20
+    assert data <= shipped
+
+
+def test_broken_toml_is_refused(tmp_path):
+    file = tmp_path / "c.toml"
+    file.write_text("a = [1,")
+    with pytest.raises(ConfigError, match="not a TOML"):
+        cfg.read_toml(file)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        cfg.read_toml(tmp_path / "nothing.toml")

@@ -1,0 +1,138 @@
+"""An IMU in a run: used, counted, told by metrics, its axes looked at, also where the front end used it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphslam.app.run import pipeline
+from graphslam.app.run.config import RunConfig, build
+from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog, Truth
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from tests.app.run.test_pipeline_space import Ring as HandedOver
+from tests.app.run.test_pipeline_space import ring as flat_ring
+from tests.reference.imu_ring import STEP, ring
+
+SWAP = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def misread(imu: Imu) -> Imu:
+    return replace(imu, angular_rate=imu.angular_rate @ SWAP.T, specific_force=imu.specific_force @ SWAP.T)
+
+
+def made(uses: frozenset[str] = frozenset({"laser"})) -> tuple[SensorLog, list[Submap]]:
+    rng = np.random.default_rng(5)
+    r = ring(rng, submaps=8, step=3 * STEP)
+    t = np.arange(0, 481) / 10
+    landmarks = {"landmark_ids": np.zeros(0, dtype=np.int64), "landmarks": np.zeros((0, 3))}
+    log = SensorLog(name="ring", streams={"imu": r.imu}, truth=Truth(Trajectory(t, r.truth(t)), **landmarks))
+    return log, [replace(s, uses=uses, report={"ended": "test", "scans": 12}) for s in r.submaps]
+
+
+def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, out: Any = None, **options: Any):
+    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: HandedOver(tuple(submaps)))
+    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    return pipeline.run(log, frontend="ring", out=out, progress=False, **options)
+
+
+@pytest.mark.parametrize("solver", ["isam2", "batch"])
+def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
+    log, submaps = made()
+    short = replace(log, streams={"imu": log["imu"].take(log["imu"].times > 1.0)})
+    r = solved(short, submaps, monkeypatch, tmp_path / "run", config={"imu": {"use": "auto"}}, solver=solver)
+    bare = solved(short, submaps, monkeypatch)
+    assert r.metric("converged") == 1.0
+    assert r.metric("anees_level_per_dof") < 3
+    assert r.metric("path_rmse_aligned") < bare.metric("path_rmse_aligned")
+    assert r.metric("imu_gyro_bias") == pytest.approx(8e-3, abs=8e-3)
+    assert 0 < r.metric("imu_gyro_bias_sigma") < 5e-3
+    assert 0.6 < r.metric("honesty_imu_chi2_per_dof") < 1.6
+    assert r.report["records_dropped"]["imu: no factor: before the first reading"] == 1
+    assert r.report["imu"]["use"] == "auto"
+    events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    kinds = [e["event"] for e in events]
+    assert {"imu", "imu-axes", "imu-bias"} <= set(kinds)
+    assert "imu-contradicted" not in kinds
+    counts = next(e for e in events if e["event"] == "imu")["dropped"]
+    assert counts == {"before the first reading": 1, "gravity outside the readings": 1}
+    assert "imu" in set(r.ledger["stream"])
+    assert "imu" not in set(bare.ledger["stream"])
+
+
+def test_what_the_front_end_used_is_not_used_again(monkeypatch):
+    log, submaps = made(frozenset({"laser", "imu"}))
+    r = solved(log, submaps, monkeypatch, config={"imu": {"use": "auto"}})
+    assert not r.graph.imus
+    with pytest.raises(EvidenceReusedError, match=r"'imu' .* a second time: submap 0"):
+        solved(log, submaps, monkeypatch, config={"imu": {"use": "imu"}})
+    with pytest.raises(MissingDataError, match=r"imu.use names no IMU .* got imu7"):
+        solved(log, submaps, monkeypatch, config={"imu": {"use": "imu7"}})
+
+
+def test_wrong_axes_are_named_while_the_run_goes_on(monkeypatch):
+    """Whoever used the readings; with a warning it goes on, ignored it says nothing."""
+    log, submaps = made(frozenset({"laser", "imu"}))
+    wrong = replace(log, streams={"imu": misread(log["imu"])})
+    with pytest.raises(DataError, match=r"imu: the axes .*: x reads −y, y reads x"):
+        solved(wrong, submaps, monkeypatch)
+    warned = solved(wrong, submaps, monkeypatch, config={"imu": {"axes": "warn"}})
+    assert [e["words"] for e in warned.events if e["event"] == "imu-axes"] == ["x reads −y, y reads x"]
+    quiet = solved(wrong, submaps, monkeypatch, config={"imu": {"axes": "ignore"}})
+    assert not [e for e in quiet.events if e["event"] == "imu-axes"]
+
+
+def test_a_contradiction_is_said(monkeypatch, caplog):
+    """Submaps that say to be a hundred times as sure as they are."""
+    log, submaps = made()
+    sure = [
+        replace(
+            s,
+            exit_covariance=1e-4 * s.exit_covariance,
+            trajectory=replace(s.trajectory, covariances=1e-4 * s.trajectory.covariances),
+        )
+        for s in submaps
+    ]
+    r = solved(log, sure, monkeypatch, config={"imu": {"use": "auto"}})
+    (said,) = [e for e in r.events if e["event"] == "imu-contradicted"]
+    assert said["chi2_per_dof"] > said["high"] > 1
+    assert "contradict each other" in caplog.text
+
+
+def test_in_the_plane_it_is_left_out(monkeypatch):
+    log, front = flat_ring(2)
+    imu = made()[0]["imu"]
+    both = replace(log, streams={**log.streams, "imu": imu})
+    r = solved(both, list(front.made), monkeypatch, config={"imu": {"use": "auto"}})
+    assert [e["why"] for e in r.events if e["event"] == "imu-not-used"] == ["the graph is in the plane"]
+
+
+def test_its_options_are_checked():
+    for bad in ({"longest": 0.0}, {"axes": "shrug"}, {"robust": "tukey"}, {"acceleration": -1.0}, {"wings": 2}):
+        with pytest.raises(ConfigError, match="imu"):
+            build(RunConfig, {"imu": bad})
+
+
+def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):
+    """SegSLAM on a robot whose IMU it uses: looked at, and nothing is said against it; turned round, it is named."""
+    log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    options = {"frontend": {"filter": {"particles": 1}}, "map": {"fuse": False}}
+    r = pipeline.run(log, frontend="segslam", seed=2, config=options, progress=False)
+    assert [e["verdict"] for e in r.events if e["event"] == "imu-axes"] == ["as stated"]
+    imu = log["imu"]
+    flipped = np.diag([1.0, -1.0, -1.0])
+    wrong = replace(imu, angular_rate=imu.angular_rate @ flipped, specific_force=imu.specific_force @ flipped)
+    with pytest.raises(DataError, match="the axes of the accelerometer are not those that its mounting says"):
+        pipeline.run(
+            replace(log, streams={**log.streams, "imu": wrong}), frontend="segslam", seed=2, config=options,
+            progress=False,
+        )  # fmt: skip

@@ -1,0 +1,101 @@
+"""What a filter leaves of the errors of dead reckoning, against paths that were driven with such errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.poses import SE2, SE3, Group, level
+from graphslam.frontends.grid.filter_drift import FilterDrift
+
+MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
+
+
+def _bend(group: Group, n: int = 60, pitch: float = 0.0) -> np.ndarray:
+    """40 m, half of them straight, then a left turn and on."""
+    step = np.zeros((n, group.dof))
+    step[:, group.position.start] = 40.0 / n
+    step[n // 2 : n // 2 + 12, group.heading] = np.pi / 24
+    if pitch:
+        step[5, 1] = pitch
+    poses = [group.identity]
+    for u in group.exp(step):
+        poses.append(group.compose(poses[-1], u))
+    return np.array(poses)
+
+
+@pytest.mark.parametrize(("group", "particles"), [(SE2, 40), (SE3, 5)])
+def test_covariance_is_that_of_many_drives(group: Group, particles: int) -> None:
+    """A heading that walks, positions that walk, wheels that are off by a factor, and a height told by a gravity that
+    is off by the same all the way."""
+    rng = np.random.default_rng(1)
+    true = _bend(group)
+    u = group.log(group.between(true[:-1], true[1:]))
+    m, more, length = 4000, 1.0 + MODEL.few / particles, 40.0 / len(u)
+    T = np.tile(group.identity, (m, 1))
+    x = group.position.start
+    wheels = 1.0 + MODEL.position_scale * rng.standard_normal((m, 1))
+    for k in range(len(u)):
+        noise = np.zeros((m, group.dof))
+        noise[:, group.heading] = MODEL.heading_walk * np.sqrt(more * length) * rng.standard_normal(m)
+        noise[:, x : x + 2] = MODEL.position_walk * np.sqrt(more * length) * rng.standard_normal((m, 2))
+        if group.dim == 3:
+            noise[:, 5] = MODEL.height_walk * np.sqrt(length) * rng.standard_normal(m)
+        driven = np.repeat(u[k][None], m, axis=0)
+        driven[:, group.position] *= wheels
+        T = group.compose(group.compose(T, group.exp(driven)), group.exp(noise))
+    T[:, 2] += 0.0 if group.dim == 2 else MODEL.height_scale * 40.0 * rng.standard_normal(m)
+    e = group.log(group.between(np.broadcast_to(true[-1], T.shape), T))
+    drawn = e.T @ e / m
+    C = MODEL.covariance(true, particles)
+    kept = [group.heading, x, x + 1] + ([5] if group.dim == 3 else [])
+    got, wanted = C[np.ix_(kept, kept)], drawn[np.ix_(kept, kept)]
+    sigma = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(got / np.outer(sigma, sigma), wanted / np.outer(sigma, sigma), atol=0.07)
+    assert abs(wanted[0, 2]) > 0.5 * sigma[0] * sigma[2]  # heading and what it moves to the side go together
+    nees = np.einsum("ni,ni->n", e[:, kept], np.linalg.solve(got, e[:, kept].T).T)
+    assert 0.93 < nees.mean() / len(kept) < 1.07
+
+
+def test_how_many_particles_and_how_far() -> None:
+    path = _bend(SE3)
+    few, some, many = (np.diag(MODEL.covariance(path, n)) for n in (2, 5, 40))
+    assert np.all(few >= some)
+    assert np.all(some >= many)
+    assert some[2] > 1.5 * many[2]
+    assert MODEL.covariance(path, 1)[2, 2] > few[2]  # nobody corrects it
+    lengths = [np.trace(MODEL.covariance(path[: k + 1], 20)) for k in (1, 10, 30, 60)]
+    assert np.all(np.diff(lengths) > 0)
+
+
+def test_frames_at_the_end_are_level_where_submaps_are() -> None:
+    """On a ramp the error of the heading turns about the vertical, not about the body's own axis."""
+    path = _bend(SE3, pitch=-0.3)
+    flat = np.array(level(path))
+    leaning = MODEL.covariance(path, 20)
+    np.testing.assert_allclose(leaning, MODEL.covariance(np.vstack([path[:-1], flat[-1:]]), 20), atol=1e-12)
+    assert np.abs(MODEL.covariance(path, 20, gravity=False) - leaning).max() > 1e-4
+    np.linalg.cholesky(MODEL.covariance(path[:1], 20))  # no way: the starts alone
+
+
+@pytest.mark.parametrize("group", [SE2, SE3])
+def test_a_single_step_by_hand(group: Group) -> None:
+    """A heading that errs at the start moves the end to the left by the way; one that errs at the end does not."""
+    path = np.stack([group.identity, group.identity])
+    path[1, 0] = 2.0
+    C = MODEL.covariance(path, 20, gravity=False)
+    y, walk = group.position.start + 1, MODEL.heading_walk**2 * (1.0 + MODEL.few / 20) * 2.0
+    assert C[group.heading, group.heading] == pytest.approx(MODEL.heading_start**2 + walk)
+    assert C[group.heading, y] == pytest.approx(0.5 * walk * 2.0)
+
+
+def test_impossible_models_and_paths() -> None:
+    with pytest.raises(ConfigError, match="heading_walk"):
+        FilterDrift(heading_walk=-1.0)
+    with pytest.raises(ConfigError, match="singular"):
+        FilterDrift(tilt=0.0)
+    with pytest.raises(DataError, match="no path or no particle"):
+        MODEL.covariance(np.zeros((0, 7)), 5)
+    with pytest.raises(DataError, match="no path or no particle"):
+        MODEL.covariance(_bend(SE2), 0)
