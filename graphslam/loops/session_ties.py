@@ -4,7 +4,8 @@ Nothing is known beforehand of how two sessions lie to each other, so there is n
 a building that repeats itself a place that looks right is often wrong. What decides is agreement: two ties (a, b) and
 (c, d) and the two chains between their ends must close a cycle (:mod:`~graphslam.association.consistent_set`, with the
 chain cut between the sessions). The largest set of ties that agree two by two must be large enough, stretch over
-some of the way, and leave no second set of others that is nearly as large; else the answer is that nothing is known, and why.
+some of the way, and leave no second set of others that is nearly as large; else the answer is that nothing is known,
+and why.
 """
 
 from __future__ import annotations
