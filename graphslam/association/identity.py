@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.graph_record import GraphRecord
-from graphslam.graph.records import SubmapRecord
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 
 

@@ -261,6 +261,38 @@ class Gps:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Compass:
+    """Headings of a magnetic compass.
+
+    Parameters
+    ----------
+    times : (n,)
+    headings : (n,)
+        Of the body's x axis [rad], counter-clockwise from magnetic east. A compass that counts clockwise from north has
+        ``π/2`` less its reading.
+    sigma : (n,)
+        Standard deviation [rad].
+    """
+
+    times: Array
+    headings: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        object.__setattr__(self, "headings", _finite(_array(self.headings, (n,), "headings"), "heading"))
+        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
+        if np.any(self.sigma <= 0):
+            k = int(np.flatnonzero(self.sigma <= 0)[0])
+            raise DataError(f"sigma of compass reading {k} is not positive", got=self.sigma[k], wanted="> 0 rad")
+
+    def take(self, index: Any) -> Compass:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], headings=self.headings[index], sigma=self.sigma[index])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkObservations:
     """Range-bearing or range-only observations of point landmarks, several per scan (ragged).
 

@@ -19,9 +19,9 @@ from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, 
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.evaluate.without_truth import correlated_dof, two_sided
-from graphslam.graph.gps import gps_jacobians, lever_arm
+from graphslam.graph.factors.gps import GpsRecord, gps_terms
+from graphslam.graph.gps import lever_arm
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import GpsRecord
 
 Ints = npt.NDArray[np.int64]
 
@@ -151,16 +151,22 @@ def gps_innovations(
     own = bias < len(values.biases)
     with_bias = np.where(own, bias, -1)
     predicted = se2_transform(se2_compose(np.broadcast_to(values.datum, (n, 3)), values.poses[node]), arm)
-    predicted[with_bias >= 0] += values.biases[with_bias[with_bias >= 0]]
-    _, J = gps_jacobians(values, node, arm, predicted, with_bias)  # where the fix should be, not where it is
+    known = with_bias >= 0
+    given = np.zeros((n, 2))
+    given[known] = values.biases[with_bias[known]]
+    predicted += given
+    _, J = gps_terms(
+        values.poses[node], values.datum, given, arm, predicted
+    )  # where the fix should be, not where it is
+    J[~known, :, 6:] = 0.0
     R = rotation2(values.datum[2]) @ rotation2(values.poses[node, 2])  # base frame → GPS frame
     if bias_sigma is not None or len(values.biases):
         J[:, :, 6:8] = np.where((bias >= 0)[:, None, None], np.swapaxes(R, 1, 2), 0.0)
 
     # everything the innovations depend on: nodes, datum, biases; the first base is fixed and has no column
     pose_columns = np.where(node[:, None] > 0, 3 * (node[:, None] - 1) + np.arange(3), -1)
-    datum_columns = np.tile(lay.datum_start + np.arange(3), (n, 1))
-    bias_columns = np.where((own & (bias >= 0))[:, None], lay.bias_start + 2 * bias[:, None] + np.arange(2), -1)
+    datum_columns = np.tile(lay.start("datum") + np.arange(3), (n, 1))
+    bias_columns = np.where((own & (bias >= 0))[:, None], lay.start("bias") + 2 * bias[:, None] + np.arange(2), -1)
     columns = np.concatenate([pose_columns, datum_columns, bias_columns], axis=1)
     needed, at = np.unique(columns, return_inverse=True)
     at = at.reshape(columns.shape)

@@ -9,11 +9,11 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.graph.attitude import DOWN
+from graphslam.graph.factors.attitude import DOWN, AttitudeRecord
+from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.gps_verbs import GpsVerbs
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.records import AttitudeRecord, GpsRecord
 
 LEVELLED = "levelled"
 """Ledger kind and class of the attitudes of levelled bases."""
@@ -40,7 +40,7 @@ class AttitudeVerbs(GpsVerbs):
         """Where gravity points, seen from a node: roll and pitch, and nothing of the heading.
 
         The first one brings in the variable ``tilt``, where up is in the frame of the first base
-        (:mod:`graphslam.graph.attitude`); what the first base itself saw of gravity goes to node 0.
+        (:mod:`graphslam.graph.factors.attitude`); what the first base itself saw of gravity goes to node 0.
 
         Parameters
         ----------
@@ -70,9 +70,9 @@ class AttitudeVerbs(GpsVerbs):
         """
         if self.dim != 3:
             raise GeometryError("gravity says nothing of poses in the plane", wanted="a graph in space")
-        if not 0 <= node < len(self.values.poses):
+        if not 0 <= node < self.structure.count("x"):
             raise DataError(
-                "attitude of a node that is not there", got=node, wanted=f"x0 … x{len(self.values.poses) - 1}"
+                "attitude of a node that is not there", got=node, wanted=f"x0 … x{self.structure.count('x') - 1}"
             )
         d = np.asarray(direction, dtype=np.float64)
         length = float(np.linalg.norm(d)) if d.shape == (3,) else float("nan")
@@ -86,14 +86,14 @@ class AttitudeVerbs(GpsVerbs):
         record = AttitudeRecord(self._next_factor, node, d / length, np.eye(2) / sigma, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
         self._start_tilt()
-        self._insert(record)
+        self.insert(record)
         self._event("attitude", factor_id=record.factor_id, node=node, sigma=sigma, evidence=evidence, group=group)
         return record.factor_id
 
     def _start_tilt(self) -> None:
         """Bring in the variable ``tilt``; fixes that took the z axis of the first base for up are turned by it."""
-        if self.values.tilt is None:
-            self.values.tilt = np.zeros(2)
+        if not self.structure.count("tilt"):
+            self.structure.append("tilt", np.zeros(2))
             for fid, r in self.records.items():
                 if isinstance(r, GpsRecord) and self.dim == 3:
                     self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed

@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
-from graphslam.graph.state import Layout
+from graphslam.graph.variables import Layout
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 
@@ -115,7 +115,7 @@ class JointCovariance:
     def poses(self) -> Array:
         """Marginal of every node ``(m + 1, d, d)``, d = 3 or 6; zeros for the fixed first base."""
         d = self.layout.pose_dof
-        blocks = self._diagonal_blocks(0, self.layout.landmark_start, d)
+        blocks = self._diagonal_blocks(0, self.layout.stop("x"), d)
         return np.concatenate([np.zeros((1, d, d)), blocks])
 
     def cross(self, first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
@@ -134,7 +134,7 @@ class JointCovariance:
 
     def landmarks(self) -> Array:
         """Marginal of every landmark ``(n, dim, dim)``."""
-        return self._diagonal_blocks(self.layout.landmark_start, self.layout.datum_start, self.layout.dim)
+        return self._diagonal_blocks(self.layout.start("l"), self.layout.stop("l"), self.layout.dim)
 
     def _diagonal_blocks(self, start: int, stop: int, d: int) -> Array:
         if self._inverse_factor is not None:

@@ -11,9 +11,9 @@ import scipy.sparse.linalg as spla
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
+from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.flat import FlatGraph
-from graphslam.graph.records import Record
-from graphslam.graph.state import Layout, Values
+from graphslam.graph.variables import KINDS, Layout, Values, split_name
 
 # Eigenvalues of the unit-diagonal matrix below this are rounding, not information: double precision keeps 1e-16 of the
 # largest, and a chain of a thousand honest submaps stays above 1e-9 (measured).
@@ -68,8 +68,8 @@ def unreached(records: Sequence[Record], layout: Layout) -> list[str]:
         touched.update(names)
         for other in names[1:]:
             parent[root(other)] = root(names[0])
-    # A prior ties its bias to a known value although no other factor has met it yet.
-    prior = {n for r in records if r.group in ("gps-bias", "imu-bias") for n in r.variables()}
+    # A prior ties its variable to a known value although no other factor has met it yet.
+    prior = {n for r in records if batch_of(type(r)).prior for n in r.variables()}
     home = {root("x0"), *(root(n) for n in prior)}
     return [n for n in layout.names() if n not in touched or root(n) not in home]
 
@@ -139,10 +139,5 @@ def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
     if "datum" in lost:
         fixes = sum(r.group == "gps" for r in flat.records)
         out.append(f"the GPS datum hangs on {fixes} fixes ({waiting} waiting): it needs two that are metres apart.")
-    if "tilt" in lost:
-        out.append("nothing says where up is: add the attitude of a node that is tied to x0.")
-    if any(n.startswith(("velocity", "imubias")) for n in lost):
-        out.append("the velocity or the bias of an IMU hangs on nothing: add readings, or remove its factors.")
-    if any(n.startswith("bias") for n in lost):
-        out.append("a GPS bias has neither a prior nor a fix of its own: set bias_sigma.")
-    return out
+    kinds = {split_name(n)[0].word for n in lost}
+    return out + list(dict.fromkeys(KINDS[w].remedy for w in KINDS if w in kinds and KINDS[w].remedy))

@@ -15,14 +15,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from graphslam.core.geometry import Array
-from graphslam.graph.attitude import AttitudeFamily
-from graphslam.graph.factors.imu.family import ForceFamily, GyroFamily, ImuBiasFamily, ImuFamily
-from graphslam.graph.families import BetweenFamily, BiasPriorFamily, Family, SubmapFamily, offsets
-from graphslam.graph.gps_family import GpsFamily
+from graphslam.graph.factors.batch import FactorBatch, Record, batch_of, factor_kinds, offsets
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.normal_kernels import scatter_dense
-from graphslam.graph.records import Record
-from graphslam.graph.state import Layout, Values
+from graphslam.graph.variables import Layout, Values
 
 Index = npt.NDArray[np.int64]
 
@@ -76,13 +72,6 @@ class FactorBlocks:
     weight: Array
 
 
-FAMILIES: tuple[type[Family], ...] = (
-    *(SubmapFamily, BetweenFamily, GpsFamily, BiasPriorFamily, AttitudeFamily),
-    *(ImuFamily, GyroFamily, ImuBiasFamily, ForceFamily),
-)
-"""Kinds of factors in the order of their blocks."""
-
-
 class FlatGraph:
     """Flat arrays of the factors of one graph revision.
 
@@ -95,23 +84,23 @@ class FlatGraph:
     def __init__(self, records: Sequence[Record], layout: Layout) -> None:
         self.layout = layout
         self.records = tuple(records)
-        order: dict[type, list[int]] = {family.record: [] for family in FAMILIES}
+        order: dict[type, list[int]] = {batch.record: [] for batch in factor_kinds()}
         for k, rec in enumerate(records):
-            order[type(rec)].append(k)
+            order[batch_of(type(rec)).record].append(k)
         self._position = np.array([k for ks in order.values() for k in ks], dtype=np.intp)
-        self.families: list[Family] = [
-            family([records[k] for k in order[family.record]], layout) for family in FAMILIES if order[family.record]
+        self.batches: list[FactorBatch] = [
+            batch_of(t)([records[k] for k in ks], layout) for t, ks in order.items() if ks
         ]
-        widths = [int(w) for f in self.families for w in f.widths]
-        self._first = offsets([len(f) for f in self.families])
+        widths = [int(w) for f in self.batches for w in f.widths]
+        self._first = offsets([len(f) for f in self.batches])
         self._g_offset = offsets(widths)
         self._H_offset = offsets([d * d for d in widths])
-        self._columns = np.concatenate([np.zeros(0, dtype=np.int64), *(f.columns for f in self.families)])
+        self._columns = np.concatenate([np.zeros(0, dtype=np.int64), *(f.columns for f in self.batches)])
 
     @property
     def has_kernels(self) -> bool:
         """Does any factor carry a robust kernel?"""
-        return any(bool(np.any(f.code != 0)) for f in self.families)
+        return any(bool(np.any(f.code != 0)) for f in self.batches)
 
     @cached_property
     def _pattern(self) -> tuple[npt.NDArray[np.intp], ...]:
@@ -130,12 +119,12 @@ class FlatGraph:
         return keep, slot, unique % max(n, 1), indptr
 
     def _blocks(self, values: Values, hessian: bool) -> tuple[Array, Array, Array]:
-        """Flat ``H`` and ``g`` (empty without ``hessian``) and losses ``(f,)`` in the order of the families."""
+        """Flat ``H`` and ``g`` (empty without ``hessian``) and losses ``(f,)`` in the order of the batches."""
         H = np.zeros(self._H_offset[-1] if hessian else 0)
         g = np.zeros(self._g_offset[-1])
         chi2 = np.zeros(len(self.records))
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows shows as inf or nan and is refused by name
-            for f, a, b in zip(self.families, self._first, self._first[1:]):
+            for f, a, b in zip(self.batches, self._first, self._first[1:]):
                 chi2[a:b] = f.blocks(values, hessian, H, self._H_offset[a : b + 1], g, self._g_offset[a : b + 1])
         return H, g, chi2
 
@@ -168,14 +157,11 @@ class FlatGraph:
     def factor_blocks(self, values: Values) -> FactorBlocks:
         """Every factor by itself at ``values``: what leverages and class-wise dof are made of."""
         H, _, _ = self._blocks(values, True)
-        d2 = np.concatenate([np.zeros(0), *(f.squared(values) for f in self.families)])
+        d2 = np.concatenate([np.zeros(0), *(f.squared(values) for f in self.batches)])
         weight = np.concatenate(
             [
                 np.ones(0),
-                *(
-                    robust_terms(d2[a:b], f.code, f.k)[1]
-                    for f, a, b in zip(self.families, self._first, self._first[1:])
-                ),
+                *(robust_terms(d2[a:b], f.code, f.k)[1] for f, a, b in zip(self.batches, self._first, self._first[1:])),
             ]
         )
         columns = [self._columns[a:b] for a, b in zip(self._g_offset, self._g_offset[1:])]

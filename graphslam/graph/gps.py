@@ -1,12 +1,6 @@
-"""GPS fixes as factors on the submap that holds them.
+"""GPS fixes before they are factors: how they enter, where they hang, and where the datum starts.
 
-A fix at time t inside submap k sees the antenna at ``arm = T_start_body(t) · lever`` in the base frame of the submap,
-so the world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first
-base stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is solved for, not assumed.
-
-The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix is equally
-uncertain in all directions, so rotating it changes nothing, and there the uncertainty of the arm (from the submap's own
-trajectory) has a constant covariance that is simply added to it.
+The factor itself is in :mod:`graphslam.graph.factors.gps`.
 """
 
 from __future__ import annotations
@@ -14,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
@@ -22,7 +15,6 @@ from graphslam.core.poses import group_of
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.state import Values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,41 +124,6 @@ def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array,
         R = quat_to_matrix(T[:, 3:])
         G[:, :, :3], G[:, :, 3:] = -R @ skew(lever), R
     return arm, G @ covariances @ np.swapaxes(G, 1, 2)
-
-
-def gps_residual(pose: Array, datum: Array, bias: Array, arm: Array, z: Array) -> Array:
-    """``arm - x⁻¹ T_gps_world⁻¹ (z - bias)``; every argument broadcasts over leading axes."""
-    p_world = (z - bias - datum[..., :2])[..., None, :] @ rotation2(datum[..., 2])
-    q = (p_world[..., 0, :] - pose[..., :2])[..., None, :] @ rotation2(pose[..., 2])
-    return np.asarray(arm - q[..., 0, :])
-
-
-def gps_jacobians(
-    values: Values, node: npt.NDArray[np.int64], arm: Array, z: Array, bias: npt.NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Residuals ``(q, 2)`` and Jacobians ``(q, 2, 8)`` on (x_node, datum, bias) in right tangents.
-
-    Parameters
-    ----------
-    node, bias : (q,) int
-        ``bias`` is -1 where a fix has none.
-    """
-    assert values.datum is not None
-    x, D = values.poses[node], values.datum
-    b = np.zeros_like(z)
-    has = bias >= 0
-    b[has] = values.biases[bias[has]]
-    Rx, RD = rotation2(x[:, 2]), rotation2(D[2])
-    p = (z - b - D[:2]) @ RD  # world position of the fix
-    q = np.einsum("kji,kj->ki", Rx, p - x[:, :2])  # in the base frame
-    J = np.zeros((len(z), 2, 8))
-    RxT = np.swapaxes(Rx, 1, 2)
-    J[:, :, :2] = np.eye(2)  # x Exp(ξ): q → Exp(-ξ) q
-    J[:, 0, 2], J[:, 1, 2] = -q[:, 1], q[:, 0]
-    J[:, :, 3:5] = RxT  # datum Exp(ξ): p → Exp(-ξ) p, seen through R_xᵀ
-    J[:, :, 5] = np.einsum("kij,kj->ki", RxT, np.stack([-p[:, 1], p[:, 0]], -1))
-    J[:, :, 6:8] = np.where(has[:, None, None], RxT @ RD.T, 0.0)
-    return arm - q, J
 
 
 def spread(points: Array) -> float:

@@ -6,10 +6,10 @@ import numpy as np
 
 from graphslam.core.errors import GeometryError
 from graphslam.core.records import Gps
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.gps import Fix, GpsConfig
 from graphslam.graph.graph_record import GraphRecord
 from graphslam.graph.noise import whitener
-from graphslam.graph.records import BiasPriorRecord, GpsRecord
 from graphslam.graph.submap_node import SubmapNode
 
 
@@ -73,7 +73,7 @@ class GpsVerbs(GraphRecord):
             return
         if self.gps_origin is None:
             self.gps_origin = self.gps.tied[0].fix.position.copy()
-        if self.values.datum is None:
+        if not self.structure.count("datum"):
             start = self.gps.datum_if_ready(self.values.poses, self.gps_origin, self.gps.tied[0].fix.config.baseline)
             if start is None:
                 return
@@ -83,8 +83,8 @@ class GpsVerbs(GraphRecord):
             bias = self._bias_of(t.fix)
             W = whitener(t.covariance, what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
             z = t.fix.position - self.gps_origin
-            tilt = self.values.tilt is not None
-            self._insert(
+            tilt = self.structure.count("tilt") > 0
+            self.insert(
                 GpsRecord(t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, t.fix.config.robust, bias, tilt=tilt)
             )
         self.gps.tied = []
@@ -94,10 +94,9 @@ class GpsVerbs(GraphRecord):
         self.gps.last_time = fix.time
         if cfg.bias_sigma is None:
             return None
-        if len(self.values.biases) == 0 or fix.time - previous > cfg.segment_gap:
-            self.values.biases = np.vstack([self.values.biases, np.zeros(self.dim)])
-            s = len(self.values.biases) - 1
+        if self.structure.count("bias") == 0 or fix.time - previous > cfg.segment_gap:
+            s = self.structure.append("bias", np.zeros(self.dim))
             record = BiasPriorRecord(self._next_factor, s, cfg.bias_sigma, dim=self.dim)
             self.ledger.spend(record.factor_id, record.label(), ["-"], (fix.time, fix.time), "prior")
-            self._insert(record)
-        return len(self.values.biases) - 1
+            self.insert(record)
+        return self.structure.count("bias") - 1

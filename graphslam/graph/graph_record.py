@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,13 +14,63 @@ from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.markup import Markup, element, join
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
+from graphslam.graph.factors.attitude import AttitudeRecord
+from graphslam.graph.factors.batch import Record, batch_of
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps_queue import GpsQueue
 from graphslam.graph.ledger import Ledger
-from graphslam.graph.records import BiasPriorRecord, GpsRecord, Record, SubmapRecord
 from graphslam.graph.score import Score, score
-from graphslam.graph.state import Values
 from graphslam.graph.submap_node import SubmapNode
+from graphslam.graph.variables import Values
+
+
+class Factors(dict[int, "Record"]):
+    """Factors by id, with a journal of every change, so that a solver sees what is new without looking at the rest.
+
+    A record of a kind that nobody registered is refused here.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.journal: list[int] = []
+
+    def __setitem__(self, factor_id: int, record: Record) -> None:
+        batch_of(type(record))
+        super().__setitem__(factor_id, record)
+        self.journal.append(factor_id)
+
+    def __delitem__(self, factor_id: int) -> None:
+        super().__delitem__(factor_id)
+        self.journal.append(factor_id)
+
+    def pop(self, factor_id: int, *default: Any) -> Any:
+        """See :meth:`dict.pop`."""
+        if factor_id in self:
+            self.journal.append(factor_id)
+        return super().pop(factor_id, *default)
+
+    def update(self, other: Any = (), /, **named: Any) -> None:
+        """See :meth:`dict.update`."""
+        for k, r in dict(other, **named).items():
+            self[k] = r
+
+
+class Source(Protocol):
+    """An incremental solver that holds newer values than the graph."""
+
+    def holds(self, name: str) -> bool:
+        """Does it hold that variable?"""
+        ...
+
+    def value(self, name: str) -> Array:
+        """Its present value."""
+        ...
+
+    def pull(self, structure: Values) -> Values:
+        """All values; those that it does not hold as they are in ``structure``."""
+        ...
 
 
 class GraphRecord:
@@ -33,8 +83,8 @@ class GraphRecord:
 
     Attributes
     ----------
-    values : Values
-        Best known values; solvers write them back.
+    structure : Values
+        Variables with values that may be old: for what depends on which variables there are, and not on where.
     records : dict of int to Record
         Every factor by id.
     ledger : Ledger
@@ -48,22 +98,55 @@ class GraphRecord:
         if dim not in (2, 3):
             raise ConfigError(f"a graph is in two or in three dimensions, got dim={dim}")
         self.dim = dim
-        self.values = Values.empty(dim)
-        self.origin = self.values.poses[0].copy()
-        self.records: dict[int, Record] = {}
+        self.structure = Values.empty(dim)
+        self._source: Source | None = None
+        self.origin = self.structure.poses[0].copy()
+        self.records = Factors()
         self.ledger = Ledger()
         self.events: list[dict[str, Any]] = []
         self.revision = 0
         self.submaps: list[SubmapNode] = []
+        self._place: dict[int, int] = {}  # submap key -> place in submaps
         self.gps = GpsQueue()
         self.gps_origin: Array | None = None
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
+        self._attitude_of: dict[int, int] = {}  # node -> attitudes that it has
         self._retired: set[int] = set()  # ids merged away or removed: never used again
         self._next_factor = 0
         self._next_landmark = 0
         self._flat: tuple[int, FlatGraph] | None = None
         self._covariance: tuple[int, Values, JointCovariance] | None = None
+
+    # ---------------------------------------------------------------- values
+
+    @property
+    def values(self) -> Values:
+        """Best known values. Where an incremental solver knows better it is asked for all of them now."""
+        if self._source is not None:
+            source, self._source = self._source, None
+            self.structure = source.pull(self.structure)
+        return self.structure
+
+    @values.setter
+    def values(self, values: Values) -> None:
+        self._source, self.structure = None, values
+
+    def expect(self, source: Source | None) -> None:
+        """From now on ``source`` knows the values; it is asked when they are needed (None: nobody does)."""
+        self._source = source
+
+    def pose(self, node: int) -> Array:
+        """Best known pose ``(3|7,)`` of one node."""
+        name = f"x{node}"
+        if self._source is not None and node and self._source.holds(name):
+            return self._source.value(name)
+        return self.structure.poses[node].copy()
+
+    @property
+    def landmark_rows(self) -> Mapping[int, int]:
+        """Landmark id → row of :attr:`Values.landmarks`."""
+        return self._row
 
     # ---------------------------------------------------------------- changing
 
@@ -84,7 +167,7 @@ class GraphRecord:
             used = {n for r in self.records.values() for n in r.variables()}
             if owner is self.submaps[-1] and not any(f"x{n}" in used for n in owner.nodes[1:]):
                 self.values.poses = self.values.poses[: owner.node + 1].copy()
-                self.submaps.pop()
+                self._place.pop(self.submaps.pop().key)
         if self.values.datum is not None and not any(isinstance(r, GpsRecord) for r in self.records.values()):
             for fid in [k for k, r in self.records.items() if isinstance(r, BiasPriorRecord)]:
                 self.ledger.refund(fid)
@@ -97,6 +180,8 @@ class GraphRecord:
 
     def _take_out(self, factor_id: int, reason: str) -> None:
         record = self.records.pop(factor_id)
+        if isinstance(record, AttitudeRecord):
+            self._attitude_of[record.node] -= 1
         self.ledger.refund(factor_id)
         self.revision += 1
         if isinstance(record, SubmapRecord):
@@ -147,7 +232,7 @@ class GraphRecord:
         self._start_landmarks(ids[entry : entry + 1], seen[None])
         if old not in ids:
             self._seen_in[old].discard(factor_id)
-        self._insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
+        self.insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
         self._event("split", factor_id=factor_id, submap=record.submap_key, landmark=old, new=new)
         return new
 
@@ -161,7 +246,7 @@ class GraphRecord:
         """
         if not values.is_finite():
             raise DataError("values of the graph are not finite", wanted="finite numbers")
-        if values.layout() != self.values.layout():
+        if values.layout() != self.structure.layout():
             raise DataError("values are of other variables than the graph's", wanted="the same layout")
         self.values = values
 
@@ -183,9 +268,8 @@ class GraphRecord:
         DataError
             It is not in the graph.
         """
-        for s in self.submaps:
-            if s.key == submap_key:
-                return s
+        if submap_key in self._place:
+            return self.submaps[self._place[submap_key]]
         raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")
 
     def landmark(self, landmark_id: int) -> Array:
@@ -198,14 +282,13 @@ class GraphRecord:
 
     def landmark_ids_of(self, submap_key: int) -> npt.NDArray[np.int64]:
         """Graph landmark of every entry of a submap, as it stands now."""
-        fid = next((s.factor_id for s in self.submaps if s.key == submap_key), None)
-        record = self.records.get(-1 if fid is None else fid)
+        record = self.records.get(self.submap(submap_key).factor_id) if submap_key in self._place else None
         return record.landmark_ids.copy() if isinstance(record, SubmapRecord) else np.zeros(0, dtype=np.int64)
 
     def flat(self) -> FlatGraph:
         """Flat arrays of the factors, made once per revision."""
         if self._flat is None or self._flat[0] != self.revision:
-            self._flat = (self.revision, FlatGraph(list(self.records.values()), self.values.layout()))
+            self._flat = (self.revision, FlatGraph(list(self.records.values()), self.structure.layout()))
         return self._flat[1]
 
     def covariance(self) -> JointCovariance:
@@ -237,13 +320,21 @@ class GraphRecord:
 
     # ---------------------------------------------------------------- inside
 
-    def _insert(self, record: Record) -> None:
+    def insert(self, record: Record) -> None:
+        """Take a factor whose evidence is in the ledger already; one with the same id is replaced."""
         self.records[record.factor_id] = record
         self._next_factor = max(self._next_factor, record.factor_id + 1)
         self.revision += 1
+        if isinstance(record, AttitudeRecord):
+            self._attitude_of[record.node] = self._attitude_of.get(record.node, 0) + 1
         if isinstance(record, SubmapRecord):
             for i in record.landmark_ids.tolist():
                 self._seen_in[i].add(record.factor_id)
+
+    def next_factor(self) -> int:
+        """A factor id that nobody has."""
+        self._next_factor += 1
+        return self._next_factor - 1
 
     def _event(self, kind: str, **facts: Any) -> None:
         self.events.append({"event": kind, **facts})
@@ -256,9 +347,9 @@ class GraphRecord:
         for i in new:
             self._row[i] = len(self._row)
             self._seen_in[i] = set()
-        v = self.values
-        v.landmark_ids = np.concatenate([v.landmark_ids, np.array(list(new), dtype=np.int64)])
-        v.landmarks = np.concatenate([v.landmarks, np.array(list(new.values())).reshape(-1, 2)])
+        self.structure.append_landmarks(
+            np.array(list(new), dtype=np.int64), np.array(list(new.values())).reshape(-1, 2)
+        )
 
     def _drop_landmarks(self, ids: Sequence[int]) -> None:
         if not ids:

@@ -2,99 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.se3 import matrix_to_quat, quat_normalize
-from graphslam.graph.state import Layout, Values, gtsam_key
+from graphslam.core.se3 import matrix_to_quat
+from graphslam.graph.factors.batch import gtsam_value, read_value
+from graphslam.graph.variables import KINDS, Values, gtsam_key, key_name, split_name
 
 
-def gtsam_pose(pose: Array) -> Any:
-    """``Pose2`` of ``(3,)``, ``Pose3`` of ``(7,)``; GTSAM takes any quaternion in silence, so it is normalised here."""
-    if len(pose) == 3:
-        return gtsam.Pose2(*pose)
-    x, y, z, w = quat_normalize(pose[3:])
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
+def value_of(values: Values, name: str, row_of: Mapping[int, int]) -> Array:
+    """Value ``(size,)`` of one variable; ``row_of`` says where landmarks stand."""
+    kind, k = split_name(name)
+    return values[kind.word][row_of[k] if kind.word == "l" else k]
 
 
-def pose_array(pose: Any) -> Array:
-    """Inverse of :func:`gtsam_pose`."""
-    if isinstance(pose, gtsam.Pose2):
-        return np.array([pose.x(), pose.y(), pose.theta()])
-    return np.concatenate([pose.translation(), matrix_to_quat(pose.rotation().matrix())])
-
-
-def insert_value(out: gtsam.Values, name: str, values: Values, row_of: dict[int, int]) -> None:
-    """Insert one variable of ``values`` into GTSAM's."""
-    key = gtsam_key(name)
-    if name == "datum":
-        assert values.datum is not None
-        out.insert(key, gtsam.Pose2(*values.datum) if values.dim == 2 else values.datum)
-    elif name == "tilt":
-        assert values.tilt is not None
-        out.insert(key, values.tilt)
-    elif name.startswith("velocity"):
-        out.insert(key, values.velocities[int(name[8:])])
-    elif name.startswith("imubias"):
-        out.insert(key, values.imu_biases[int(name[7:])])
-    elif name.startswith("bias"):
-        out.insert(key, values.biases[int(name[4:])])
-    elif name[0] == "x":
-        out.insert(key, gtsam_pose(values.poses[int(name[1:])]))
-    else:
-        out.insert(key, values.landmarks[row_of[int(name[1:])]])
+def insert_values(out: gtsam.Values, names: Iterable[str], values: Values, row_of: Mapping[int, int]) -> None:
+    """Insert variables of ``values`` into GTSAM's."""
+    for name in names:
+        out.insert(gtsam_key(name), gtsam_value(value_of(values, name, row_of), name, values.dim))
 
 
 def to_gtsam(values: Values) -> gtsam.Values:
     """All free variables as GTSAM values."""
     out, layout = gtsam.Values(), values.layout()
-    for name in layout.names():
-        insert_value(out, name, values, layout.row_of)
+    insert_values(out, layout.names(), values, layout.row_of)
     return out
 
 
-def from_gtsam(estimate: gtsam.Values, like: Values, layout: Layout | None = None) -> Values:
+def from_gtsam(estimate: gtsam.Values, like: Values, row_of: Mapping[int, int] | None = None) -> Values:
     """GTSAM values → ours; variables that GTSAM does not hold keep their value in ``like``."""
     out = like.copy()
+    row_of = like.layout().row_of if row_of is None else row_of
     keys = np.array(list(estimate.keys()), dtype=np.uint64)
     letter = (keys >> np.uint64(56)).astype(np.int64)
     index = (keys & np.uint64((1 << 56) - 1)).astype(np.int64)
-    if like.dim == 3:
-        _from_gtsam_in_space(estimate, out, keys, letter, index)
-        return out
-    row_of = (layout or like.layout()).row_of
-    # bulk extraction comes in the order of the keys, one array a type
-    posed, pointed = np.isin(letter, [ord("g"), ord("x")]), np.isin(letter, [ord("b"), ord("l")])
-    P = np.asarray(gtsam.utilities.extractPose2(estimate)).reshape(-1, 3)
-    p = np.asarray(gtsam.utilities.extractPoint2(estimate)).reshape(-1, 2)
-    x = letter[posed] == ord("x")
-    out.poses[index[posed][x]] = P[x]
-    if np.any(~x):
-        out.datum = P[~x][0].copy()
-    l = letter[pointed] == ord("l")
-    rows = np.array([row_of[int(i)] for i in index[pointed][l]], dtype=np.intp)
-    out.landmarks[rows] = p[l]
-    out.biases[index[pointed][~l]] = p[~l]
+    nodes = letter == ord("x")
+    _poses_from_gtsam(estimate, out, letter, index)
+    done = nodes
+    if like.dim == 2:  # bulk extraction comes in the order of the keys; in space it leaves rows of other sizes unset
+        points = np.isin(letter, [ord(k.letter) for k in KINDS.values() if k.dof(2) == 2])
+        p = np.asarray(gtsam.utilities.extractPoint2(estimate)).reshape(-1, 2)
+        if len(p) == points.sum():
+            l = letter[points] == ord("l")
+            rows = np.array([row_of[int(i)] for i in index[points][l]], dtype=np.intp)
+            out.landmarks[rows] = p[l]
+            done = nodes | (letter == ord("l"))
+    for key in keys[~done].tolist():
+        name = key_name(key)
+        kind, k = split_name(name)
+        out[kind.word][row_of[k] if kind.word == "l" else k] = read_value(estimate, name, key, like.dim)
     return out
 
 
-def _from_gtsam_in_space(estimate: gtsam.Values, out: Values, keys: Any, letter: Any, index: Any) -> None:
-    P = np.asarray(gtsam.utilities.extractPose3(estimate)).reshape(-1, 12)  # rotation by rows, then position
+def _poses_from_gtsam(estimate: gtsam.Values, out: Values, letter: Any, index: Any) -> None:
     x = letter == ord("x")
+    if out.dim == 2:
+        posed = np.isin(letter, [ord("g"), ord("x")])
+        P = np.asarray(gtsam.utilities.extractPose2(estimate)).reshape(-1, 3)
+        out.poses[index[x]] = P[x[posed]]
+        return
+    P = np.asarray(gtsam.utilities.extractPose3(estimate)).reshape(-1, 12)  # rotation by rows, then position
     rotations = P[:, :9].reshape(-1, 3, 3)
     finite = np.all(np.isfinite(P), axis=1)
     out.poses[index[x]] = np.nan
     out.poses[index[x][finite], :3] = P[finite, 9:]
     out.poses[index[x][finite], 3:] = matrix_to_quat(rotations[finite])
-    # the few others one by one: extractPoint3 also counts vectors of other sizes and leaves their rows unset
-    for key, what, i in zip(keys[~x].tolist(), letter[~x].tolist(), index[~x].tolist()):
-        if what == ord("g"):
-            out.datum = np.array(estimate.atVector(key))
-        elif what == ord("t"):
-            out.tilt = np.array(estimate.atVector(key))
-        else:
-            rows = {"b": out.biases, "v": out.velocities, "i": out.imu_biases}[chr(what)]
-            rows[i] = estimate.atVector(key)

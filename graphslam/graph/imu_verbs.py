@@ -16,17 +16,17 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
-from graphslam.graph.attitude import up_turn
 from graphslam.graph.attitude_verbs import LEVELLED, AttitudeVerbs, without_tilt
+from graphslam.graph.factors.attitude import AttitudeRecord, up_turn
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.axes import check_imu_axes
+from graphslam.graph.factors.imu.batch import GYRO_ROWS, XI, XJ, Ways, way_terms
 from graphslam.graph.factors.imu.config import ImuConfig, Place, path_of, places_of
-from graphslam.graph.factors.imu.family import GYRO_ROWS, XI, XJ, Ways, way_terms
 from graphslam.graph.factors.imu.plan import FEWEST, Plan, joined, plan_of, window_of
 from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.factors.imu.states import ImuStates, compacted, links_wanted
 from graphslam.graph.noise import whitener
-from graphslam.graph.records import AttitudeRecord, BetweenRecord
 
 logger = logging.getLogger(__name__)
 
@@ -54,11 +54,11 @@ class ImuVerbs(AttitudeVerbs):
 
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
         preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
-        :mod:`graphslam.graph.factors.imu.family`), inner nodes
+        :mod:`graphslam.graph.factors.imu.batch`), inner nodes
         included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
         the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
         pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The
-        first factor brings in the ``tilt`` (:mod:`graphslam.graph.attitude`).
+        first factor brings in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
 
         It may be called again when there are more submaps, with the readings that follow (or with none): ways that
         are there stay. Everything left out is counted by reason (event ``imu``).
@@ -208,11 +208,9 @@ class ImuVerbs(AttitudeVerbs):
         for k, (a, b) in enumerate(pairs):
             for n in (a, b):
                 if n not in biases:
-                    biases[n] = len(self.values.imu_biases)
-                    self.values.imu_biases = np.vstack([self.values.imu_biases, start])
+                    biases[n] = self.values.append("imubias", start)
                 if cfg.accelerometer and n not in velocities:
-                    velocities[n] = len(self.values.velocities)
-                    self.values.velocities = np.vstack([self.values.velocities, np.full(3, np.nan)])
+                    velocities[n] = self.values.append("velocity", np.full(3, np.nan))
             va, vb = velocities.get(a, -1), velocities.get(b, -1)
             local = np.stack([unit[a][1], unit[b][1]])
             made.append(
@@ -248,7 +246,7 @@ class ImuVerbs(AttitudeVerbs):
                     continue  # the last one has given it up already
                 covariances[m] = without_tilt(s.stated[m]) if give_up else s.stated[m]
                 W = whitener(covariances[m], what=f"covariance of {old.label()}", dim=6)
-                self._insert(replace(old, whitener=W))
+                self.insert(replace(old, whitener=W))
             self.submaps[k] = replace(s, covariances=covariances)
 
     def _start_bias(
@@ -308,7 +306,7 @@ class ImuVerbs(AttitudeVerbs):
             gyro = isinstance(r, GyroRecord)
             Pk = Pk[np.ix_(GYRO_ROWS, GYRO_ROWS)] if gyro else Pk
             W = whitener(Pk, what=f"covariance of {r.label()}", dim=len(Pk))
-            self._insert(replace(r, whitener=W))
+            self.insert(replace(r, whitener=W))
 
     def _add_forces(self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], plan: Plan) -> list[int]:
         if not plan.gravity:
@@ -330,12 +328,11 @@ class ImuVerbs(AttitudeVerbs):
             W = whitener(sigma**2 * np.eye(3) + tilted, what=f"specific force at x{n}", dim=3)
             row = known.get(n)
             if row is None:
-                row = len(self.values.imu_biases)
-                start = self.values.imu_biases[-1] if row else np.zeros(6)
-                self.values.imu_biases = np.vstack([self.values.imu_biases, start])
+                last = self.values.imu_biases[-1:]
+                row = self.values.append("imubias", last if len(last) else np.zeros(6))
             r = ForceRecord(self._next_factor, stream, n, float(at[k]), row, L, force[k], W, cfg.robust)
             self.ledger.spend(r.factor_id, r.label(), [stream], window_of(at[k], cfg))
-            self._insert(r)
+            self.insert(r)
             ids.append(r.factor_id)
         return ids
 
@@ -354,10 +351,10 @@ class ImuVerbs(AttitudeVerbs):
                     del wanted[(r.before, r.bias)]
         ids = []
         for (before, bias), sigma in wanted.items():
-            r = ImuBiasRecord(self._next_factor, stream, before, bias, sigma)
-            self.ledger.spend(r.factor_id, r.label(), ["-"], (0.0, 0.0), "prior")
-            self._insert(r)
-            ids.append(r.factor_id)
+            link = ImuBiasRecord(self._next_factor, stream, before, bias, sigma)
+            self.ledger.spend(link.factor_id, link.label(), ["-"], (0.0, 0.0), "prior")
+            self.insert(link)
+            ids.append(link.factor_id)
         return ids
 
     def _compact(self) -> None:

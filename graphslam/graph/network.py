@@ -6,8 +6,9 @@ import numpy as np
 
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord, SubmapRecord
 
 
 def to_network(graph: PoseGraph) -> PoseNetwork:

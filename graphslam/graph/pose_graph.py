@@ -34,14 +34,19 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
+from graphslam.core.records import Compass, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.attitude_verbs import without_tilt
+from graphslam.graph.factors.batch import Record
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.imu_verbs import ImuVerbs
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, whitener
-from graphslam.graph.records import AttitudeRecord, BetweenRecord, Record, SubmapRecord
+from graphslam.graph.readings import BeaconConfig, CompassConfig, Readings
 from graphslam.graph.submap_node import SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
@@ -58,6 +63,10 @@ class PoseGraph(ImuVerbs):
     dim : int
         2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
     """
+
+    def __init__(self, dim: int = 2) -> None:
+        super().__init__(dim)
+        self.readings = Readings(self)
 
     def add_submap(
         self,
@@ -102,7 +111,7 @@ class PoseGraph(ImuVerbs):
         """
         if submap.dim != self.dim:
             raise GeometryError(f"submap {submap.key} has the wrong dimension", got=submap.dim, wanted=self.dim)
-        if any(s.key == submap.key for s in self.submaps):
+        if submap.key in self._place:
             raise DataError(f"submap {submap.key} is already in the graph", wanted="each submap once")
         if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
             raise ConfigError(f"inner nodes need a positive spacing, got {spacing}")
@@ -131,19 +140,20 @@ class PoseGraph(ImuVerbs):
         W = whitener(
             lm.dense_covariance(), what=f"covariance of submap {submap.key}", dim=3 + 2 * n, scale=covariance_scale
         )
-        node, fid = len(self.values.poses) - 1, self._next_factor
+        node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         # from here on nothing fails
         fresh = np.flatnonzero(ids < 0)
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
-        self._start_landmarks(ids, se2_transform(self.values.poses[-1], lm.positions))
+        self._start_landmarks(ids, se2_transform(self.pose(node), lm.positions))
         record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
         ends = np.stack([np.zeros(3), submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self._tie_fixes(self.submaps[-1])
+        self.readings.tie(self.submaps[-1])
         return fid
 
     def _add_dense(
@@ -153,7 +163,7 @@ class PoseGraph(ImuVerbs):
         stated = covariance_scale * cut.covariances
         if level_sigma is not None:
             cut.covariances[-1] = without_tilt(cut.covariances[-1])  # the path inside stands by its own attitude
-        d, node, fid = self.values.group.dof, len(self.values.poses) - 1, self._next_factor
+        d, node, fid = self.structure.group.dof, self.structure.count("x") - 1, self._next_factor
         records = [
             BetweenRecord(
                 fid + k,
@@ -174,13 +184,13 @@ class PoseGraph(ImuVerbs):
             "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
         )
         self._tie_fixes(self.submaps[-1])
+        self.readings.tie(self.submaps[-1])
         return fid
 
     def _level_ends(self, sigma: float) -> None:
         """The last submap's exit is level, and so is its base if nothing has said so yet."""
         s = self.submaps[-1]
-        known = {r.node for r in self.records.values() if isinstance(r, AttitudeRecord)}
-        if s.node not in known:
+        if not self._attitude_of.get(s.node):
             self._level(s.node, sigma, s.interval[0])
         fid = self._level(s.exit_node, sigma, s.interval[1])
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
@@ -189,11 +199,16 @@ class PoseGraph(ImuVerbs):
         self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, *covariances: Array
     ) -> None:
         """New nodes after the last one, the submap's entry, and its factors."""
-        node, group, base = len(self.values.poses) - 1, self.values.group, self.values.poses[-1]
+        node, group, base = (
+            self.structure.count("x") - 1,
+            self.structure.group,
+            self.pose(self.structure.count("x") - 1),
+        )
         new = group.compose(np.broadcast_to(base, T_base_node[1:].shape), T_base_node[1:])
-        self.values.poses = np.vstack([self.values.poses, new])
+        self.structure.append("x", new)
         ids = tuple(r.factor_id for r in records)
         nodes = tuple(range(node, node + len(T_base_node)))
+        self._place[submap.key] = len(self.submaps)
         self.submaps.append(
             SubmapNode(
                 submap.key,
@@ -209,7 +224,94 @@ class PoseGraph(ImuVerbs):
             )
         )
         for record in records:
-            self._insert(record)
+            self.insert(record)
+
+    def add_compass(
+        self, compass: Compass, *, stream: str = "compass", config: CompassConfig | None = None
+    ) -> list[int]:
+        """Give the graph headings, at any time and in any portion; each finds its own submap.
+
+        The zero of the compass, where magnetic east is in the frame of the first base, is a variable; so is the
+        deviation by iron on the robot if the configuration says so (:mod:`graphslam.graph.factors.compass`).
+
+        Returns
+        -------
+        list of int
+            Factor ids, one a reading that was kept (:attr:`CompassConfig.every`).
+
+        Raises
+        ------
+        EvidenceReusedError
+            A submap that holds a reading already used ``stream``, or the reading was given before.
+        """
+        return self.readings.add_compass(compass, stream, config)
+
+    def add_beacons(
+        self,
+        ranges: LandmarkObservations,
+        *,
+        stream: str = "beacons",
+        config: BeaconConfig | None = None,
+        lever: ArrayLike | None = None,
+    ) -> list[int]:
+        """Give the graph distances to beacons of unknown position; each finds its own submap.
+
+        A beacon gets a place when it was heard often enough from places that do not lie on one line; its distances
+        become factors then (:mod:`graphslam.graph.factors.range`).
+
+        Parameters
+        ----------
+        ranges : LandmarkObservations
+            With known identities; bearings are not used.
+        lever : (dim,), optional
+            Antenna in the body frame; by default the place of the stream's sensor.
+
+        Returns
+        -------
+        list of int
+            Factor ids, one a distance that was kept.
+        """
+        return self.readings.add_beacons(ranges, stream, config, None if lever is None else np.asarray(lever))
+
+    def finish_readings(self) -> None:
+        """No more submaps will come: headings and distances that still wait are dropped, and counted."""
+        self.readings.finish()
+
+    def add_range(
+        self,
+        i: int,
+        j: int,
+        distance: float,
+        sigma: float,
+        *,
+        arm_i: ArrayLike | None = None,
+        arm_j: ArrayLike | None = None,
+        streams: Iterable[str] = (),
+        interval: tuple[float, float] | None = None,
+        evidence: str = EXCLUSIVE,
+        robust: Robust = NO_KERNEL,
+    ) -> int:
+        """A distance between two nodes, antennas ``(dim,)`` in their frames [m].
+
+        Parameters
+        ----------
+        streams, interval
+            What it spends; an exclusive measurement must say both.
+        """
+        last = self.structure.count("x") - 1
+        if i == j or not (0 <= i <= last and 0 <= j <= last):
+            raise DataError("a distance joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
+        if not (np.isfinite(distance) and distance >= 0 and np.isfinite(sigma) and sigma > 0):
+            raise DataError(f"distance x{i} – x{j} is not usable", got=(distance, sigma), wanted="≥ 0 m, sigma > 0 m")
+        names = list(streams)
+        if evidence == EXCLUSIVE and (not names or interval is None):
+            raise ConfigError(f"distance x{i} – x{j} must name the streams and the interval that it spends")
+        arms = [np.zeros(self.dim) if a is None else np.asarray(a, dtype=np.float64) for a in (arm_i, arm_j)]
+        record = RangeRecord(self.next_factor(), i, j, arms[0], arms[1], float(distance), float(sigma), robust)
+        self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
+        self.insert(record)
+        self._event("range", factor_id=record.factor_id, i=i, j=j, evidence=evidence)
+        return record.factor_id
 
     def start_session(self, T_world_base: ArrayLike) -> int:
         """Begin another chain of submaps whose first base is free: another robot, or another day.
@@ -230,9 +332,8 @@ class PoseGraph(ImuVerbs):
         T = self._pose(T_world_base, "start of a session")
         if not self.submaps:
             raise DataError("the first session needs no start", wanted="submaps before another session begins")
-        self.values.poses = np.vstack([self.values.poses, T])
+        node = self.structure.append("x", T)
         self.revision += 1
-        node = len(self.values.poses) - 1
         self._event("session", node=node, T_world_base=T.tolist())
         return node
 
@@ -261,17 +362,17 @@ class PoseGraph(ImuVerbs):
         group : str
             Class under which :meth:`objective` reports it.
         """
-        last = len(self.values.poses) - 1
+        last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("between-factor joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
         T = self._pose(T_ij, f"relative pose x{i} → x{j}")
         names = list(streams)
         if evidence == EXCLUSIVE and (not names or interval is None):
             raise ConfigError(f"between-factor x{i} → x{j} must name the streams and the interval that it spends")
-        W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=self.values.group.dof)
+        W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=self.structure.group.dof)
         record = BetweenRecord(self._next_factor, i, j, T, W, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
-        self._insert(record)
+        self.insert(record)
         self._event("between", factor_id=record.factor_id, i=i, j=j, evidence=evidence, group=group)
         return record.factor_id
 
@@ -313,7 +414,7 @@ class PoseGraph(ImuVerbs):
 
     def _into(self, s: SubmapNode, T_base_here: Array, P: Array) -> tuple[int, Array, Array]:
         """A pose seen from a submap's base, seen from the nearest of its nodes: (node, pose, covariance)."""
-        path, group = s.trajectory, self.values.group
+        path, group = s.trajectory, self.structure.group
         if not s.inner or path is None:
             return s.node, T_base_here, P
         dim = self.dim
@@ -332,7 +433,7 @@ class PoseGraph(ImuVerbs):
 
     def _pose(self, T: ArrayLike, what: str) -> Array:
         """A pose of the graph's dimension, its quaternion of length one."""
-        pose, group = np.asarray(T, dtype=np.float64), self.values.group
+        pose, group = np.asarray(T, dtype=np.float64), self.structure.group
         if pose.shape != (group.size,) or not np.all(np.isfinite(pose)):
             wanted = {3: "three", 7: "seven"}[group.size]
             raise GeometryError(f"{what} is not usable", got=T, wanted=f"{wanted} finite numbers")

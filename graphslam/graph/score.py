@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from graphslam.core.geometry import Array
 from graphslam.core.markup import table
 from graphslam.graph.flat import FlatGraph
+from graphslam.graph.variables import KINDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,19 +80,16 @@ def score(flat: FlatGraph, chi2: Array) -> Score:
         c[0] += value
         c[1] += 1
         c[2] += record.rows
-    unknowns = {
-        "gps": lay.datum_dof if lay.datum else 0,
-        "gps-bias": lay.dim * lay.biases,
-        "attitude": 2 if lay.tilt else 0,
-        # every record of the class brings in, or ties, one bias; the ways bring in the others and the velocities
-        "imu-bias": 6 * int(sums.get("imu-bias", [0.0, 0, 0])[1]),
-        "imu": 3 * lay.velocities + 6 * (lay.imu_biases - int(sums.get("imu-bias", [0.0, 0, 0])[1])),
-    }
-    if lay.tilt and "attitude" not in sums and "levelled" not in sums:
-        owner = "imu" if "imu" in sums else "imu-gravity"
-        unknowns[owner] = unknowns.get(owner, 0) + 2
-    chain = next((g for g in ("submap", "dense-submap") if g in sums), next(iter(sums), ""))
-    unknowns[chain] = unknowns.get(chain, 0) + lay.datum_start
+    unknowns: dict[str, int] = {}
+    for word, kind in KINDS.items():
+        free = lay.stop(word) - lay.start(word)
+        if free and word == "imubias" and "imu" in sums:  # those that have a factor of their own, and the others
+            own = min(free, kind.dof(lay.dim) * int(sums.get("imu-bias", [0.0, 0, 0])[1]))
+            unknowns["imu-bias"] = unknowns.get("imu-bias", 0) + own
+            unknowns["imu"] = unknowns.get("imu", 0) + free - own
+        elif free:
+            owner = next((c for c in kind.classes if c in sums), next(iter(sums), ""))
+            unknowns[owner] = unknowns.get(owner, 0) + free
     return Score(
         {g: ClassScore(float(v), int(f), int(r), int(r) - unknowns.get(g, 0)) for g, (v, f, r) in sums.items()}
     )

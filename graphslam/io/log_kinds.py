@@ -15,6 +15,7 @@ from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import (
     AckermannGeometry,
+    Compass,
     Gps,
     LandmarkObservations,
     LaserScans,
@@ -176,6 +177,7 @@ KINDS: dict[str, Kind] = {
         _unpack_steering,
         {"wheelbase": floats(), "encoder_offset": floats(), "model": texts()},
     ),
+    "compass": Kind(Compass, {**_TIMES, "headings": floats("n"), "sigma": floats("n")}),
     "velocity-controls": Kind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
     "odometry": Kind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
     "gps": Kind(Gps, {**_TIMES, "positions": floats("n", "c"), "sigma": floats("n"), "lever": floats("c")}),

@@ -8,9 +8,9 @@ import numpy as np
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
@@ -56,7 +56,8 @@ def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
     DataError
         A factor of the chain was removed.
     """
-    T, P = [], []
+    T: list[Array] = []
+    P: list[Array] = []
     for s in graph.submaps:
         for k, fid in enumerate(s.factor_ids[: len(s.nodes) - 1]):
             r = graph.records.get(fid)

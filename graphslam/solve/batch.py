@@ -10,10 +10,10 @@ import numpy as np
 
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.gtsam_factors import gtsam_factor
+from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.state import Values
+from graphslam.graph.variables import Values
 from graphslam.solve.levenberg import LevenbergConfig, Optimum, newton_step, optimise
 from graphslam.solve.solution import Solution, make_solution
 

@@ -5,13 +5,16 @@ linearised in part at old values. :meth:`Isam2Solver.gap` says by how much the o
 reached from here, :meth:`Isam2Solver.solve_to_optimum` gets there, and a :class:`Solution` is never flagged converged
 before.
 
-GTSAM's ``update`` is not exception-safe: after a throw the object is dead. Every update therefore works on a copy
-that replaces the old object only when it succeeded.
+An update costs what it touches: only records that changed are looked at (the graph keeps a journal of them), nothing is
+copied, and the estimate is read when somebody asks the graph for its values. GTSAM's ``update`` is not exception-safe:
+after a throw the object is dead. What it held is then made again from the graph's own records; a factor is blamed only
+if that fails, too.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import re
 import time
 
@@ -20,13 +23,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from graphslam.core.errors import ConfigError, SolverError
+from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.batch import Record, gtsam_factor, pose_array
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.flat import FlatGraph
-from graphslam.graph.gtsam_factors import gtsam_factor
-from graphslam.graph.gtsam_values import from_gtsam, insert_value
+from graphslam.graph.gtsam_values import from_gtsam, insert_values, value_of
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import Record
-from graphslam.graph.state import Values
+from graphslam.graph.variables import Values, gtsam_key, split_name, thresholds
 from graphslam.solve.batch import linearisation_gap, optimise_graph, state_of
 from graphslam.solve.solution import Solution, make_solution
 
@@ -63,8 +67,10 @@ class Isam2Solver:
     relinearize_angle : float
         The same for a heading [rad]. Submap factors are linear but for the heading of their base: an error of the
         linearisation is (change of heading) x (change of position), so headings are held much tighter.
-    relinearize_skip : int
-        Look only at every n-th update.
+    relinearize_skip : int, optional
+        Look for variables that moved at every n-th update only: looking costs as much as there are variables. By
+        default 10, and 1 where there are landmarks, which are associated by where the poses are thought to be. A
+        factor between two nodes that were there before, a loop, has them looked at in any case.
     """
 
     name = "isam2"
@@ -75,9 +81,9 @@ class Isam2Solver:
         *,
         relinearize_threshold: float = 0.1,
         relinearize_angle: float = 0.01,
-        relinearize_skip: int = 1,
+        relinearize_skip: int | None = None,
     ) -> None:
-        if not (relinearize_threshold > 0 and relinearize_angle > 0 and relinearize_skip >= 1):
+        if not (relinearize_threshold > 0 and relinearize_angle > 0 and (relinearize_skip or 1) >= 1):
             raise ConfigError(
                 "iSAM2 needs positive thresholds and skip, got "
                 f"{relinearize_threshold} m, {relinearize_angle} rad, {relinearize_skip}"
@@ -89,9 +95,11 @@ class Isam2Solver:
         self.updates = 0
         self.rebuilds = 0
         self.seconds = 0.0
-        self._isam: gtsam.ISAM2
+        self._isam: gtsam.ISAM2 | None
         self._held: dict[int, tuple[Record, int]]  # factor id -> (record, slot)
         self._known: set[str]
+        self._read: int  # entries of the graph's journal that were taken in
+        self._since_pull = 0
         self._forget()
 
     # ---------------------------------------------------------------- verbs
@@ -132,8 +140,8 @@ class Isam2Solver:
         while passes < max_passes:
             passes += 1
             before = self.graph.values
-            self._rebuild()
-            if _distance(before, self.graph.values) <= tolerance:
+            self._rebuild([], [])
+            if before.distance(self.graph.values) <= tolerance:
                 break
         self.seconds += time.perf_counter() - t0
         return passes
@@ -144,7 +152,7 @@ class Isam2Solver:
         t0 = time.perf_counter()
         optimum = optimise_graph(self.graph)
         self.graph.set_values(optimum.values)
-        self._rebuild()
+        self._rebuild([], [])
         self.graph.set_values(optimum.values)
         self.seconds += time.perf_counter() - t0
 
@@ -169,110 +177,159 @@ class Isam2Solver:
 
     # ---------------------------------------------------------------- inside
 
-    def _forget(self) -> None:
+    def _new(self) -> gtsam.ISAM2:
+        """An empty iSAM2 for graphs of this kind."""
         parameters = gtsam.ISAM2Params()
-        metres, radians = self.relinearize_threshold, self.relinearize_angle
-        thresholds = gtsam.ISAM2ThresholdMap()
-        if self.graph.dim == 2:
-            widths = {"x": (2, 1), "g": (2, 1), "l": (2, 0), "b": (2, 0)}
-        else:  # GTSAM's Pose3 has its rotation first; the datum here has its heading last
-            widths = {"x": (3, -3), "g": (3, 1), "b": (3, 0), "t": (0, 2)}
-            widths |= {"v": (3, 0), "i": (3, -3)}  # of an IMU's velocity [m/s]; of its biases [rad/s, m/s²]
-        for letter, (m, r) in widths.items():
-            parts = [np.full(m, metres), np.full(abs(r), radians)]
-            thresholds.insert((letter, np.concatenate(parts if r >= 0 else parts[::-1])))
-        parameters.setRelinearizeThreshold(thresholds)
-        parameters.relinearizeSkip = self.relinearize_skip
-        parameters.findUnusedFactorSlots = True
+        limits = gtsam.ISAM2ThresholdMap()
+        for item in thresholds(self.graph.dim, self.relinearize_threshold, self.relinearize_angle).items():
+            limits.insert(item)
+        parameters.setRelinearizeThreshold(limits)
+        landmarks = self.graph.structure.count("l") > 0
+        parameters.relinearizeSkip = self.relinearize_skip or (1 if landmarks else 10)
         # Cholesky squares the condition number: an open chain of 900 poses with a centimetre of noise each is
         # "indeterminate" to it. QR costs about the same here.
         parameters.setFactorization("QR")
-        self._isam = gtsam.ISAM2(parameters)
+        return gtsam.ISAM2(parameters)
+
+    def _forget(self) -> None:
+        self._isam = None
         self._held = {}
         self._known = set()
+        self._read = 0
 
     def _update(self) -> None:
         new, gone = self._difference()
-        if not self.graph.values.is_finite():
-            raise SolverError("the graph holds values that are not finite; iSAM2 is not touched")
         changed = [i for i in gone if i in self.graph.records]  # re-keyed by a merge
-        lost = self._known - set(self.graph.values.layout().names())
+        lost = self._known - set(self.graph.structure.layout().names()) if gone else set()
         if changed or lost:
-            self._check_finite(new)
-            self._rebuild()
-            return
-        if not new and not gone and self.updates:
-            return
-        self._check_finite(new)
-        previous = (self._isam, dict(self._held), set(self._known))
-        try:
-            self._feed(gtsam.ISAM2(self._isam), new, gone)
-            self._write_back()
-        except _FAILURES as error:
-            self._isam, self._held, self._known = previous
-            # what fails step by step may be sound as a whole: a factor is blamed only if that fails, too
-            self._rebuild(cause=error)
-            return
-        self.updates += 1
+            self._rebuild(new, gone)
+        elif new or gone or not self.updates:
+            self._check_fresh(new)
+            try:
+                self._feed(new, gone)
+                self._promise(new)
+            except _FAILURES as error:
+                # what fails step by step may be sound as a whole: a factor is blamed only if that fails, too
+                self._rebuild(new, gone, cause=error)
+            else:
+                self.updates += 1
+        self._read = len(self.graph.records.journal)
+
+    def _check_fresh(self, new: list[Record]) -> None:
+        """Variables that iSAM2 is to hear of start at numbers."""
+        for name in {n for r in new for n in r.variables()} - self._known - {"x0"}:
+            if not np.all(np.isfinite(value_of(self.graph.structure, name, self.graph.landmark_rows))):
+                raise SolverError(f"{name} starts at a value that is not finite; iSAM2 is not touched")
 
     def _difference(self) -> tuple[list[Record], list[int]]:
         """Records to add, and factor ids that iSAM2 holds and the graph does not (or no longer in that form)."""
-        records = self.graph.records
-        gone = [i for i, (r, _) in self._held.items() if records.get(i) is not r]
-        new = [r for i, r in records.items() if i not in self._held or self._held[i][0] is not r]
+        records, new, gone = self.graph.records, [], []
+        for i in dict.fromkeys(self.graph.records.journal[self._read :]):
+            now, held = records.get(i), self._held.get(i)
+            if held is not None and held[0] is not now:
+                gone.append(i)
+            if now is not None and (held is None or held[0] is not now):
+                new.append(now)
         return new, gone
 
-    def _feed(self, isam: gtsam.ISAM2, new: list[Record], gone: list[int]) -> None:
-        """One GTSAM update on ``isam``, which then becomes ours."""
+    def _feed(self, new: list[Record], gone: list[int]) -> None:
+        """One update of GTSAM's."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        layout = self.graph.flat().layout
         fresh: dict[str, None] = {}
         for record in new:
             factors.push_back(gtsam_factor(record, self.graph.origin))
             for name in record.variables():
                 if name != "x0" and name not in self._known:
                     fresh[name] = None
-        for name in fresh:
-            insert_value(values, name, self.graph.values, layout.row_of)
+        insert_values(values, fresh, self.graph.structure, self.graph.landmark_rows)
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = [self._held[i][1] for i in gone]
-        result = isam.update(factors, values, parameters)
-        slots = list(result.getNewFactorsIndices())
-        self._isam = isam
+        loops = (isinstance(r, BetweenRecord) and fresh.keys().isdisjoint(r.variables()) for r in new)
+        parameters.force_relinearize = any(loops)
+        if self._isam is None:
+            self._isam = self._new()
+        slots = list(self._isam.update(factors, values, parameters).getNewFactorsIndices())
         for i in gone:
             del self._held[i]
         for record, slot in zip(new, slots):
             self._held[record.factor_id] = (record, slot)
         self._known |= set(fresh)
 
-    def _write_back(self) -> None:
-        estimate = from_gtsam(self._isam.calculateEstimate(), self.graph.values, self.graph.flat().layout)
+    def value(self, name: str) -> Array:
+        """The present estimate of one variable that iSAM2 holds."""
+        kind, dim, key = split_name(name)[0], self.graph.dim, gtsam_key(name)
+        group = kind.pose_group(dim)
+        if group is not None:
+            pose = self._isam.calculateEstimatePose2 if dim == 2 else self._isam.calculateEstimatePose3
+            return pose_array(pose(key))
+        return np.array(self._isam.calculateEstimateVector(key))
+
+    def _is_finite(self, name: str) -> bool:
+        if name[0] != "x":
+            return bool(np.all(np.isfinite(self.value(name))))
+        key = gtsam_key(name)
+        if self.graph.dim == 2:
+            pose = self._isam.calculateEstimatePose2(key)
+            return math.isfinite(pose.x() + pose.y() + pose.theta())
+        return math.isfinite(self._isam.calculateEstimatePose3(key).matrix().sum())
+
+    def holds(self, name: str) -> bool:
+        """Is that variable in iSAM2?"""
+        return name in self._known
+
+    def _promise(self, new: list[Record]) -> None:
+        """The graph's values are those of iSAM2 from now on; they are read when somebody asks for them.
+
+        A residual that is not finite spreads over all variables of its factor, so that one of each new factor tells.
+        """
+        for record in new:
+            name = next((n for n in record.variables() if n != "x0"), None)
+            if name is not None and not self._is_finite(name):
+                raise SolverError("iSAM2 returned values that are not finite")
+        self.graph.expect(self)
+        self._since_pull += 1
+        if self._since_pull > max(100, len(self._known) // 10):  # what a rebuild would begin at stays near
+            self._since_pull = 0
+            _ = self.graph.values
+
+    def pull(self, structure: Values) -> Values:
+        """All values: those that iSAM2 holds as it has them, others as they are in ``structure``."""
+        estimate = from_gtsam(self._isam.calculateEstimate(), structure, self.graph.landmark_rows)
         if not estimate.is_finite():
             raise SolverError("iSAM2 returned values that are not finite")
-        self.graph.set_values(estimate)
+        return estimate
 
-    def _rebuild(self, cause: Exception | None = None) -> None:
+    def _rebuild(self, new: list[Record], gone: list[int], cause: Exception | None = None) -> None:
         """Make iSAM2 again from the graph's record, linearised at the graph's values.
 
         ``cause`` is what an update step by step failed with.
         """
-        old = (self._isam, self._held, self._known)
-        new, gone = self._difference()
+        if cause is not None:
+            self.graph.expect(None)  # the object that knew better is dead
+            try:
+                self._check_finite(new)
+            except SolverError:
+                ids = {r.factor_id for r in new}
+                self._restore([r for i, r in self.graph.records.items() if i not in ids])
+                raise
+        _ = self.graph.values  # while the old object can tell
         self._forget()
         try:
-            self._feed(self._isam, list(self.graph.records.values()), [])
+            self._feed(list(self.graph.records.values()), [])
             if cause is not None:
                 self._check_normal_equations()
-            self._write_back()
+            self.graph.set_values(self.pull(self.graph.values))
         except _FAILURES as error:
-            self._isam, self._held, self._known = old
             self._blame(new, gone, cause or error)
+        self._read = len(self.graph.records.journal)
         self.rebuilds += 1
         self.updates += 1
 
     def _check_finite(self, new: list[Record]) -> None:
-        """Refuse a factor whose residual is not finite before GTSAM sees it (its own message would mislead)."""
-        chi2 = FlatGraph(new, self.graph.flat().layout).evaluate(self.graph.values, hessian=False).chi2
+        """Refuse a factor whose residual is not finite (GTSAM's own message would mislead)."""
+        if not self.graph.values.is_finite():
+            raise SolverError("the graph holds values that are not finite; iSAM2 is not touched")
+        chi2 = FlatGraph(new, self.graph.values.layout()).evaluate(self.graph.values, hessian=False).chi2
         for record, value in zip(new, chi2):
             if not np.isfinite(value):
                 self._reject(record, f"its residual is {value}")
@@ -284,24 +341,33 @@ class Isam2Solver:
             raise SolverError("the squares of its Jacobian overflow")
 
     def _blame(self, new: list[Record], gone: list[int], error: Exception) -> None:
-        """The update failed and iSAM2 is rolled back: find out why, and say it."""
+        """The whole graph fails, too: find out why, and say it."""
         if gone:
+            self._forget()
             self.graph.diagnose().raise_if_bad()
         # the first new factor with which an update of those before it fails
-        isam, held, known = self._isam, dict(self._held), set(self._known)
-        try:
-            for record in new:
-                try:
-                    self._feed(gtsam.ISAM2(self._isam), [record], [])
-                    self._isam.calculateEstimate()
-                except _FAILURES as cause:
-                    self._isam, self._held, self._known = isam, held, known
-                    self.graph.diagnose().raise_if_bad()
-                    self._reject(record, _in_words(cause))
-        finally:
-            self._isam, self._held, self._known = isam, held, known
+        names = {r.factor_id for r in new}
+        before = [r for i, r in self.graph.records.items() if i not in names]
+        self._restore(before)
+        for record in new:
+            try:
+                self._feed([record], [])
+                self._isam.calculateEstimate()
+            except _FAILURES as cause:
+                self._restore(before)
+                self.graph.diagnose().raise_if_bad()
+                self._reject(record, _in_words(cause))
         self.graph.diagnose().raise_if_bad()
         raise SolverError(f"iSAM2 update failed ({_in_words(error)}); the solver is as it was before") from error
+
+    def _restore(self, records: list[Record]) -> None:
+        """Hold these records and no others, as far as they can be solved."""
+        self._forget()
+        try:
+            self._feed(records, [])
+            self._isam.calculateEstimate()
+        except _FAILURES:  # then the next update makes it anew
+            self._forget()
 
     def _reject(self, record: Record, why: str) -> None:
         self.graph.remove(record.factor_id, reason=f"rejected by iSAM2: {why}")
@@ -317,16 +383,3 @@ def _in_words(error: Exception) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     found = re.search(r"(?<=near variable )\d+ \(Symbol: (\w+)\)\.?", text)
     return text if found is None else f"{text[: found.start()]}{found[1]}"
-
-
-def _distance(a: Values, b: Values) -> float:
-    """Greatest change of any component."""
-    parts = [np.abs(a.poses - b.poses).max(initial=0.0), np.abs(a.landmarks - b.landmarks).max(initial=0.0)]
-    parts += [
-        np.abs(a.velocities - b.velocities).max(initial=0.0),
-        np.abs(a.imu_biases - b.imu_biases).max(initial=0.0),
-    ]
-    for one, other in ((a.datum, b.datum), (a.tilt, b.tilt)):
-        if one is not None and other is not None:
-            parts.append(np.abs(one - other).max())
-    return float(max(parts))

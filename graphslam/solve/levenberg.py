@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.graph.flat import FlatGraph, System
-from graphslam.graph.state import Values
+from graphslam.graph.variables import Values
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 # A dense Cholesky factorisation beats a sparse one below this many columns (measured).

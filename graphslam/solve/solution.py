@@ -15,11 +15,11 @@ from graphslam.core.markup import Markup, element, join
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.flat import FlatGraph
-from graphslam.graph.gps_family import level_datum_pose
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
 from graphslam.graph.score import Score, score
-from graphslam.graph.state import Values, vector_form
+from graphslam.graph.variables import Values, vector_form
 from graphslam.solve.levenberg import Optimum
 
 
@@ -152,7 +152,7 @@ class Solution:
         lay = self._flat.layout
         if lay.dim != 2:
             raise GeometryError("poses in space have no covariance as vectors", wanted="joint_marginal")
-        P = self.covariance.columns(np.arange(lay.datum_start))
+        P = self.covariance.columns(np.arange(lay.stop("l")))
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
 
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:

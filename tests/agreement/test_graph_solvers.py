@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_between
+from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gtsam_factors import gtsam_factor
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.state import gtsam_key
+from graphslam.graph.variables import gtsam_key
 from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import solve_submaps

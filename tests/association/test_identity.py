@@ -11,8 +11,8 @@ from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.config import BackEndConfig
 from graphslam.association.identity import doubtful_identities, identity_statistics
 from graphslam.core.errors import DataError
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import SubmapRecord
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import make_chain
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Gps
+from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gps_family import level_datum_pose
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver

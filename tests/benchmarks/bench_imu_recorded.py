@@ -27,10 +27,10 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.without_truth import class_consistency
+from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gps_family import level_datum_pose
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from tests.conftest import data_root

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_between, se2_log
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.flat import FlatGraph
-from graphslam.graph.gps import GpsConfig, gps_residual
+from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord, BiasPriorRecord, GpsRecord, SubmapRecord
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 

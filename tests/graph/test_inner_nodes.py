@@ -14,10 +14,10 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.inner_nodes import cut_submap, inner_rows
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import GpsRecord
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import STEP_SIGMA, dense_chain

@@ -12,15 +12,17 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.attitude import AttitudeRecord
+from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose, pose_array
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gtsam_factors import gtsam_factor
-from graphslam.graph.gtsam_values import from_gtsam, gtsam_pose, pose_array, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import to_network
 from graphslam.graph.noise import NO_KERNEL, Robust, robust_terms, whitener
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import AttitudeRecord, BetweenRecord, BiasPriorRecord, GpsRecord
-from graphslam.graph.state import Values, gtsam_key, key_name
+from graphslam.graph.variables import Values, gtsam_key, key_name
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
 from graphslam.solve.isam2 import Isam2Solver
@@ -108,12 +110,12 @@ def test_gradient_and_matrix_against_finite_differences(rng):
 
     def residuals(v):
         rows = []
-        for family in flat.families:
-            if len(family):
-                rows.append((family.terms(v)[0], family))
+        for batch in flat.batches:
+            if len(batch):
+                rows.append((batch.whitened(v)[0], batch))
         return rows
 
-    w = [np.sqrt(_weights(family, r)) for r, family in residuals(values)]
+    w = [np.sqrt(_weights(batch, r)) for r, batch in residuals(values)]
     J, gradient = [], []
     for c in range(n):
         step = np.zeros(n)
@@ -136,8 +138,8 @@ def test_gradient_and_matrix_against_finite_differences(rng):
     np.testing.assert_allclose(system.g / scale, np.array(gradient) / scale, atol=1e-4)
 
 
-def _weights(family, r):
-    return robust_terms(np.sum(r**2, axis=1), family.code, family.k)[1]
+def _weights(batch, r):
+    return robust_terms(np.sum(r**2, axis=1), batch.code, batch.k)[1]
 
 
 def test_every_factor_is_gtsams(rng):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_compose, se2_exp
-from graphslam.graph.gtsam_factors import gtsam_factor
+from graphslam.graph.factors.batch import gtsam_factor
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import whitener
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.state import gtsam_key, key_name, vector_form
-from graphslam.graph.submap_factor import submap_factor
 from graphslam.graph.submap_model import submap_residual
+from graphslam.graph.variables import gtsam_key, key_name, vector_form
 from tests.reference.graph_chain import correlated_covariance, dense_submap, end_only_submap, make_chain
 
 
@@ -21,7 +21,7 @@ def build(rng, start: int, ids: np.ndarray):
     n = len(ids)
     z = np.concatenate([[3.0, 1.0, 0.4], rng.normal(0, 5, 2 * n)])
     P = correlated_covariance(rng, 3 + 2 * n, 0.3)
-    factor = submap_factor(start, ids, z, whitener(P), np.zeros(3))
+    factor = gtsam_factor(SubmapRecord(0, 0, start, ids, z, whitener(P)), np.zeros(3))
     poses = {start: np.array([1.0, -2.0, 2.9]) if start else np.zeros(3), start + 1: np.array([4.0, 1.0, -2.8])}
     points = {int(i): rng.normal(0, 5, 2) for i in ids}
     values = gtsam.Values()
@@ -103,7 +103,7 @@ def test_it_never_raises_and_fills_every_jacobian(rng):
 
 def test_heading_is_wrapped(rng):
     z = np.array([1.0, 0.0, np.pi - 0.01])
-    factor = submap_factor(1, np.zeros(0, dtype=np.int64), z, np.eye(3), np.zeros(3))
+    factor = gtsam_factor(SubmapRecord(0, 0, 1, np.zeros(0, dtype=np.int64), z, np.eye(3)), np.zeros(3))
     values = gtsam.Values()
     values.insert(gtsam_key("x1"), gtsam.Pose2(0, 0, 0))
     values.insert(gtsam_key("x2"), gtsam.Pose2(1, 0, -np.pi + 0.01))

@@ -10,9 +10,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
 from graphslam.loops.loops import LoopCloser

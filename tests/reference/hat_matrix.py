@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.geometry import se2_between, se2_log
-from graphslam.graph.gps import gps_residual
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord, BiasPriorRecord, GpsRecord, SubmapRecord
-from graphslam.graph.state import Values
 from graphslam.graph.submap_model import submap_residual
+from graphslam.graph.variables import Values
 
 
 def whitened_residual(record: object, values: Values) -> np.ndarray:

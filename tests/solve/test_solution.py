@@ -9,7 +9,7 @@ from graphslam.core.errors import MissingDataError, SolverError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.state import gtsam_key, key_name
+from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 

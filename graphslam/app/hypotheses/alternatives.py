@@ -24,9 +24,9 @@ from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.io.g2o import write_g2o
 from graphslam.io.tum import write_tum
 from graphslam.maps.entropy import Clarity

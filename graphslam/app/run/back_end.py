@@ -20,10 +20,10 @@ from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, find_loops

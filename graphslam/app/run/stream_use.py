@@ -12,9 +12,9 @@ from graphslam.app.run.config import RunConfig
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
+from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import GpsRecord
 
 Role = Literal["input", "gps", "imu", "unused"]
 

@@ -21,10 +21,10 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.formats import load_npz
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.session_ties import SessionMap

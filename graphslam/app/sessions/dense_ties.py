@@ -12,9 +12,9 @@ from scipy import stats
 from graphslam.app.sessions.dense import DenseSession, put
 from graphslam.core.errors import DataError, SolverError
 from graphslam.core.poses import group_of
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import BetweenRecord
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.graph_relative import GraphRelative
 from graphslam.loops.measure import Loop

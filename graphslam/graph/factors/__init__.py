@@ -1,1 +1,21 @@
-"""Kinds of factors."""
+"""Kinds of factors, one file each, and their registration: a new kind is a file and an entry here.
+
+The order of the entries is the order of the blocks in a graph's arrays.
+"""
+
+from graphslam.graph.factors.attitude import AttitudeBatch
+from graphslam.graph.factors.batch import register_factor
+from graphslam.graph.factors.between import BetweenBatch
+from graphslam.graph.factors.compass import CompassBatch, DeclinationBatch, DeviationPriorBatch
+from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
+from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
+from graphslam.graph.factors.landmark_submap import SubmapBatch
+from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
+
+for _batch in (
+    *(SubmapBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
+    *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
+    *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
+    *(RangeBatch, BeaconRangeBatch),
+):
+    register_factor(_batch)

@@ -20,7 +20,7 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.gps_family import level_datum_pose
+from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.io.g2o import read_g2o
 from tests.reference.space_chain import dense_chain
 

@@ -25,7 +25,7 @@ from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.records import BetweenRecord
+from graphslam.graph.factors.between import BetweenRecord
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
 from tests.reference.hall_sessions import HallDrive, hall_drive

@@ -11,12 +11,11 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_multiply, so3_exp
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.attitude import DOWN
+from graphslam.graph.factors.attitude import DOWN
+from graphslam.graph.factors.gps import GpsRecord, gps_predicted_in_space, level_datum_pose
 from graphslam.graph.gps import GpsConfig, arm_of
-from graphslam.graph.gps_family import gps_predicted_in_space, level_datum_pose
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.records import GpsRecord
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import DenseChain, dense_chain

@@ -13,15 +13,14 @@ from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, G
 from graphslam.core.imu import GRAVITY
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
+from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.imu.config import ImuConfig, places_of
-from graphslam.graph.factors.imu.gtsam import imu_in_space
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.gtsam_factors import gtsam_factor
-from graphslam.graph.gtsam_values import gtsam_pose, to_gtsam
+from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.state import gtsam_key, key_name
+from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.imu_ring import MOUNT, NOISE, Ring, ring, true_readings
@@ -70,22 +69,22 @@ def test_every_kind_is_there_and_named(rng):
 
 
 def test_jacobians_are_those_of_differences(rng):
-    """Of every family, at values where nothing is small."""
+    """Of every batch, at values where nothing is small."""
     _, g = mixed(rng)
     values = wobbled(g, rng, 0.1)
     lay, h = g.flat().layout, 1e-6
-    for family in g.flat().families[-4:]:
-        r, J = family.terms(values)
-        columns = family.columns.reshape(len(family), -1)
-        numeric = np.zeros((len(family), r.shape[1], lay.size))
+    for batch in g.flat().batches[-4:]:
+        r, J = batch.whitened(values)
+        columns = batch.columns.reshape(len(batch), -1)
+        numeric = np.zeros((len(batch), r.shape[1], lay.size))
         for c in range(lay.size):
             step = np.zeros(lay.size)
             step[c] = h
-            numeric[:, :, c] = (family.terms(values.retract(step))[0] - family.terms(values.retract(-step))[0]) / (
+            numeric[:, :, c] = (batch.whitened(values.retract(step))[0] - batch.whitened(values.retract(-step))[0]) / (
                 2 * h
             )
         mine = np.zeros_like(numeric)
-        for k in range(len(family)):
+        for k in range(len(batch)):
             for q, c in enumerate(columns[k]):
                 if c >= 0:
                     mine[k, :, c] += J[k, :, q]
@@ -120,7 +119,7 @@ def test_the_way_is_gtsams_own(rng):
     y = np.concatenate([x[:3] + v + 0.5 * g + turn @ pim.p[0], se3.quat_multiply(x[3:], se3.matrix_to_quat(pim.R[0]))])
     w, sigma = v + g + turn @ pim.v[0], np.sqrt(np.diag(P))
     values, theirs_factor = gtsam.Values(), gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, theirs)
-    factor = imu_in_space(record, gtsam.noiseModel.Unit.Create(15), SE3.identity)
+    factor = gtsam_factor(record, SE3.identity)
     at = SE3.compose(y, SE3.exp(2 * sigma[:6] * rng.normal(size=6)))
     w = w + 2 * sigma[6:9] * rng.normal(size=3)
     a, b = 0.01 * rng.normal(size=(2, 6)) * [1, 1, 1, 5, 5, 5]
@@ -136,7 +135,7 @@ def test_the_way_is_gtsams_own(rng):
     assert factor.error(mine) == pytest.approx(theirs_factor.error(values), rel=0.05)
 
 
-def test_gtsam_factors_are_the_families(rng):
+def test_gtsam_factors_are_the_batches(rng):
     """Residual and Jacobian of every factor, the fixed base among them."""
     _, g = mixed(rng)
     values = wobbled(g, rng)

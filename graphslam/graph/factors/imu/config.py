@@ -14,8 +14,8 @@ from graphslam.core.poses import SE3
 from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.state import Values
 from graphslam.graph.submap_node import SubmapNode
+from graphslam.graph.variables import Values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,10 +11,10 @@ import numpy as np
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
+from graphslam.graph.factors.batch import Record
 from graphslam.graph.factors.imu.config import ImuConfig, Place
 from graphslam.graph.factors.imu.preintegration import longest_pause
 from graphslam.graph.factors.imu.records import ForceRecord, ImuRecord
-from graphslam.graph.records import Record
 from graphslam.graph.submap_node import SubmapNode
 
 FEWEST = 4

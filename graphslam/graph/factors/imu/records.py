@@ -1,4 +1,4 @@
-"""Records of what an IMU says: preintegrated ways, biases, specific forces (residuals: ``family.py``)."""
+"""Records of what an IMU says: preintegrated ways, biases, specific forces (residuals: ``batch.py``)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class ImuRecord:
         Nodes.
     interval : (t_i, t_j)
     velocities : (a, b)
-        Velocities of the unit at i and at j: rows of :attr:`~graphslam.graph.state.Values.velocities`.
+        Velocities of the unit at i and at j: rows of :attr:`~graphslam.graph.variables.Values.velocities`.
     biases : (a, b)
-        Rows of :attr:`~graphslam.graph.state.Values.imu_biases`.
+        Rows of :attr:`~graphslam.graph.variables.Values.imu_biases`.
     T_i_imu, T_j_imu : (7,)
         The unit seen from the nodes.
     R, p, v : (3, 3), (3,), (3,)
@@ -127,7 +127,7 @@ class ForceRecord:
     node : int
     time : float
     bias : int
-        Row of :attr:`~graphslam.graph.state.Values.imu_biases`.
+        Row of :attr:`~graphslam.graph.variables.Values.imu_biases`.
     T_node_imu : (7,)
     force : (3,)
         In the axes of the unit [m/s²].
@@ -157,6 +157,3 @@ class ForceRecord:
     def label(self) -> str:
         """Name for messages."""
         return f"gravity seen by {self.stream} at x{self.node} (factor {self.factor_id})"
-
-
-MotionRecord = ImuRecord | ImuBiasRecord | ForceRecord

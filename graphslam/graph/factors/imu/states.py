@@ -22,7 +22,7 @@ class ImuStates:
         Nodes in order of time.
     time : dict of int to float
     velocity, bias : dict of int to int
-        Node → row of :attr:`~graphslam.graph.state.Values.velocities` and of ``imu_biases``.
+        Node → row of :attr:`~graphslam.graph.variables.Values.velocities` and of ``imu_biases``.
     """
 
     order: tuple[int, ...]

@@ -1,8 +1,8 @@
 """Factors of an IMU: preintegrated ways between nodes, biases, specific forces. Residuals and Jacobians.
 
-With the unit at ``X = x · T_node_imu`` = (R, p), gravity ``g = -G u(τ)`` (:mod:`graphslam.graph.attitude` says what u
-is), velocities v of the unit in the frame of the first base, and ``δ = b_i - b̄``, the residual of a way is (Forster et
-al. 2017, eq. 45, and the walk of the biases)::
+With the unit at ``X = x · T_node_imu`` = (R, p), gravity ``g = -G u(τ)`` (:mod:`graphslam.graph.factors.attitude` says
+what u is), velocities v of the unit in the frame of the first base, and ``δ = b_i - b̄``, the residual of a way is
+(Forster et al. 2017, eq. 45, and the walk of the biases)::
 
     r_φ = Log((ΔR Exp(J_φ δ_g))ᵀ R_iᵀ R_j)
     r_p = R_iᵀ (p_j - p_i - v_i T - ½ g T²) - Δp - J_p δ
@@ -33,10 +33,10 @@ from graphslam.core.se3 import (
     so3_left_jacobian_inverse,
     so3_log,
 )
-from graphslam.graph.attitude import up_turn
+from graphslam.graph.factors.attitude import up_turn
+from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.families import UniformFamily
-from graphslam.graph.state import Layout, Values
+from graphslam.graph.variables import Layout
 
 WIDTHS = {"x_i": 6, "v_i": 3, "b_i": 6, "x_j": 6, "v_j": 3, "b_j": 6, "tilt": 2}
 XI, VI, BI, XJ, VJ, BJ, TILT = (
@@ -132,92 +132,92 @@ def force_terms(x: Array, L: Array, bias: Array, tilt: Array, force: Array) -> t
     return h + bias[:, 3:] - force, J
 
 
-class ImuFamily(UniformFamily):
+class ImuBatch(UniformBatch):
     """Preintegrated ways."""
 
     record = ImuRecord
+    slots = ("x", "velocity", "imubias", "x", "velocity", "imubias", "tilt")
 
     def __init__(self, records: Sequence[ImuRecord], layout: Layout) -> None:
         super().__init__(records, layout)
-        d = 9 if self.record is GyroRecord else 15
         self._ways = Ways(records)
-        self._i, self._j = (np.array([getattr(r, n) for r in records], dtype=np.int64) for n in "ij")
-        self._v = np.array([r.velocities for r in records], dtype=np.int64).reshape(-1, 2)
-        self._b = np.array([r.biases for r in records], dtype=np.int64).reshape(-1, 2)
-        self._W = np.array([r.whitener for r in records]).reshape(-1, d, d)
-        columns = []
-        for side, nodes in enumerate((self._i, self._j)):
-            columns += [layout.pose_columns(nodes)]
-            columns += [layout.velocity_start + 3 * self._v[:, side, None] + np.arange(3)]
-            columns += [layout.imu_bias_start + 6 * self._b[:, side, None] + np.arange(6)]
-        columns += [np.broadcast_to(layout.tilt_start + np.arange(2), (len(records), 2))]
-        every = np.concatenate(columns, axis=1)
-        self._set_columns(every if d == 15 else every[:, GYRO_COLUMNS])
 
-    def terms(self, values: Values) -> tuple[Array, Array]:
-        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
-        r, J = self._plain(values)
-        return np.einsum("kij,kj->ki", self._W, r), self._W @ J
+    @staticmethod
+    def keys(record: ImuRecord) -> Sequence[int | None]:
+        """Node, velocity and bias at both ends, tilt."""
+        (va, vb), (ba, bb) = record.velocities, record.biases
+        return record.i, va, ba, record.j, vb, bb, 0
 
-    def _plain(self, values: Values) -> tuple[Array, Array]:
-        assert values.tilt is not None  # every way by the accelerometer brings it in
-        x, v, b = values.poses, values.velocities, values.imu_biases
-        (vi, vj), (bi, bj) = self._v.T, self._b.T
-        return way_terms(self._ways, x[self._i], v[vi], b[bi], x[self._j], v[vj], b[bj], values.tilt)
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
+        x_i, v_i, b_i, x_j, v_j, b_j, tilt = blocks
+        return way_terms(self._ways, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
 
 
-class GyroFamily(ImuFamily):
+class GyroBatch(UniformBatch):
     """Preintegrated turns of the gyro alone."""
 
     record = GyroRecord
+    slots = ("x", "imubias", "x", "imubias")
 
-    def _plain(self, values: Values) -> tuple[Array, Array]:
-        x, b, none = values.poses, values.imu_biases, np.zeros((len(self), 3))
-        bi, bj = self._b.T
-        r, J = way_terms(self._ways, x[self._i], none, b[bi], x[self._j], none, b[bj], np.zeros(2))
+    def __init__(self, records: Sequence[GyroRecord], layout: Layout) -> None:
+        super().__init__(records, layout)
+        self._ways = Ways(records)
+
+    @staticmethod
+    def keys(record: GyroRecord) -> Sequence[int | None]:
+        """Node and bias at both ends."""
+        return record.i, record.biases[0], record.j, record.biases[1]
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
+        x_i, b_i, x_j, b_j = blocks
+        none = np.zeros((len(self), 3))
+        r, J = way_terms(self._ways, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
         return r[:, GYRO_ROWS], J[:, GYRO_ROWS][:, :, GYRO_COLUMNS]
 
 
-class ImuBiasFamily(UniformFamily):
+class ImuBiasBatch(UniformBatch):
     """Biases at their start, and walks of biases over pauses."""
 
     record = ImuBiasRecord
+    slots = ("imubias", "imubias")
+    prior = True
 
-    def __init__(self, records: Sequence[ImuBiasRecord], layout: Layout) -> None:
-        super().__init__(records, layout)
-        self._before = np.array([-1 if r.before is None else r.before for r in records], dtype=np.int64)
-        self._bias = np.array([r.bias for r in records], dtype=np.int64)
-        self._sigma = np.array([r.sigma for r in records]).reshape(-1, 6)
-        at = [layout.imu_bias_start + 6 * b[:, None] + np.arange(6) for b in (self._before, self._bias)]
-        self._set_columns(np.concatenate([np.where(self._before[:, None] < 0, -1, at[0]), at[1]], axis=1))
+    @staticmethod
+    def keys(record: ImuBiasRecord) -> Sequence[int | None]:
+        """The bias before (None at the start), the bias."""
+        return record.before, record.bias
 
-    def terms(self, values: Values) -> tuple[Array, Array]:
-        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
-        b = values.imu_biases
-        start = np.where(self._before[:, None] < 0, 0.0, b[self._before])
-        W = np.eye(6) / self._sigma[:, None, :]
-        return (b[self._bias] - start) / self._sigma, np.concatenate([-W, W], axis=2)
+    @staticmethod
+    def whitener(record: ImuBiasRecord) -> Array:
+        """Of σ."""
+        return np.diag(1.0 / record.sigma)
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
+        before, now = blocks
+        J = np.concatenate([-np.eye(6), np.eye(6)], axis=1)
+        return now - before, np.broadcast_to(J, (len(self), 6, 12))
 
 
-class ForceFamily(UniformFamily):
+class ForceBatch(UniformBatch):
     """Specific forces about nodes."""
 
     record = ForceRecord
+    slots = ("x", "imubias", "tilt")
 
     def __init__(self, records: Sequence[ForceRecord], layout: Layout) -> None:
         super().__init__(records, layout)
-        self._node = np.array([r.node for r in records], dtype=np.int64)
-        self._bias = np.array([r.bias for r in records], dtype=np.int64)
         self._L = np.array([r.T_node_imu for r in records]).reshape(-1, 7)
         self._force = np.array([r.force for r in records]).reshape(-1, 3)
-        self._W = np.array([r.whitener for r in records]).reshape(-1, 3, 3)
-        bias = layout.imu_bias_start + 6 * self._bias[:, None] + np.arange(6)
-        tilt = np.broadcast_to(layout.tilt_start + np.arange(2), (len(records), 2))
-        self._set_columns(np.concatenate([layout.pose_columns(self._node), bias, tilt], axis=1))
 
-    def terms(self, values: Values) -> tuple[Array, Array]:
-        """See :meth:`~graphslam.graph.families.UniformFamily.terms`."""
-        assert values.tilt is not None
-        x, b = values.poses[self._node], values.imu_biases[self._bias]
-        r, J = force_terms(x, self._L, b, values.tilt, self._force)
-        return np.einsum("kij,kj->ki", self._W, r), self._W @ J
+    @staticmethod
+    def keys(record: ForceRecord) -> Sequence[int | None]:
+        """Node, bias, tilt."""
+        return record.node, record.bias, 0
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
+        x, bias, tilt = blocks
+        return force_terms(x, self._L, bias, tilt[0], self._force)

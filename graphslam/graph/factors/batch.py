@@ -1,0 +1,345 @@
+"""Factors of one kind, all at once: columns, whitened residuals and Jacobians, Gauss–Newton blocks, GTSAM's factors.
+
+A kind of factor is one file of this package: a *record* (the facts of one factor, with the names of its variables) and
+a *batch* (a vectorised residual and Jacobian of all factors of the kind). Registering the batch
+(:func:`register_factor`) is all that is needed: batch solving, covariances, diagnosis, scores and the incremental
+solver find it by the type of the record. GTSAM gets a factor of its own where it has one (:meth:`FactorBatch.gtsam`),
+else a custom factor that calls the batch on one row. A record of a kind that nobody registered is refused at once.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.core.se3 import matrix_to_quat, quat_normalize
+from graphslam.graph.noise import NO_KERNEL, Robust, robust_terms
+from graphslam.graph.variables import KINDS, Layout, Values, gtsam_key, split_name
+
+Index = npt.NDArray[np.int64]
+
+
+class Record(Protocol):
+    """The facts of one factor: plain arrays, enough to make it again.
+
+    Solvers never keep the only copy of anything: GTSAM's incremental solver is lost after a failed update, so whatever
+    it held is made again from the records.
+    """
+
+    @property
+    def factor_id(self) -> int:
+        """Number of the factor in its graph."""
+        ...
+
+    @property
+    def group(self) -> str:
+        """Class of factors under which χ² is reported."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        ...
+
+    def variables(self) -> list[str]:
+        """Names of the free and fixed variables, each once, in the order of the batch's columns."""
+        ...
+
+    def label(self) -> str:
+        """Name for messages and plots."""
+        ...
+
+
+def offsets(lengths: Sequence[int] | Index) -> Index:
+    """``[0, l_0, l_0 + l_1, …]``."""
+    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+
+
+class FactorBatch(ABC):
+    """All factors of one kind.
+
+    Parameters
+    ----------
+    records : sequence of records
+        Of :attr:`record`, possibly none.
+    layout : Layout
+
+    Attributes
+    ----------
+    widths : (k,) int
+        Columns of each factor, fixed ones included.
+    columns : (Σ widths,) int
+        Where they are in the layout; -1 = fixed.
+    code, k : (k,)
+        Robust kernel of each (:func:`~graphslam.graph.noise.robust_terms`).
+    """
+
+    record: ClassVar[type]
+    prior: ClassVar[bool] = False
+    """A factor of this kind ties its variables to known values although no other factor meets them."""
+
+    def __init__(self, records: Sequence[Any], layout: Layout) -> None:
+        self.records = list(records)
+        self.layout = layout
+        kernels = [getattr(r, "robust", NO_KERNEL) for r in records]
+        self.code = np.array([r.code for r in kernels], dtype=np.int64)
+        self.k = np.array([r.k for r in kernels])
+        self.widths: Index = np.zeros(0, dtype=np.int64)
+        self.columns: Index = np.zeros(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @abstractmethod
+    def squared(self, values: Values) -> Array:
+        """``rᵀ Λ r`` ``(k,)``, kernels left aside."""
+
+    @abstractmethod
+    def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
+        """Fill this batch's part of the flat blocks; return its losses ``(k,)`` (``2 ρ`` where a kernel acts).
+
+        Parameters
+        ----------
+        H : flat
+            Row-major ``w Jᵀ Λ J`` of the factors, one after the other; ``H_offset`` ``(k + 1,)`` says where.
+        g : flat
+            ``w Jᵀ Λ r``; ``g_offset`` ``(k + 1,)``.
+        """
+
+    @classmethod
+    @abstractmethod
+    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+        """GTSAM's factor of a record; one on the fixed first base, at ``origin``, has no key for it."""
+
+
+class UniformBatch(FactorBatch):
+    """Factors that all have the same kinds of variables: :meth:`terms` is all that a kind has to say.
+
+    Attributes
+    ----------
+    slots : tuple of str
+        Words of the kinds of its variables (:data:`~graphslam.graph.variables.KINDS`), in the order of the columns. A
+        record that lacks one has None in its place in :meth:`keys`.
+    """
+
+    slots: ClassVar[tuple[str, ...]]
+
+    def __init__(self, records: Sequence[Any], layout: Layout) -> None:
+        super().__init__(records, layout)
+        self.dim = layout.dim
+        keys = np.array([[-1 if k is None else k for k in self.keys(r)] for r in records], dtype=np.int64)
+        self._rows = keys.reshape(-1, len(self.slots))
+        for s, word in enumerate(self.slots):
+            if word == "l":
+                self._rows[:, s] = [layout.row_of.get(k, -1) for k in self._rows[:, s].tolist()]
+        columns = [layout.at(word, self._rows[:, s]) for s, word in enumerate(self.slots)]
+        every = np.concatenate([c.reshape(len(records), -1) for c in columns], axis=1)
+        self.columns = every.ravel()
+        self.widths = np.full(len(self), every.shape[1], dtype=np.int64)
+        d = records[0].rows if records else 0
+        self.whiteners = np.array([self.whitener(r) for r in records]).reshape(len(records), d, d)
+
+    @staticmethod
+    @abstractmethod
+    def keys(record: Any) -> Sequence[int | None]:
+        """Numbers of its variables, slot by slot; of landmarks their ids."""
+
+    @staticmethod
+    def whitener(record: Any) -> Array:
+        """``W`` ``(d, d)`` with ``Wᵀ W`` = information."""
+        return np.asarray(record.whitener)
+
+    @abstractmethod
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """Residuals ``(k, d)`` and Jacobians ``(k, d, c)``, not whitened.
+
+        Parameters
+        ----------
+        blocks : (k, size) each
+            Values of the variables, slot by slot; zeros where a record lacks one.
+        """
+
+    def gather(self, values: Values) -> list[Array]:
+        """Values ``(k, size)`` of the variables of all factors, slot by slot."""
+        out = []
+        for s, word in enumerate(self.slots):
+            rows, have = self._rows[:, s], values[word]
+            absent = rows < 0
+            block = have[np.maximum(rows, 0)] if len(have) else np.zeros((len(rows), KINDS[word].size(self.dim)))
+            out.append(np.where(absent[:, None], 0.0, block) if np.any(absent) else block)
+        return out
+
+    def whitened(self, values: Values) -> tuple[Array, Array]:
+        """Whitened residuals ``(k, d)`` and Jacobians ``(k, d, c)``."""
+        r, J = self.terms(*self.gather(values))
+        return np.einsum("kij,kj->ki", self.whiteners, r), self.whiteners @ J
+
+    def squared(self, values: Values) -> Array:
+        """``rᵀ Λ r`` ``(k,)``."""
+        return np.sum(self.whitened(values)[0] ** 2, axis=1) if len(self) else np.zeros(0)
+
+    def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
+        """See :meth:`FactorBatch.blocks`."""
+        if len(self) == 0:
+            return np.zeros(0)
+        r, J = self.whitened(values)
+        loss, w = robust_terms(np.sum(r**2, axis=1), self.code, self.k)
+        if hessian:
+            Jt = np.swapaxes(J, 1, 2) * w[:, None, None]
+            H[H_offset[0] : H_offset[-1]] = (Jt @ J).ravel()
+            g[g_offset[0] : g_offset[-1]] = (Jt @ r[..., None]).ravel()
+        return loss
+
+    @classmethod
+    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+        """A custom factor that calls :meth:`terms` on one row: slow, and right for every kind."""
+        return custom_factor(cls, record, origin)
+
+
+# ------------------------------------------------------------------------------------------------ registry
+
+_BATCHES: dict[type, type[FactorBatch]] = {}
+
+
+def register_factor(batch: type[FactorBatch]) -> type[FactorBatch]:
+    """Enter a kind of factor, by the type of its record."""
+    if batch.record in _BATCHES:
+        raise ConfigError(f"factors of {batch.record.__name__} are registered twice")
+    _BATCHES[batch.record] = batch
+    return batch
+
+
+def batch_of(record_type: type) -> type[FactorBatch]:
+    """The batch of a type of record.
+
+    Raises
+    ------
+    ConfigError
+        Nobody registered that kind of factor.
+    """
+    if record_type not in _BATCHES:
+        known = ", ".join(t.__name__ for t in _BATCHES)
+        raise ConfigError(f"no kind of factor is registered for {record_type.__name__}; known: {known}")
+    return _BATCHES[record_type]
+
+
+def factor_kinds() -> list[type[FactorBatch]]:
+    """Every kind, in the order of registration."""
+    return list(_BATCHES.values())
+
+
+def gtsam_factor(record: Any, origin: Array) -> gtsam.NonlinearFactor:
+    """The GTSAM factor of a record; one on the fixed first base, at ``origin`` ``(3|7,)``, loses that key."""
+    return batch_of(type(record)).gtsam(record, origin)
+
+
+# ------------------------------------------------------------------------------------------------ GTSAM
+
+
+def gtsam_pose(pose: Array) -> Any:
+    """``Pose2`` of ``(3,)``, ``Pose3`` of ``(7,)``; GTSAM takes any quaternion in silence, so it is normalised here."""
+    if len(pose) == 3:
+        return gtsam.Pose2(*pose)
+    x, y, z, w = quat_normalize(pose[3:])
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
+
+
+def pose_array(pose: Any) -> Array:
+    """Inverse of :func:`gtsam_pose`."""
+    if isinstance(pose, gtsam.Pose2):
+        return np.array([pose.x(), pose.y(), pose.theta()])
+    return np.concatenate([pose.translation(), matrix_to_quat(pose.rotation().matrix())])
+
+
+def gtsam_value(value: Array, name: str, dim: int) -> Any:
+    """A variable's value as GTSAM holds it: a pose, or a vector."""
+    return gtsam_pose(value) if split_name(name)[0].pose_group(dim) is not None else np.ascontiguousarray(value)
+
+
+def read_value(values: gtsam.Values, name: str, key: int, dim: int) -> Array:
+    """A variable's value out of GTSAM's."""
+    kind = split_name(name)[0]
+    group = kind.pose_group(dim)
+    if group is not None:
+        return pose_array(values.atPose2(key) if group.dof == 3 else values.atPose3(key))
+    return np.array(values.atVector(key))
+
+
+def with_kernel(base: Any, robust: Robust) -> Any:
+    """GTSAM noise model with the same kernel as :class:`~graphslam.graph.noise.Robust`."""
+    if robust.kind == "none":
+        return base
+    estimator = getattr(gtsam.noiseModel.mEstimator, robust.kind.capitalize())
+    return gtsam.noiseModel.Robust.Create(estimator.Create(robust.k), base)
+
+
+def unit_noise(record: Any) -> Any:
+    """Noise of unit size, with the record's kernel: for factors that whiten by themselves."""
+    return with_kernel(gtsam.noiseModel.Unit.Create(record.rows), getattr(record, "robust", NO_KERNEL))
+
+
+def safe_factor(noise: Any, names: Sequence[str], widths: Sequence[int], rows: int, terms: Any) -> gtsam.CustomFactor:
+    """A custom factor that never raises and fills every Jacobian it is asked for.
+
+    GTSAM turns an exception inside a factor into a broken solver, and crashes on a missing Jacobian. So whatever goes
+    wrong is a residual of nan, which the solver refuses by name.
+
+    Parameters
+    ----------
+    names, widths : (v,)
+        Free variables and their degrees of freedom.
+    terms : callable
+        ``(values, H) -> residual``, whitened; fills ``H`` unless it is None.
+    """
+
+    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+        try:
+            return np.asarray(terms(values, H))
+        except Exception:
+            for k, width in enumerate(widths if H is not None else []):
+                H[k] = np.zeros((rows, width))  # type: ignore[index]
+            return np.full(rows, np.nan)
+
+    return gtsam.CustomFactor(noise, [gtsam_key(n) for n in names], error)
+
+
+def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsam.CustomFactor:
+    """A custom factor of any kind, by the terms of its batch on one row (the default of every kind)."""
+    dim = group_of(origin).dim
+    slots = list(zip(batch.slots, batch.keys(record)))
+    one = _alone(batch, record, dim)
+    names = [None if k is None else (w if KINDS[w].single else f"{w}{k}") for w, k in slots]
+    widths = [KINDS[w].dof(dim) for w, _ in slots]
+    first = offsets(widths)
+    free = [s for s, n in enumerate(names) if n is not None and n != "x0"]
+    reads = [(s, names[s], gtsam_key(str(names[s]))) for s in free]
+    blocks = [np.zeros((1, KINDS[w].size(dim))) for w in batch.slots]
+    for s, n in enumerate(names):
+        if n == "x0":
+            blocks[s][0] = origin
+
+    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
+        here = list(blocks)
+        for s, name, key in reads:
+            here[s] = read_value(values, str(name), key, dim)[None]
+        r, J = one.terms(*here)
+        if H is not None:
+            J = one.whiteners[0] @ J[0]
+            for h, s in enumerate(free):
+                H[h] = np.asfortranarray(J[:, first[s] : first[s + 1]])
+        return np.asarray(one.whiteners[0] @ r[0])
+
+    return safe_factor(unit_noise(record), [str(names[s]) for s in free], [widths[s] for s in free], record.rows, terms)
+
+
+def _alone(batch: type[UniformBatch], record: Any, dim: int) -> UniformBatch:
+    """A batch of one factor whose columns nobody asks for."""
+    return batch([record], Layout(dim, tuple(0 for _ in KINDS), np.zeros(0, dtype=np.int64)))

@@ -1,0 +1,105 @@
+"""Relative poses between two nodes: ``Log(T_ij⁻¹ x_i⁻¹ x_j)``, as GTSAM's BetweenFactor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import SE2, SE3, group_of
+from graphslam.graph.factors.batch import UniformBatch, gtsam_pose, safe_factor, with_kernel
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.variables import gtsam_key
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BetweenRecord:
+    """``T_ij`` between two nodes, right-tangent noise.
+
+    Parameters
+    ----------
+    T_ij : (3,) or (7,)
+    whitener : (3, 3) or (6, 6)
+        Tangents in GTSAM's order: x, y, θ, or rotation before translation.
+    """
+
+    factor_id: int
+    i: int
+    j: int
+    T_ij: Array
+    whitener: Array
+    robust: Robust = NO_KERNEL
+    group: str = "between"
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return len(self.whitener)
+
+    def variables(self) -> list[str]:
+        """Names of the variables."""
+        return [f"x{self.i}", f"x{self.j}"]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"{self.group} x{self.i} → x{self.j} (factor {self.factor_id})"
+
+
+class BetweenBatch(UniformBatch):
+    """Relative poses."""
+
+    record = BetweenRecord
+    slots = ("x", "x")
+
+    def __init__(self, records: Sequence[BetweenRecord], layout: Any) -> None:
+        super().__init__(records, layout)
+        self._group = SE2 if layout.dim == 2 else SE3
+        self._T = np.array([r.T_ij for r in records]).reshape(-1, self._group.size)
+
+    @staticmethod
+    def keys(record: BetweenRecord) -> Sequence[int | None]:
+        """From, to."""
+        return record.i, record.j
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`UniformBatch.terms`."""
+        G, (x_i, x_j) = self._group, blocks
+        h = G.between(x_i, x_j)
+        r = G.log(G.between(self._T, h))
+        J_j = np.linalg.inv(G.right_jacobian(r))  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
+        J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
+        return r, np.concatenate([J_i, J_j], axis=2)
+
+    @classmethod
+    def gtsam(cls, record: BetweenRecord, origin: Array) -> gtsam.NonlinearFactor:
+        """GTSAM's own, or a prior where one node is the fixed first base."""
+        # Not SqrtInformation(W): GTSAM wants it upper triangular, and of a lower one it keeps the diagonal in silence.
+        information = record.whitener.T @ record.whitener
+        noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
+        group = group_of(record.T_ij)
+        plane = group.dim == 2
+        if record.i and record.j:
+            ki, kj = gtsam_key(f"x{record.i}"), gtsam_key(f"x{record.j}")
+            between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
+            return between(ki, kj, gtsam_pose(record.T_ij), noise)
+        if record.j:  # from the fixed base: the same residual Log(T⁻¹ x_0⁻¹ x_j) is that of a prior on x_j
+            prior = gtsam.PriorFactorPose2 if plane else gtsam.PriorFactorPose3
+            return prior(gtsam_key(f"x{record.j}"), gtsam_pose(group.compose(origin, record.T_ij)), noise)
+        # To the fixed base: Log(T⁻¹ x_i⁻¹ x_0) is not a prior's residual, so the base is a constant of a custom factor.
+        T, x0, key, d = gtsam_pose(record.T_ij), gtsam_pose(origin), gtsam_key(f"x{record.i}"), group.dof
+        Pose = gtsam.Pose2 if plane else gtsam.Pose3
+
+        def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
+            H1, H2, H3, H4 = (np.zeros((d, d), order="F") for _ in range(4))
+            x = values.atPose2(key) if plane else values.atPose3(key)
+            h = x.between(x0, H1, H2)
+            r = Pose.Logmap(T.between(h, H3, H4), H2)
+            if H is not None:
+                H[0] = H2 @ H4 @ H1
+            return np.asarray(r)
+
+        return safe_factor(noise, [f"x{record.i}"], [d], d, terms)

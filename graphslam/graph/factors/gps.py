@@ -1,0 +1,340 @@
+"""Position fixes as factors on the submap that holds them, in the plane and in space.
+
+A fix at time t inside submap k sees the antenna at ``arm = T_start_body(t) · lever`` in the base frame of the submap,
+so the world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first
+base stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is solved for, not assumed.
+
+The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix is equally
+uncertain in all directions, so rotating it changes nothing, and there the uncertainty of the arm (from the submap's own
+trajectory) has a constant covariance that is simply added to it.
+
+In space the datum is ``[x, y, z, ψ]``: the GPS frame (east, north, up) and the level frame of the first base differ by
+a turn about the vertical and a shift. Where the graph knows the tilt of its first base
+(:mod:`~graphslam.graph.factors.attitude`), level is what the tilt says; else its z axis is taken as up::
+
+    p_world = Exp(τ) R_z(ψ)ᵀ (z - bias - t),   r = arm - x⁻¹ p_world
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array, rotation2
+from graphslam.core.poses import upright
+from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, se3_transform, skew, so3_exp
+from graphslam.graph.factors.attitude import constant_or_read, skew_of, turn_of, up_turn
+from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
+from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.variables import Values, gtsam_key
+
+Index = npt.NDArray[np.int64]
+Terms = Callable[[gtsam.Values, "list[Array] | None"], Array]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GpsRecord:
+    """One position fix inside a submap; see :mod:`graphslam.graph.gps` for the residual.
+
+    Parameters
+    ----------
+    node : int
+        Node that the fix hangs on: the base of the submap that holds it, or the nearest inner node.
+    arm : (dim,)
+        Antenna in the node's frame, ``T_node_body(t) · lever``.
+    z : (dim,)
+        Fix in the GPS frame, counted from the first fix.
+    whitener : (dim, dim)
+        Of fix and arm together, in the node's frame.
+    bias : int or None
+        GPS segment whose bias it carries.
+    tilt : bool
+        The graph knows where up is, and the level datum is turned by it.
+    """
+
+    factor_id: int
+    node: int
+    time: float
+    arm: Array
+    z: Array
+    whitener: Array
+    robust: Robust = NO_KERNEL
+    bias: int | None = None
+    group: str = "gps"
+    tilt: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return len(self.z)
+
+    def variables(self) -> list[str]:
+        """Names of the variables."""
+        bias = [] if self.bias is None else [f"bias{self.bias}"]
+        return [f"x{self.node}", "datum", *bias, *(["tilt"] if self.tilt else [])]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"GPS fix at {self.time:.3f} s on x{self.node} (factor {self.factor_id})"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BiasPriorRecord:
+    """Prior ``N(0, sigma² I)`` on the bias of one GPS segment."""
+
+    factor_id: int
+    bias: int
+    sigma: float
+    group: str = "gps-bias"
+    dim: int = 2
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return self.dim
+
+    def variables(self) -> list[str]:
+        """Names of the variables."""
+        return [f"bias{self.bias}"]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"prior on bias{self.bias} (factor {self.factor_id})"
+
+
+def gps_residual(pose: Array, datum: Array, bias: Array, arm: Array, z: Array) -> Array:
+    """``arm - x⁻¹ T_gps_world⁻¹ (z - bias)``; every argument broadcasts over leading axes."""
+    p_world = (z - bias - datum[..., :2])[..., None, :] @ rotation2(datum[..., 2])
+    q = (p_world[..., 0, :] - pose[..., :2])[..., None, :] @ rotation2(pose[..., 2])
+    return np.asarray(arm - q[..., 0, :])
+
+
+def gps_terms(x: Array, datum: Array, bias: Array, arm: Array, z: Array) -> tuple[Array, Array]:
+    """Residuals ``(k, 2)`` and Jacobians ``(k, 2, 8)`` on (pose 3, datum 3, bias 2) in right tangents, not whitened.
+
+    Parameters
+    ----------
+    x : (k, 3)
+    datum : (3,)
+    bias, arm, z : (k, 2)
+    """
+    Rx, RD = rotation2(x[:, 2]), rotation2(datum[2])
+    p = (z - bias - datum[:2]) @ RD  # world position of the fix
+    q = np.einsum("kji,kj->ki", Rx, p - x[:, :2])  # in the base frame
+    J = np.zeros((len(z), 2, 8))
+    RxT = np.swapaxes(Rx, 1, 2)
+    J[:, :, :2] = np.eye(2)  # x Exp(ξ): q → Exp(-ξ) q
+    J[:, 0, 2], J[:, 1, 2] = -q[:, 1], q[:, 0]
+    J[:, :, 3:5] = RxT  # datum Exp(ξ): p → Exp(-ξ) p, seen through R_xᵀ
+    J[:, :, 5] = np.einsum("kij,kj->ki", RxT, np.stack([-p[:, 1], p[:, 0]], -1))
+    J[:, :, 6:8] = RxT @ RD.T
+    return arm - q, J
+
+
+def gps_terms_in_space(
+    poses: Array, datum: Array, bias: Array, tilt: Array | None, arm: Array, z: Array
+) -> tuple[Array, Array]:
+    """Residuals ``(k, 3)`` and Jacobians ``(k, 3, 15)`` on (pose 6, datum 4, bias 3, tilt 2), not whitened.
+
+    Parameters
+    ----------
+    poses : (k, 7)
+    datum : (4,)
+    bias, arm, z : (k, 3)
+    tilt : (2,) or None
+    """
+    E, J_r = up_turn(np.zeros(2) if tilt is None else tilt)
+    c, s = np.cos(datum[3]), np.sin(datum[3])
+    Rz = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    w = (z - bias - datum[:3]) @ Rz  # in the level frame at the first base
+    p = w @ E.T
+    Rt = np.swapaxes(quat_to_matrix(poses[:, 3:]), 1, 2)
+    q = (Rt @ (p - poses[:, :3])[..., None])[..., 0]  # in the node's frame
+    RtE = Rt @ E
+    J = np.zeros((len(z), 3, 15))
+    J[:, :, :3] = -skew(q)  # x Exp(ξ): q → Exp(-ξ) q = q + q × ω - v
+    J[:, :, 3:6] = np.eye(3)
+    J[:, :, 6:9] = RtE @ Rz.T
+    J[:, :, 9] = np.einsum("kij,kj->ki", RtE, np.stack([-w[:, 1], w[:, 0], np.zeros(len(w))], -1))
+    J[:, :, 10:13] = J[:, :, 6:9]
+    J[:, :, 13:] = RtE @ skew(w) @ J_r  # Exp(ω) Exp(J_r δ) w = p - Exp(ω) [w]× J_r δ
+    return arm - q, J
+
+
+def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
+    """``T_gps_world`` ``(7,)`` of a datum ``[x, y, z, heading]`` and of the tilt of the first base."""
+    pose = upright(datum[:3], datum[3])
+    if tilt is not None:
+        pose[3:] = quat_normalize(quat_multiply(pose[3:], so3_exp(-np.append(tilt, 0.0))))
+    return pose
+
+
+def gps_predicted_in_space(values: Values, node: Index, arm: Array) -> Array:
+    """Where the GPS frame has the antennas ``(k, 3)`` of nodes ``(k,)``, biases left aside."""
+    assert values.datum is not None
+    return se3_transform(level_datum_pose(values.datum, values.tilt), se3_transform(values.poses[node], arm))
+
+
+class GpsBatch(UniformBatch):
+    """Position fixes, in the plane or in space."""
+
+    record = GpsRecord
+    slots = ("x", "datum", "bias", "tilt")
+
+    def __init__(self, records: Sequence[GpsRecord], layout: Any) -> None:
+        super().__init__(records, layout)
+        self._arm = np.array([r.arm for r in records]).reshape(-1, layout.dim)
+        self._z = np.array([r.z for r in records]).reshape(-1, layout.dim)
+
+    @staticmethod
+    def keys(record: GpsRecord) -> Sequence[int | None]:
+        """Node, datum, bias if there is one, tilt if the graph knows it."""
+        return record.node, 0, record.bias, 0 if record.tilt else None
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`UniformBatch.terms`."""
+        x, datum, bias, tilt = blocks
+        if self.dim == 2:
+            r, J = gps_terms(x, datum[0], bias, self._arm, self._z)
+            J[self._rows[:, 2] < 0, :, 6:] = 0.0
+            return r, J
+        r, J = np.zeros_like(self._z), np.zeros((len(self._z), 3, 15))
+        turned = self._rows[:, 3] >= 0
+        for level in (False, True):
+            k = np.flatnonzero(turned != level)
+            if len(k):
+                up = None if level else tilt[k[0]]
+                r[k], J[k] = gps_terms_in_space(x[k], datum[0], bias[k], up, self._arm[k], self._z[k])
+        return r, J
+
+    @classmethod
+    def gtsam(cls, record: GpsRecord, origin: Array) -> gtsam.NonlinearFactor:
+        """A custom factor in scalars: every fix hangs on the datum, so that this runs more often than anything else."""
+        names = record.variables()
+        free = [n for n in names if n != "x0"]
+        terms = _in_the_plane(free, record, origin) if record.rows == 2 else _in_space(names, record, origin)
+        dof = {"x": 3, "d": 3, "b": 2} if record.rows == 2 else {"x": 6, "d": 4, "t": 2, "b": 3}
+        return safe_factor(unit_noise(record), free, [dof[n[0]] for n in free], record.rows, terms)
+
+
+def _in_the_plane(names: list[str], record: GpsRecord, origin: Array) -> Terms:
+    """``W (arm - x⁻¹ T_gps_world⁻¹ (z - bias))`` (see :mod:`graphslam.graph.gps`) in scalar arithmetic.
+
+    There are hundreds of fixes and every one hangs on the datum, so this runs more often than anything else here:
+    numpy's overhead on arrays of two would be most of the time.
+    """
+    ax, ay = map(float, record.arm)
+    zx, zy = map(float, record.z)
+    (w00, w01), (w10, w11) = record.whitener.tolist()
+    ox, oy, ot = map(float, origin)
+    keys = [gtsam_key(n) for n in names]
+    k_pose = keys[0] if record.node else None
+    k_datum = keys[1] if record.node else keys[0]
+    k_bias = keys[-1] if record.bias is not None else None
+    n = len(keys)
+    W = np.array(record.whitener)
+
+    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
+        x = values.atPose2(k_pose) if k_pose is not None else None
+        px, py, pt = (ox, oy, ot) if x is None else (x.x(), x.y(), x.theta())
+        d = values.atPose2(k_datum)
+        bx, by = values.atPoint2(k_bias) if k_bias is not None else (0.0, 0.0)
+        cd, sd = math.cos(d.theta()), math.sin(d.theta())
+        ux, uy = zx - bx - d.x(), zy - by - d.y()
+        wx, wy = cd * ux + sd * uy, cd * uy - sd * ux  # fix in the world
+        c, s = math.cos(pt), math.sin(pt)
+        vx, vy = wx - px, wy - py
+        qx, qy = c * vx + s * vy, c * vy - s * vx  # fix in the base frame
+        rx, ry = ax - qx, ay - qy
+        if H is not None:
+            i = 0
+            if k_pose is not None:
+                H[0] = np.array(
+                    [[w00, w01, w01 * qx - w00 * qy], [w10, w11, w11 * qx - w10 * qy]],
+                    order="F",
+                )
+                i = 1
+            Rt = np.array([[c, s, c * -wy + s * wx], [-s, c, s * wy + c * wx]])
+            H[i] = np.asfortranarray(W @ Rt)
+            if k_bias is not None:
+                H[n - 1] = np.asfortranarray(W @ Rt[:, :2] @ np.array([[cd, sd], [-sd, cd]]))
+        return np.array([w00 * rx + w01 * ry, w10 * rx + w11 * ry])
+
+    return terms
+
+
+def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
+    """``W (arm - x⁻¹ Exp(τ) R_z(ψ)ᵀ (z - bias - t))`` in small matrices and scalars."""
+    pose = constant_or_read(names[0], origin)
+    datum = gtsam_key("datum")
+    bias = None if record.bias is None else gtsam_key(f"bias{record.bias}")
+    tilt = gtsam_key("tilt") if record.tilt else None
+    W, arm, z = np.array(record.whitener), np.array(record.arm), np.array(record.z)
+    W_pose = np.hstack([np.zeros((3, 3)), W])
+
+    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
+        R, t = pose(values)
+        d = values.atVector(datum)
+        u = z - d[:3]
+        if bias is not None:
+            u = u - values.atVector(bias)
+        c, s = math.cos(d[3]), math.sin(d[3])
+        w = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
+        RtE = R.T
+        if tilt is not None:
+            E, J_r = turn_of(*values.atVector(tilt))
+            RtE = RtE @ E
+        q = RtE @ w - R.T @ t
+        if H is not None:
+            WRtE, k = W @ RtE, 0
+            if names[0] != "x0":
+                J = W_pose.copy(order="F")
+                J[:, :3] = -W @ skew_of(q)
+                H[0], k = J, 1
+            Rz_t = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            J = np.empty((3, 4), order="F")
+            J[:, :3] = WRtE @ Rz_t
+            J[:, 3] = WRtE[:, 1] * w[0] - WRtE[:, 0] * w[1]
+            H[k] = J
+            if bias is not None:
+                H[k + 1] = np.asfortranarray(J[:, :3])
+            if tilt is not None:
+                H[-1] = np.asfortranarray(WRtE @ skew_of(w) @ J_r)
+        return np.asarray(W @ (arm - q))
+
+    return terms
+
+
+class BiasPriorBatch(UniformBatch):
+    """Priors on the biases of GPS segments."""
+
+    record = BiasPriorRecord
+    slots = ("bias",)
+    prior = True
+
+    @staticmethod
+    def keys(record: BiasPriorRecord) -> Sequence[int | None]:
+        """The bias."""
+        return (record.bias,)
+
+    @staticmethod
+    def whitener(record: BiasPriorRecord) -> Array:
+        """Of the prior's σ."""
+        return np.eye(record.dim) / record.sigma
+
+    def terms(self, *blocks: Array) -> tuple[Array, Array]:
+        """See :meth:`UniformBatch.terms`."""
+        return blocks[0], np.broadcast_to(np.eye(self.dim), (len(self), self.dim, self.dim))
+
+    @classmethod
+    def gtsam(cls, record: BiasPriorRecord, origin: Array) -> gtsam.NonlinearFactor:
+        """GTSAM's own."""
+        noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
+        prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
+        return prior(gtsam_key(f"bias{record.bias}"), np.zeros(record.dim), noise)

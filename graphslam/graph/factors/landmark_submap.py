@@ -1,0 +1,197 @@
+"""A landmark submap: one n-ary factor with its full joint covariance (Combined SLAM eq. 15).
+
+All submaps together are one compiled loop. One of them is a GTSAM factor written in Python, with an analytic Jacobian:
+it never raises, fills every Jacobian it is asked for, and whitens by itself, in three matrix products for all landmarks
+together, telling GTSAM that its noise is of unit size: handing over some twenty small blocks to be whitened one by one
+costs more than the whole linearisation here. Whitening commutes with linearisation (it is a constant matrix), so
+nothing is approximated by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_factor
+from graphslam.graph.normal_kernels import submap_blocks
+from graphslam.graph.variables import Layout, Values, gtsam_key
+
+_TWO_PI = 2.0 * math.pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapRecord:
+    """A landmark submap between x_start and x_{start + 1} (Combined SLAM eq. 15).
+
+    Parameters
+    ----------
+    factor_id, submap_key, start : int
+    landmark_ids : (n,) int64
+        Graph landmark of every entry; an id may stand twice.
+    z : (3 + 2n,)
+        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame.
+    whitener : (3 + 2n, 3 + 2n)
+        ``W`` with ``Wᵀ W`` = information.
+    information : ((3 + 2n)²,)
+        Row major; made here.
+    """
+
+    factor_id: int
+    submap_key: int
+    start: int
+    landmark_ids: npt.NDArray[np.int64]
+    z: Array
+    whitener: Array
+    group: str = "submap"
+    information: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return len(self.z)
+
+    def variables(self) -> list[str]:
+        """Names of the free and fixed variables, each once."""
+        return [f"x{self.start}", f"x{self.start + 1}", *(f"l{i}" for i in dict.fromkeys(self.landmark_ids.tolist()))]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"submap {self.submap_key} (factor {self.factor_id})"
+
+
+class SubmapBatch(FactorBatch):
+    """Landmark submaps (Combined SLAM eq. 15), by a compiled kernel."""
+
+    record = SubmapRecord
+
+    def __init__(self, records: Sequence[SubmapRecord], layout: Layout) -> None:
+        super().__init__(records, layout)
+        row = layout.row_of
+        self._start = np.array([r.start for r in records], dtype=np.int64)
+        self._entry_offset = offsets([len(r.landmark_ids) for r in records])
+        ids = np.concatenate([np.zeros(0, dtype=np.int64), *(r.landmark_ids for r in records)])
+        self._entry_row = np.array([row[i] for i in ids.tolist()], dtype=np.int64)
+        self._z = np.concatenate([np.zeros(0), *(r.z for r in records)])
+        self._z_offset = offsets([len(r.z) for r in records])
+        self._info = np.concatenate([np.zeros(0), *(r.information for r in records)])
+        self._info_offset = offsets([len(r.z) ** 2 for r in records])
+        self.widths = 6 + 2 * np.diff(self._entry_offset)
+        # every submap: two poses, then its entries; the heads are put in front of the entries' flat columns
+        points = (layout.landmark_start + 2 * self._entry_row[:, None] + np.arange(2)).ravel()
+        heads = np.concatenate([layout.pose_columns(self._start), layout.pose_columns(self._start + 1)], axis=1).ravel()
+        self.columns = np.insert(points, np.repeat(2 * self._entry_offset[:-1], 6), heads)
+
+    def squared(self, values: Values) -> Array:
+        """``rᵀ Λ r`` ``(k,)``."""
+        none, no_offset = np.zeros(0), np.zeros(len(self) + 1, dtype=np.int64)
+        return self.blocks(values, False, none, no_offset, none, no_offset)
+
+    def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
+        """See :meth:`FactorBatch.blocks`."""
+        chi2 = np.zeros(len(self))
+        if len(self) == 0:
+            return chi2
+        submap_blocks(
+            np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), self._start,
+            self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
+            hessian, H, H_offset, g, g_offset, chi2,
+        )  # fmt: skip
+        return chi2
+
+    @classmethod
+    def gtsam(cls, record: SubmapRecord, origin: Array) -> gtsam.NonlinearFactor:
+        """A custom factor in scalars and three products of matrices."""
+        return submap_factor(record, origin)
+
+
+def submap_factor(record: SubmapRecord, origin: Array) -> gtsam.CustomFactor:
+    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start where that is the fixed first base, at ``origin``.
+
+    A landmark that stands twice gives one key, whose Jacobian sums both entries.
+    """
+    unique, entry_of = np.unique(record.landmark_ids, return_inverse=True)
+    fixed = record.start == 0
+    names = [] if fixed else [f"x{record.start}"]
+    names += [f"x{record.start + 1}", *(f"l{i}" for i in unique.tolist())]
+    widths = [3 if n[0] == "x" else 2 for n in names]
+    terms = _terms([gtsam_key(n) for n in names], fixed, entry_of, record.z, record.whitener, origin)
+    return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
+
+
+def _terms(
+    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], z: Array, W: Array, origin: Array
+) -> Callable[..., Array]:
+    m = len(z)
+    first_landmark = len(keys) - (len(np.unique(entry_of)) if len(entry_of) else 0)
+    landmark_keys = keys[first_landmark:]
+    u = len(landmark_keys)
+    repeated = u != len(entry_of)
+    W = np.ascontiguousarray(W)
+    W_end, W_heading = W[:, :2].copy(), W[:, 2].copy()
+    W_points = W[:, 3:]
+    if repeated:  # columns of entries of one landmark are added up once and for all
+        W_unique = np.zeros((m, u, 2))
+        for entry, k in enumerate(entry_of.tolist()):
+            W_unique[:, k] += W_points[:, 2 * entry : 2 * entry + 2]
+    else:
+        W_unique = W_points.reshape(m, -1, 2)[:, np.argsort(entry_of)]
+    W_unique = np.ascontiguousarray(W_unique.reshape(m * u, 2))
+    W_sum = np.stack([W[:, 0] + W_points[:, 0::2].sum(1), W[:, 1] + W_points[:, 1::2].sum(1)], -1)  # Σ over all points
+    end_key, start_key = keys[0 if fixed else 1], None if fixed else keys[0]
+
+    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
+        if start_key is None:
+            sx, sy, st = origin
+        else:
+            start = values.atPose2(start_key)
+            sx, sy, st = start.x(), start.y(), start.theta()
+        end = values.atPose2(end_key)
+        c, s = math.cos(st), math.sin(st)
+        R = np.array([[c, -s], [s, c]])
+        points = np.empty((u + 1, 2))
+        points[0] = end.x(), end.y()
+        for i, k in enumerate(landmark_keys):
+            points[i + 1] = values.atPoint2(k)
+        q = (points - (sx, sy)) @ R  # everything in the start frame
+        qe = q[1:][entry_of] if u else q[1:]
+        r = np.empty(m)
+        r[:2] = q[0]
+        dt = end.theta() - st
+        r[2] = dt
+        r[3:] = qe.ravel()
+        r -= z
+        r[2] = math.pi - (math.pi - r[2]) % _TWO_PI
+        if H is not None:
+            _fill(H, q[0], qe, dt, R)
+        return np.asarray(W @ r)
+
+    def _fill(H: list[Array], q_end: Array, qe: Array, dt: float, R: Array) -> None:
+        if not fixed:
+            J = np.empty((m, 3), order="F")
+            J[:, :2] = -W_sum  # a step of the start moves every point by -1
+            turn = np.empty(m)
+            turn[0], turn[1], turn[2] = q_end[1], -q_end[0], -1.0
+            turn[3::2], turn[4::2] = qe[:, 1], -qe[:, 0]
+            J[:, 2] = W @ turn
+            H[0] = J
+        J = np.empty((m, 3), order="F")
+        ce, se = math.cos(dt), math.sin(dt)
+        J[:, 0] = W_end[:, 0] * ce + W_end[:, 1] * se  # R_sᵀ R_e
+        J[:, 1] = W_end[:, 1] * ce - W_end[:, 0] * se
+        J[:, 2] = W_heading
+        H[first_landmark - 1] = J
+        if u:
+            J_points = (W_unique @ R.T).reshape(m, u, 2)  # R_sᵀ in each landmark's own rows
+            for i in range(u):
+                H[first_landmark + i] = J_points[:, i]
+
+    return terms
