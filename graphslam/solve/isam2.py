@@ -17,6 +17,7 @@ import logging
 import math
 import re
 import time
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -95,7 +96,7 @@ class Isam2Solver:
         self.updates = 0
         self.rebuilds = 0
         self.seconds = 0.0
-        self._isam: gtsam.ISAM2 | None
+        self._isam: Any  # gtsam.ISAM2, or None before the first update
         self._held: dict[int, tuple[Record, int]]  # factor id -> (record, slot)
         self._known: set[str]
         self._read: int  # entries of the graph's journal that were taken in
