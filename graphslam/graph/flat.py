@@ -118,7 +118,7 @@ class FlatGraph:
         indptr = np.searchsorted(unique, np.arange(n + 1) * n)
         return keep, slot, unique % max(n, 1), indptr
 
-    def _blocks(self, values: Values, hessian: bool) -> tuple[Array, Array, Array]:
+    def _blocks(self, values: Values, hessian: bool, weights: Array | None = None) -> tuple[Array, Array, Array]:
         """Flat ``H`` and ``g`` (empty without ``hessian``) and losses ``(f,)`` in the order of the batches."""
         H = np.zeros(self._H_offset[-1] if hessian else 0)
         g = np.zeros(self._g_offset[-1])
@@ -126,9 +126,17 @@ class FlatGraph:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows shows as inf or nan and is refused by name
             for f, a, b in zip(self.batches, self._first, self._first[1:]):
                 chi2[a:b] = f.blocks(values, hessian, H, self._H_offset[a : b + 1], g, self._g_offset[a : b + 1])
+        if weights is not None:
+            w = np.asarray(weights)[self._position]
+            chi2 *= w
+            if hessian:
+                H *= np.repeat(w, np.diff(self._H_offset))
+                g *= np.repeat(w, np.diff(self._g_offset))
         return H, g, chi2
 
-    def evaluate(self, values: Values, *, hessian: bool = True, dense: bool | None = None) -> System:
+    def evaluate(
+        self, values: Values, *, hessian: bool = True, dense: bool | None = None, weights: Array | None = None
+    ) -> System:
         """Objective, gradient and Gauss-Newton matrix at ``values``.
 
         Parameters
@@ -137,8 +145,10 @@ class FlatGraph:
             False for the objective alone (``A`` and ``g`` are then empty).
         dense : bool, optional
             Dense ``A``; by default where that is faster.
+        weights : (f,), optional
+            Factor on the information of each factor, in the order of the records.
         """
-        H, g, chi2 = self._blocks(values, hessian)
+        H, g, chi2 = self._blocks(values, hessian, weights)
         out = np.empty_like(chi2)
         out[self._position] = chi2
         if not hessian:

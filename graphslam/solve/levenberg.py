@@ -98,10 +98,13 @@ def newton_step(system: System, damping: float = 0.0) -> tuple[Array, float]:
     return step, float(-g @ step)
 
 
-def optimise(flat: FlatGraph, values: Values, config: LevenbergConfig | None = None) -> Optimum:
+def optimise(
+    flat: FlatGraph, values: Values, config: LevenbergConfig | None = None, *, weights: Array | None = None
+) -> Optimum:
     """Minimise the objective of a graph from ``values``.
 
-    Gauss–Newton steps while they help, damped ones when they do not.
+    Gauss–Newton steps while they help, damped ones when they do not. ``weights`` ``(f,)`` multiply the information of
+    the factors.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def optimise(flat: FlatGraph, values: Values, config: LevenbergConfig | None = N
     """
     cfg = config or LevenbergConfig()
     dense = flat.layout.size <= DENSE_SOLVE_LIMIT
-    system = flat.evaluate(values, dense=dense)
+    system = flat.evaluate(values, dense=dense, weights=weights)
     initial = system.objective
     if not np.isfinite(initial):
         raise SolverError(f"objective is {initial} at the initial values; a factor or a value is not finite")
@@ -129,17 +132,17 @@ def optimise(flat: FlatGraph, values: Values, config: LevenbergConfig | None = N
             converged = True
             # the step is there already and the last one squares the error, so take it
             trial = values.retract(step)
-            last = flat.evaluate(trial, hessian=False)
+            last = flat.evaluate(trial, hessian=False, weights=weights)
             if last.objective <= system.objective * (1.0 + 1e-13):
                 values, system = trial, last
             break
         trial = values.retract(step)
-        after = flat.evaluate(trial, hessian=False).objective
+        after = flat.evaluate(trial, hessian=False, weights=weights).objective
         # rounding alone moves the objective by about this much: not a reason to damp
         noise = 1e-13 * system.objective
         if after <= system.objective + noise:
             values = trial
-            system = flat.evaluate(values, dense=dense)
+            system = flat.evaluate(values, dense=dense, weights=weights)
             damping = 0.0 if damping <= 1e-6 else damping / 10.0
         else:
             damping = 1e-4 if damping == 0.0 else damping * 10.0

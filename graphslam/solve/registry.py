@@ -8,6 +8,7 @@ from graphslam.core.errors import UnknownNameError
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
+from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.solution import Solution
 
@@ -38,7 +39,7 @@ class Solver(Protocol):
         ...
 
 
-SOLVERS: dict[str, type] = {"isam2": Isam2Solver, "batch": BatchSolver}
+SOLVERS: dict[str, type] = {"isam2": Isam2Solver, "batch": BatchSolver, "lm": BatchSolver, "gnc": GncSolver}
 
 
 def make_solver(name: str, graph: PoseGraph, **options: Any) -> Solver:

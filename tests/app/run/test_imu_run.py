@@ -45,7 +45,7 @@ def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatc
     return pipeline.run(log, frontend="ring", out=out, progress=False, **options)
 
 
-@pytest.mark.parametrize("solver", ["isam2", "batch"])
+@pytest.mark.parametrize("solver", ["isam2", "lm", "gnc"])
 def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
     log, submaps = made()
     short = replace(log, streams={"imu": log["imu"].take(log["imu"].times > 1.0)})

@@ -1,0 +1,144 @@
+"""Graduated non-convexity over a whole graph: what contradicts the rest is weighed down, named, and taken out.
+
+Truncated least squares by graduated non-convexity (Yang et al., RA-L 2020, algorithm 1): every doubtful factor has a
+weight in [0, 1]; the surrogate of the truncated loss begins convex and is made less so from round to round. Doubtful is
+what measured something between far instants or against the outside (matches, loops, fixes, distances, headings); the
+chain of submaps, IMU factors and priors are believed. The limit of a factor is the χ² that right measurements of its
+dimension exceed once in ``1 / (1 - confidence)``.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphslam.core.errors import ConfigError, IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.batch import Record, batch_of
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.noise import NO_KERNEL
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.batch import BatchSolver
+from graphslam.solve.levenberg import LevenbergConfig, optimise
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+
+BELIEVED = frozenset({"submap", "dense-submap", "levelled", "imu", "declination"})
+"""Classes of factors that are never outliers here; priors are none either."""
+
+
+@dataclass(frozen=True, slots=True)
+class GncConfig:
+    """When a factor is an outlier.
+
+    Parameters
+    ----------
+    confidence : float
+        A right measurement stays within its limit with this probability.
+    growth : float
+        By how much the surrogate is made less convex from round to round.
+    max_rounds : int
+    """
+
+    confidence: float = 0.999
+    growth: float = 1.4
+    max_rounds: int = 100
+
+    def __post_init__(self) -> None:
+        if not (0.5 < self.confidence < 1.0 and self.growth > 1.0 and self.max_rounds >= 1):
+            raise ConfigError(f"graduated non-convexity cannot work with {self}")
+
+
+class GncSolver(BatchSolver):
+    """Batch solving that finds outliers when it goes to the optimum.
+
+    :meth:`update` solves by least squares. :meth:`solve_to_optimum` runs graduated non-convexity from there, takes
+    the outliers out of the graph (events ``outlier``: factor, class, χ² and its limit), and ends at the optimum of what
+    is left.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    config : LevenbergConfig, optional
+    gnc : GncConfig, optional
+    """
+
+    name = "gnc"
+
+    def __init__(self, graph: PoseGraph, config: LevenbergConfig | None = None, gnc: GncConfig | None = None) -> None:
+        super().__init__(graph, config)
+        self.gnc = gnc or GncConfig()
+        self._searched = -1  # revision of the graph in which outliers were looked for last
+
+    def solve_to_optimum(self) -> None:
+        """Find the outliers, take them out, and solve until nothing is left to gain."""
+        t0 = time.perf_counter()
+        if self.graph.revision != self._searched:
+            for record, d2, limit in outliers(self.graph, self.gnc, self.config):
+                self.graph.note(
+                    "outlier", factor_id=record.factor_id, factor=record.label(), group=record.group,
+                    chi2=d2, limit=limit,
+                )  # fmt: skip
+                self.graph.remove(record.factor_id, reason=f"outlier: χ² {d2:.1f} where {limit:.1f} is the limit")
+            self._searched = self.graph.revision
+        self.seconds += time.perf_counter() - t0
+        self._solve(self.config)
+
+    def covariance(self) -> JointCovariance:
+        """Joint covariance of what is left, at the present values."""
+        return self.graph.covariance()
+
+    def solution(self, *, gap: bool = True) -> Solution:
+        """See :meth:`BatchSolver.solution`; outliers are looked for first, if the graph changed since."""
+        if self.graph.revision != self._searched:
+            self.solve_to_optimum()
+        return super().solution(gap=gap)
+
+
+def outliers(
+    graph: PoseGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
+) -> list[tuple[Record, float, float]]:
+    """Doubtful factors whose final weight is less than a half, with their χ² at the end and its limit.
+
+    The graph is not changed.
+    """
+    cfg = config or GncConfig()
+    records: list[Any] = list(graph.records.values())
+    doubtful = np.array([not batch_of(type(r)).prior and r.group not in BELIEVED for r in records], dtype=bool)
+    if not np.any(doubtful):
+        return []
+    plain = [replace(r, robust=NO_KERNEL) if d and hasattr(r, "robust") else r for r, d in zip(records, doubtful)]
+    flat, values = FlatGraph(plain, graph.values.layout()), graph.values
+    limit = chi2.ppf(cfg.confidence, [r.rows for r in records])
+    w = np.ones(len(records))
+    d2 = flat.evaluate(values, hessian=False).chi2
+    worst = float(np.max(d2[doubtful] / limit[doubtful]))
+    if worst <= 1.0:  # nothing contradicts: least squares it is
+        return []
+    mu = 1.0 / max(2.0 * worst - 1.0, 1e-6)
+    for _ in range(cfg.max_rounds):
+        w[doubtful] = _weights(d2[doubtful] / limit[doubtful], mu)
+        try:
+            optimum = optimise(flat, values, solver, weights=w)
+        except IndeterminateError:  # so much is doubted that the rest does not hold together
+            break
+        values, d2 = optimum.values, flat.evaluate(optimum.values, hessian=False).chi2
+        if np.all((w < 1e-3) | (w > 1.0 - 1e-3)) and mu > 1.0:
+            break
+        mu *= cfg.growth
+    w[doubtful] = _weights(d2[doubtful] / limit[doubtful], max(mu, 1e3))
+    return [(records[k], float(d2[k]), float(limit[k])) for k in np.flatnonzero(doubtful & (w < 0.5))]
+
+
+def _weights(ratio: Array, mu: float) -> Array:
+    """Weights of truncated least squares by the ratio of χ² to its limit (Yang et al., eq. 14)."""
+    low, high = mu / (mu + 1.0), (mu + 1.0) / mu
+    between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
+    return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(between, 0.0, 1.0)))
