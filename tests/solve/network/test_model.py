@@ -63,6 +63,7 @@ def random_network(
         values = local
         if marks == "bearing-range":
             values = np.stack([np.arctan2(local[:, 1], local[:, 0]), np.hypot(*local.T)], 1)
+            values[:, 1] += 5 * noise  # or else a distance may come out negative
         B = rng.standard_normal((n, 2, 2))
         arguments |= {
             "landmark_ids": np.arange(4) + 100,
