@@ -7,7 +7,7 @@ order (2-D: x, y, θ; 3-D: rotation first, then translation), whatever order the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -27,6 +27,31 @@ ObservationKind = Literal["cartesian", "bearing-range"]
 ROUNDING = 1e-9
 # A repaired matrix keeps this share of its largest eigenvalue in every direction, so that it has an inverse.
 REPAIR_FLOOR = 1e-9
+
+
+class Labels(Sequence[str]):
+    """Names made only when an error needs them (a network may have a million edges)."""
+
+    def __init__(self, name: Callable[[int], str]) -> None:
+        self._name = name
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._name(int(k))
+
+    def __len__(self) -> int:
+        return 0
+
+
+def all_positive_definite(matrices: Array) -> bool:
+    """Whether every one of ``(m, d, d)`` symmetric matrices has a Cholesky factor; a fifth of the work of eigenvalues.
+
+    False says nothing yet: a positive semi-definite matrix has none either.
+    """
+    try:
+        np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _eigen_floor(information: Array) -> tuple[Array, Array]:
@@ -76,6 +101,8 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
             wanted="symmetric matrices",
         )
     info = 0.5 * (info + swapped)
+    if all_positive_definite(info):
+        return info
     low, top = _eigen_floor(info)
     bad = np.flatnonzero(low < -ROUNDING * top)
     if len(bad):
@@ -274,14 +301,14 @@ class PoseNetwork:
             raise DataError(f"range is not positive: {self.observation_name(k)}", where=self.source)
         checked = check_informations(
             self.information,
-            _Labels(self.edge_name),
+            Labels(self.edge_name),
             what="edge information matrices",
             where=self.source,
         )
         object.__setattr__(self, "information", checked)
         checked = check_informations(
             self.observation_information,
-            _Labels(self.observation_name),
+            Labels(self.observation_name),
             what="landmark information matrices",
             where=self.source,
         )
@@ -342,16 +369,3 @@ class PoseNetwork:
             f"PoseNetwork({self.source}: {self.dim}-D, {len(self.ids)} poses ({int(self.has_initial.sum())} with an "
             f"initial value), {len(self.edges)} edges{marks if len(self.landmark_ids) else ''})"
         )
-
-
-class _Labels(Sequence[str]):
-    """Names made only when an error needs them (a network may have a million edges)."""
-
-    def __init__(self, name: Any) -> None:
-        self._name = name
-
-    def __getitem__(self, k: Any) -> Any:
-        return self._name(int(k))
-
-    def __len__(self) -> int:
-        return 0

@@ -19,6 +19,7 @@ import numpy as np
 from graphslam.core.errors import DataError, FormatError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.core.reading import read_text
 from graphslam.io.network_builder import NetworkBuilder, upper_triangle
 from graphslam.io.text_records import Records, write_text
 
@@ -60,59 +61,53 @@ def read_g2o(path: str | os.PathLike[str], *, repair: bool = False, create_missi
     CovarianceError
         Names the edges whose information is impossible.
     """
-    records = Records(path, LAYOUTS, ignored=("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET"))
-    in_3d = [tag for tag in _3D if records.rows[tag]]
-    in_2d = [tag for tag in _2D if records.rows[tag]]
+    return parse_g2o(path, read_text(path), repair=repair, create_missing=create_missing)
+
+
+def parse_g2o(
+    path: str | os.PathLike[str], text: str, *, repair: bool = False, create_missing: bool = False
+) -> PoseNetwork:
+    """The same from the content of the file; ``path`` names it in errors."""
+    records = Records(path, text, LAYOUTS, ignored=("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET"))
+    rows = records.rows
+    in_3d = [tag for tag in _3D if len(rows[tag])]
+    in_2d = [tag for tag in _2D if len(rows[tag])]
     if in_2d and in_3d:
-        line = records.rows[in_3d[0]][0][0]
+        line = int(rows[in_3d[0]].lines[0])
         raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=records.where(line), wanted="one dimension")
-    build = NetworkBuilder(records.path, 3 if in_3d else 2, repair, create_missing)
-    for tag in ("VERTEX_SE2", "VERTEX_SE3:QUAT"):
-        for line, (vertex,), pose in records.rows[tag]:
-            build.add_vertex(vertex, pose, records.where(line))
-    for line, (mark,), position in records.rows["VERTEX_XY"]:
-        if mark in build.marks:
-            raise FormatError("landmark given twice", where=records.where(line), got=mark)
-        build.marks[mark] = np.array(position)
-    for line, held, _ in records.rows["FIX"]:
-        build.fixed.update((vertex, records.where(line)) for vertex in held)
-    _read_edges(records, build)
+    build = NetworkBuilder(records.path, 3 if in_3d else 2, records.where, repair, create_missing)
+    vertices, edges = (rows[tag] for tag in (_3D if in_3d else _2D)[:2])
+    build.add_vertices(vertices.whole[:, 0], vertices.real, vertices.lines)
+    marks = rows["VERTEX_XY"]
+    build.add_landmarks(marks.whole[:, 0], marks.real, marks.lines)
+    build.fixed = rows["FIX"].whole[:, 0], rows["FIX"].lines
+    width, d = (7, 6) if in_3d else (3, 3)
+    information = upper_triangle(edges.real[:, width:], d)
+    if in_3d:
+        information = information[:, _SWAP][:, :, _SWAP]
+    build.add_edges(edges.whole, edges.real[:, :width], information, edges.lines)
     _read_landmarks(records, build)
     return build.build()
 
 
-def _read_edges(records: Records, build: NetworkBuilder) -> None:
-    for tag, width, d in (("EDGE_SE2", 3, 3), ("EDGE_SE3:QUAT", 7, 6)):
-        rows = records.rows[tag]
-        if rows:
-            values = np.array([r[2] for r in rows])
-            information = upper_triangle(values[:, width:], d)
-            if d == 6:
-                information = information[:, _SWAP][:, :, _SWAP]
-            pairs = np.array([r[1] for r in rows], dtype=np.int64)
-            build.add_edges(pairs, values[:, :width], information, [records.where(r[0]) for r in rows])
-
-
 def _read_landmarks(records: Records, build: NetworkBuilder) -> None:
     cartesian, polar = records.rows["EDGE_SE2_XY"], records.rows["BR"]
-    if cartesian and polar:
-        line = polar[0][0]
-        raise FormatError("EDGE_SE2_XY and BR in one file", where=records.where(line), wanted="one kind of observation")
-    if cartesian:
-        values = np.array([r[2] for r in cartesian])
-        pairs = np.array([r[1] for r in cartesian], dtype=np.int64)
-        lines = [records.where(r[0]) for r in cartesian]
-        build.add_observations(pairs, values[:, :2], upper_triangle(values[:, 2:], 2), lines)
-    for line, _, (_, distance, sigma_b, sigma_r) in polar:
-        if not (distance > 0 and sigma_b > 0 and sigma_r > 0):
-            raise FormatError("range and standard deviations must be positive", where=records.where(line))
-    if polar:
-        values = np.array([r[2] for r in polar])
+    if len(cartesian) and len(polar):
+        where = records.where(int(polar.lines[0]))
+        raise FormatError("EDGE_SE2_XY and BR in one file", where=where, wanted="one kind of observation")
+    if len(cartesian):
+        build.add_observations(
+            cartesian.whole, cartesian.real[:, :2], upper_triangle(cartesian.real[:, 2:], 2), cartesian.lines
+        )
+    if len(polar):
+        bad = np.flatnonzero(~(polar.real[:, 1:] > 0.0).all(axis=1))
+        if len(bad):
+            where = records.where(int(polar.lines[bad[0]]))
+            raise FormatError("range and standard deviations must be positive", where=where)
         information = np.zeros((len(polar), 2, 2))
-        information[:, [0, 1], [0, 1]] = values[:, 2:] ** -2.0
+        information[:, [0, 1], [0, 1]] = polar.real[:, 2:] ** -2.0
         build.kind = "bearing-range"
-        pairs = np.array([r[1] for r in polar], dtype=np.int64)
-        build.add_observations(pairs, values[:, :2], information, [records.where(r[0]) for r in polar])
+        build.add_observations(polar.whole, polar.real[:, :2], information, polar.lines)
 
 
 def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:

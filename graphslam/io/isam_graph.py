@@ -24,8 +24,9 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, FormatError
 from graphslam.core.geometry import Array
-from graphslam.core.network import PoseNetwork
-from graphslam.io.network_builder import NetworkBuilder, upper_triangle
+from graphslam.core.network import Ids, Labels, PoseNetwork
+from graphslam.core.reading import read_text
+from graphslam.io.network_builder import NetworkBuilder, edge_labels, sighting_labels, upper_triangle
 from graphslam.io.text_records import Records
 
 Noise = Literal["auto", "covariance", "information", "sqrt-information", "toro"]
@@ -58,31 +59,45 @@ def read_isam_graph(
     ------
     MissingDataError, FormatError, CovarianceError
     """
+    return parse_isam_graph(path, read_text(path), noise=noise, repair=repair, create_missing=create_missing)
+
+
+def parse_isam_graph(
+    path: str | os.PathLike[str],
+    text: str,
+    *,
+    noise: Noise = "auto",
+    repair: bool = False,
+    create_missing: bool = False,
+) -> PoseNetwork:
+    """The same from the content of the file; ``path`` names it in errors."""
     if noise not in get_args(Noise):
         raise ConfigError(f"unknown noise format {noise!r}; known: {', '.join(get_args(Noise))}")
-    records = Records(path, LAYOUTS)
-    build = NetworkBuilder(records.path, 2, repair, create_missing)
-    for line, (vertex,), pose in records.rows["VERTEX2"]:
-        build.add_vertex(vertex, pose, records.where(line))
-    rows = sorted(records.rows["EDGE2"] + records.rows["ODOMETRY"])
-    if rows:
-        values = np.array([r[2] for r in rows])
-        pairs = np.array([r[1] for r in rows], dtype=np.int64)
-        labels = [f"{i} -> {j}" for i, j in pairs]
-        name = _guess(values[:, 3:], records, rows) if noise == "auto" else noise
-        information = _information(values[:, 3:], name, build, labels)
+    records = Records(path, text, LAYOUTS)
+    rows = records.rows
+    build = NetworkBuilder(records.path, 2, records.where, repair, create_missing)
+    vertices = rows["VERTEX2"]
+    build.add_vertices(vertices.whole[:, 0], vertices.real, vertices.lines)
+    parts = rows["EDGE2"], rows["ODOMETRY"]
+    lines = np.concatenate([p.lines for p in parts])
+    if len(lines):
+        order = np.argsort(lines)
+        pairs, values = (np.concatenate(a)[order] for a in ([p.whole for p in parts], [p.real for p in parts]))
+        lines = lines[order]
+        name = _guess(values[:, 3:], records, lines) if noise == "auto" else noise
+        information = _information(values[:, 3:], name, build, edge_labels(pairs))
         build.noise = {
             "toro": "information, TORO order",
             "sqrt-information": "square-root information",
             "covariance": "covariance, as GTSAM's load2D reads it",
         }.get(name, name)
-        build.add_edges(pairs, values[:, :3], information, [records.where(r[0]) for r in rows])
-    if records.rows["LANDMARK"]:
+        build.add_edges(pairs, values[:, :3], information, lines)
+    if len(rows["LANDMARK"]):
         _landmarks(records, build, noise)
     return build.build()
 
 
-def _guess(columns: Array, records: Records, rows: list[tuple[int, list[int], list[float]]]) -> Noise:
+def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
     nonzero = columns != 0.0
     patterns: dict[Noise, list[int]] = {"toro": [0, 2, 3], "covariance": [0, 3, 5]}
     for name, places in patterns.items():
@@ -92,12 +107,12 @@ def _guess(columns: Array, records: Records, rows: list[tuple[int, list[int], li
     odd = np.flatnonzero((nonzero != np.isin(np.arange(6), [0, 3, 5])).any(axis=1))
     raise FormatError(
         "the meaning of the noise columns cannot be told from the numbers",
-        where=records.where(rows[int(odd[0])][0]),
+        where=records.where(int(lines[odd[0]])),
         wanted='noise="covariance", "information", "sqrt-information" or "toro"',
     )
 
 
-def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: list[str]) -> Array:
+def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: Labels) -> Array:
     if noise == "toro":
         return upper_triangle(columns[:, _TORO], 3)
     if noise == "information":
@@ -110,11 +125,8 @@ def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: li
 
 def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     rows = records.rows["LANDMARK"]
-    values = np.array([r[2] for r in rows])
-    pairs = np.array([r[1] for r in rows], dtype=np.int64)
-    labels = [f"{i} sees {j}" for i, j in pairs]
-    lines = [records.where(r[0]) for r in rows]
-    xy, c = values[:, :2], values[:, 2:]
+    pairs, lines, labels = rows.whole, rows.lines, sighting_labels(rows.whole)
+    xy, c = rows.real[:, :2], rows.real[:, 2:]
     covariance = upper_triangle(c, 2)
     if noise in ("information", "sqrt-information"):
         R = np.triu(covariance)
@@ -126,7 +138,7 @@ def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     distance = np.hypot(xy[:, 0], xy[:, 1])
     bad = np.flatnonzero((distance <= 0.0) | (c[:, 0] <= 0.0))
     if len(bad):
-        raise FormatError("landmark at zero distance or with zero covariance", where=records.where(rows[bad[0]][0]))
+        raise FormatError("landmark at zero distance or with zero covariance", where=records.where(int(lines[bad[0]])))
     information = np.zeros((len(rows), 2, 2))
     information[:, 0, 0] = 10.0 / c[:, 0]  # σ_bearing² = c / 10, "at ten metres"
     information[:, 1, 1] = 1.0 / c[:, 0]

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from graphslam.core.errors import CovarianceError, FormatError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.network import Ids, ObservationKind, PoseNetwork, check_informations, repair_informations
+from graphslam.core.network import (
+    Ids,
+    Labels,
+    ObservationKind,
+    PoseNetwork,
+    all_positive_definite,
+    check_informations,
+    repair_informations,
+)
 from graphslam.core.se3 import quat_normalize
 
 log = logging.getLogger(__name__)
@@ -17,16 +26,24 @@ log = logging.getLogger(__name__)
 
 def upper_triangle(values: Array, size: int) -> Array:
     """Symmetric ``(m, size, size)`` from row-wise upper triangles ``(m, size (size + 1) / 2)``."""
-    out = np.zeros((len(values), size, size))
+    out = np.empty((len(values), size, size))
     rows, columns = np.triu_indices(size)
     out[:, rows, columns] = values
     out[:, columns, rows] = values
     return out
 
 
+def _none(*shape: int) -> Array:
+    return np.zeros(shape)
+
+
+def _no_ids(*shape: int) -> Ids:
+    return np.zeros(shape, dtype=np.int64)
+
+
 @dataclass
 class NetworkBuilder:
-    """Collects what a file says; :meth:`build` orders it by vertex id and checks it.
+    """Collects what a file says, as arrays; :meth:`build` orders it by vertex id and checks it.
 
     Parameters
     ----------
@@ -34,6 +51,8 @@ class NetworkBuilder:
         File name for errors.
     dim : int
         2 or 3.
+    where : callable
+        A place in words from a line number.
     repair : bool
         Project impossible matrices instead of refusing them.
     create_missing : bool
@@ -42,64 +61,78 @@ class NetworkBuilder:
 
     source: str
     dim: int
+    where: Callable[[int], str]
     repair: bool = False
     create_missing: bool = False
-    named: dict[int, str] = field(default_factory=dict)
-    vertices: dict[int, Array] = field(default_factory=dict)
-    marks: dict[int, Array | None] = field(default_factory=dict)
-    fixed: dict[int, str] = field(default_factory=dict)
-    edges: list[tuple[Ids, Array, Array]] = field(default_factory=list)
-    sightings: list[tuple[Ids, Array, Array]] = field(default_factory=list)
+    vertices: tuple[Ids, Array] = field(default_factory=lambda: (_no_ids(0), _none(0, 7)))
+    marks: tuple[Ids, Array] = field(default_factory=lambda: (_no_ids(0), _none(0, 2)))
+    fixed: tuple[Ids, Ids] = field(default_factory=lambda: (_no_ids(0), _no_ids(0)))
+    edges: tuple[Ids, Array, Array] | None = None
+    sightings: tuple[Ids, Array, Array] | None = None
+    edge_lines: Ids = field(default_factory=lambda: _no_ids(0))
+    sighting_lines: Ids = field(default_factory=lambda: _no_ids(0))
     kind: ObservationKind = "cartesian"
     noise: str = "information"
     repaired: int = 0
 
-    def add_vertex(self, vertex: int, pose: list[float], where: str) -> None:
-        """One pose; 3-D quaternions are normalised here.
+    def add_vertices(self, ids: Ids, poses: Array, lines: Ids) -> None:
+        """Poses ``(n, 3 | 7)``; 3-D quaternions are normalised here.
 
         Raises
         ------
         FormatError
             Given twice, or with a quaternion of length zero.
         """
-        if vertex in self.vertices:
-            raise FormatError("vertex given twice", where=where, got=f"vertex {vertex}")
-        self.vertices[vertex] = self._unit(np.array([pose]), [where])[0]
+        self._unique(ids, lines, "vertex given twice", "vertex ")
+        self.vertices = ids, self._unit(poses, lines)
 
-    def _unit(self, poses: Array, where: list[str]) -> Array:
+    def add_landmarks(self, ids: Ids, positions: Array, lines: Ids) -> None:
+        """Landmark positions ``(l, 2)``.
+
+        Raises
+        ------
+        FormatError
+            Given twice.
+        """
+        self._unique(ids, lines, "landmark given twice", "")
+        self.marks = ids, positions
+
+    def _unique(self, ids: Ids, lines: Ids, what: str, name: str) -> None:
+        _, first = np.unique(ids, return_index=True)
+        if len(first) < len(ids):
+            k = int(np.setdiff1d(np.arange(len(ids)), first)[0])
+            raise FormatError(what, where=self.where(int(lines[k])), got=f"{name}{ids[k]}")
+
+    def _unit(self, poses: Array, lines: Ids) -> Array:
         if self.dim == 2:
             return poses
         length = np.linalg.norm(poses[:, 3:], axis=1)
         # a printed unit quaternion is off by its digits; one that is off by more than 1 % is something else
         bad = np.flatnonzero(np.abs(length - 1.0) > 1e-2)
         if len(bad):
-            raise FormatError("not a unit quaternion", where=where[bad[0]], got=poses[bad[0], 3:], wanted="length 1")
+            raise FormatError(
+                "not a unit quaternion", where=self.where(int(lines[bad[0]])), got=poses[bad[0], 3:], wanted="length 1"
+            )
         return np.concatenate([poses[:, :3], quat_normalize(poses[:, 3:])], axis=1)
 
-    def add_edges(self, pairs: Ids, measurements: Array, information: Array, where: list[str]) -> None:
+    def add_edges(self, pairs: Ids, measurements: Array, information: Array, lines: Ids) -> None:
         """Edges ``(m, 2)`` between vertex ids; information in GTSAM's order."""
         loops = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
         if len(loops):
             raise FormatError(
-                "an edge joins a vertex to itself", where=where[loops[0]], got=f"vertex {pairs[loops[0], 0]}"
+                "an edge joins a vertex to itself",
+                where=self.where(int(lines[loops[0]])),
+                got=f"vertex {pairs[loops[0], 0]}",
             )
-        for (i, j), line in zip(pairs.tolist(), where, strict=True):
-            self.named.setdefault(i, line)
-            self.named.setdefault(j, line)
-        labels = [f"{i} -> {j}" for i, j in pairs]
-        information = self.sound(information, labels, "edge information matrices")
-        self.edges.append((pairs, self._unit(measurements, where), information))
+        information = self.sound(information, edge_labels(pairs), "edge information matrices")
+        self.edges, self.edge_lines = (pairs, self._unit(measurements, lines), information), lines
 
-    def add_observations(self, pairs: Ids, values: Array, information: Array, where: list[str]) -> None:
+    def add_observations(self, pairs: Ids, values: Array, information: Array, lines: Ids) -> None:
         """Landmark sightings ``(k, 2)`` = (vertex id, landmark id)."""
-        for i, line in zip(pairs[:, 0].tolist(), where, strict=True):
-            self.named.setdefault(i, line)
-        labels = [f"{i} sees {j}" for i, j in pairs]
-        self.sightings.append((pairs, values, self.sound(information, labels, "landmark information matrices")))
-        for j in pairs[:, 1]:
-            self.marks.setdefault(int(j), None)
+        information = self.sound(information, sighting_labels(pairs), "landmark information matrices")
+        self.sightings, self.sighting_lines = (pairs, values, information), lines
 
-    def sound(self, matrices: Array, labels: list[str], what: str) -> Array:
+    def sound(self, matrices: Array, labels: Labels, what: str) -> Array:
         """Matrices as they are, repaired and counted, or an error that names the impossible ones."""
         if self.repair:
             matrices, changed = repair_informations(matrices)
@@ -108,18 +141,19 @@ class NetworkBuilder:
             self.repaired += len(changed)
         return check_informations(matrices, labels, what=what, where=self.source)
 
-    def invert(self, covariances: Array, labels: list[str], what: str) -> Array:
+    def invert(self, covariances: Array, labels: Labels, what: str) -> Array:
         """Information of covariances, or an error that names the singular ones."""
         covariances = self.sound(covariances, labels, what)
-        w = np.linalg.eigvalsh(covariances)
-        bad = np.flatnonzero(w[:, 0] <= 0.0) if len(w) else np.zeros(0, dtype=np.intp)
-        if len(bad):
-            raise CovarianceError(
-                f"{len(bad)} of {len(w)} {what} are not positive definite: {labels[bad[0]]}",
-                where=self.source,
-                got=f"smallest eigenvalue {w[bad[0], 0]:.3g}",
-                wanted="> 0",
-            )
+        if not all_positive_definite(covariances):
+            w = np.linalg.eigvalsh(covariances)
+            bad = np.flatnonzero(w[:, 0] <= 0.0)
+            if len(bad):
+                raise CovarianceError(
+                    f"{len(bad)} of {len(w)} {what} are not positive definite: {labels[bad[0]]}",
+                    where=self.source,
+                    got=f"smallest eigenvalue {w[bad[0], 0]:.3g}",
+                    wanted="> 0",
+                )
         return np.asarray(np.linalg.inv(covariances))
 
     def build(self) -> PoseNetwork:
@@ -130,45 +164,28 @@ class NetworkBuilder:
         FormatError
             No records, an id that is both a pose and a landmark, or an edge to a vertex that is not there.
         """
-        missing = [v for v in self.named if v not in self.vertices] if self.vertices else []
-        if missing and not self.create_missing:
-            more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-            raise FormatError(
-                f"an edge names vertex {missing[0]}, which is not in the file{more}",
-                where=self.named[missing[0]],
-                wanted="a record of every vertex (or of none); --create-missing or create_missing=True makes them",
-            )
-        pairs = _stack([e[0] for e in self.edges], (0, 2), np.int64)
-        seen = _stack([s[0] for s in self.sightings], (0, 2), np.int64)
-        ids = np.unique(np.concatenate([np.array(list(self.vertices), dtype=np.int64), pairs.ravel(), seen[:, 0]]))
-        marks = np.array(sorted(self.marks), dtype=np.int64)
+        width, d = (3, 3) if self.dim == 2 else (7, 6)
+        pairs, measurements, information = self.edges or (_no_ids(0, 2), _none(0, width), _none(0, d, d))
+        seen, values, seen_information = self.sightings or (_no_ids(0, 2), _none(0, 2), _none(0, 2, 2))
+        given, poses_given = self.vertices
+        self._check_named(pairs, seen)
+        ids = np.unique(np.concatenate([given, pairs.ravel(), seen[:, 0]]))
+        marks = np.unique(np.concatenate([self.marks[0], seen[:, 1]]))
         both = np.intersect1d(ids, marks)
         if len(both):
             raise FormatError("an id is used for a pose and for a landmark", where=self.source, got=int(both[0]))
         if len(ids) == 0 or len(pairs) + len(seen) == 0:
             raise FormatError("no edges in the file", where=self.source, wanted="a pose network")
-        width, d = (3, 3) if self.dim == 2 else (7, 6)
         poses = np.zeros((len(ids), width))
         poses[:, -1] = 0.0 if self.dim == 2 else 1.0
-        known = np.array(sorted(self.vertices), dtype=np.int64)
-        at = np.searchsorted(ids, known)
-        if len(known):
-            poses[at] = np.stack([self.vertices[int(v)] for v in known])
         has = np.zeros(len(ids), dtype=np.bool_)
-        has[at] = True
-        fixed = np.zeros(len(ids), dtype=np.bool_)
-        for vertex, where in self.fixed.items():
-            k = int(np.searchsorted(ids, vertex))
-            if k == len(ids) or ids[k] != vertex or not has[k]:
-                raise FormatError("FIX names a vertex without a pose", where=where, got=f"vertex {vertex}")
-            fixed[k] = True
+        if len(given):
+            at = np.searchsorted(ids, given)
+            poses[at], has[at] = poses_given, True
         landmarks = np.zeros((len(marks), 2))
         has_mark = np.zeros(len(marks), dtype=np.bool_)
-        for k, mark in enumerate(marks):
-            position = self.marks[int(mark)]
-            if position is not None:
-                landmarks[k], has_mark[k] = position, True
-        observations = np.stack([np.searchsorted(ids, seen[:, 0]), np.searchsorted(marks, seen[:, 1])], axis=1)
+        at = np.searchsorted(marks, self.marks[0])
+        landmarks[at], has_mark[at] = self.marks[1], True
         try:
             return PoseNetwork(
                 dim=self.dim,
@@ -176,15 +193,15 @@ class NetworkBuilder:
                 poses=poses,
                 has_initial=has,
                 edges=np.searchsorted(ids, pairs),
-                measurements=_stack([e[1] for e in self.edges], (0, width), np.float64),
-                information=_stack([e[2] for e in self.edges], (0, d, d), np.float64),
-                fixed=fixed,
+                measurements=measurements,
+                information=information,
+                fixed=self._held(ids, has),
                 landmark_ids=marks,
                 landmarks=landmarks,
                 has_landmark=has_mark,
-                observations=observations,
-                observation_values=_stack([s[1] for s in self.sightings], (0, 2), np.float64),
-                observation_information=_stack([s[2] for s in self.sightings], (0, 2, 2), np.float64),
+                observations=np.stack([np.searchsorted(ids, seen[:, 0]), np.searchsorted(marks, seen[:, 1])], axis=1),
+                observation_values=values,
+                observation_information=seen_information,
                 observation_kind=self.kind,
                 repaired=self.repaired,
                 noise=self.noise,
@@ -193,6 +210,42 @@ class NetworkBuilder:
         except GeometryError as error:
             raise FormatError(str(error)) from None
 
+    def _check_named(self, pairs: Ids, seen: Ids) -> None:
+        """Every vertex that a measurement names must be given, unless none is or they are to be made."""
+        if len(self.vertices[0]) == 0 or self.create_missing:
+            return
+        named = np.concatenate([pairs.ravel(), seen[:, 0]])
+        lines = np.concatenate([np.repeat(self.edge_lines, 2), self.sighting_lines])
+        lost = np.flatnonzero(~np.isin(named, self.vertices[0]))
+        if len(lost):
+            others = len(np.unique(named[lost])) - 1
+            more = f" and {others} more" if others else ""
+            raise FormatError(
+                f"an edge names vertex {named[lost[0]]}, which is not in the file{more}",
+                where=self.where(int(lines[lost[0]])),
+                wanted="a record of every vertex (or of none); --create-missing or create_missing=True makes them",
+            )
 
-def _stack(parts: list[Array] | list[Ids], empty: tuple[int, ...], kind: type) -> Array:
-    return np.concatenate(parts).astype(kind) if parts else np.zeros(empty, dtype=kind)
+    def _held(self, ids: Ids, has: Array) -> Array:
+        held, lines = self.fixed
+        at = np.minimum(np.searchsorted(ids, held), len(ids) - 1)
+        lost = np.flatnonzero((ids[at] != held) | ~has[at])
+        if len(lost):
+            raise FormatError(
+                "FIX names a vertex without a pose",
+                where=self.where(int(lines[lost[0]])),
+                got=f"vertex {held[lost[0]]}",
+            )
+        fixed = np.zeros(len(ids), dtype=np.bool_)
+        fixed[at] = True
+        return fixed
+
+
+def edge_labels(pairs: Ids) -> Labels:
+    """Names of edges, made when an error needs them."""
+    return Labels(lambda k: f"{pairs[k, 0]} -> {pairs[k, 1]}")
+
+
+def sighting_labels(pairs: Ids) -> Labels:
+    """Names of landmark observations, made when an error needs them."""
+    return Labels(lambda k: f"{pairs[k, 0]} sees {pairs[k, 1]}")

@@ -6,11 +6,13 @@ import os
 
 from graphslam.core.errors import FormatError
 from graphslam.core.network import PoseNetwork
-from graphslam.core.reading import size_limit
+from graphslam.core.reading import read_text, size_limit
 from graphslam.io import g2o, isam_graph
-from graphslam.io.g2o import read_g2o
-from graphslam.io.isam_graph import Noise, read_isam_graph
-from graphslam.io.text_records import tags_of
+from graphslam.io.isam_graph import Noise
+from graphslam.io.text_records import tagged_lines
+
+# The first record of a known kind tells the format; it is looked for in so many lines.
+_LINES = 100_000
 
 
 def read_network(
@@ -39,14 +41,19 @@ def read_network(
     MissingDataError, FormatError, CovarianceError
     """
     with size_limit(max_size):
-        tags = tags_of(path)
-        if tags & set(g2o.LAYOUTS):
-            return read_g2o(path, repair=repair, create_missing=create_missing)
-        if tags & set(isam_graph.LAYOUTS):
-            return read_isam_graph(path, noise=noise, repair=repair, create_missing=create_missing)
+        text = read_text(path)
+    other = set[str]()
+    for number, tokens in tagged_lines(text):
+        if tokens[0] in g2o.LAYOUTS:
+            return g2o.parse_g2o(path, text, repair=repair, create_missing=create_missing)
+        if tokens[0] in isam_graph.LAYOUTS:
+            return isam_graph.parse_isam_graph(path, text, noise=noise, repair=repair, create_missing=create_missing)
+        other.add(tokens[0][:20])
+        if number > _LINES:
+            break
     raise FormatError(
         "not a pose network",
         where=str(path),
-        got="records " + ", ".join(sorted(t[:20] for t in tags)[:5]) if tags else "an empty file",
+        got="records " + ", ".join(sorted(other)[:5]) if other else "an empty file",
         wanted="g2o, TORO or iSAM records",
     )

@@ -10,15 +10,18 @@ import bz2
 import gzip
 import lzma
 import os
+from array import array
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import LARGEST, read_text
+from graphslam.core.reading import LARGEST, read_text, usable
 
 _WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gzip.compress, ".bz2": bz2.compress}
 
@@ -108,86 +111,129 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     os.replace(temporary, p)
 
 
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """All records of one tag, in file order.
+
+    Parameters
+    ----------
+    lines : (n,) int64
+        Line of every record, counted from 1.
+    whole : (n, integers) int64
+    real : (n, floats) float64
+    """
+
+    lines: npt.NDArray[np.int64]
+    whole: npt.NDArray[np.int64]
+    real: Array
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
 class Records:
-    """Numbers of a text file by record tag, in file order.
+    """Numbers of a text file by record tag, in file order, as arrays.
 
     Parameters
     ----------
     path : path-like
+    text : str
+        What the file holds.
     layouts : dict of str to tuple of int
         Tag → (leading integers, following floats). A line of a known tag must have exactly that many numbers;
-        -1 integers means one or more and no floats.
+        -1 integers means one or more and no floats: each is then a row of its own.
     ignored : tuple of str
         Tags that are skipped.
 
     Attributes
     ----------
-    rows : dict of str to list
-        Tag → list of (line number, integers, floats).
+    rows : dict of str to Rows
+
+    Raises
+    ------
+    FormatError
+        With file and line.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], layouts: dict[str, tuple[int, int]], *, ignored: tuple[str, ...] = ()
+        self,
+        path: str | os.PathLike[str],
+        text: str,
+        layouts: dict[str, tuple[int, int]],
+        *,
+        ignored: tuple[str, ...] = (),
     ) -> None:
         self.path = str(path)
-        self.rows: dict[str, list[tuple[int, list[int], list[float]]]] = {tag: [] for tag in layouts}
-        for number, tokens in self._lines(read_text(path)):
-            tag = tokens[0]
-            if tag in ignored:
-                continue
-            if tag not in layouts:
+        # Packed numbers, not lists of objects: a file may hold a million edges.
+        raw = {
+            tag: (array("q"), array("q"), array("d"), integers, 1 + integers + floats)
+            for tag, (integers, floats) in layouts.items()
+        }
+        for number, tokens in tagged_lines(text):
+            if tokens[0] not in raw:
+                if tokens[0] in ignored:
+                    continue
                 raise FormatError(
-                    f"unknown record {tag[:40]!r}", where=self.where(number), wanted="one of " + ", ".join(layouts)
-                )
-            self.rows[tag].append((number, *self._numbers(number, tokens, *layouts[tag])))
-
-    @staticmethod
-    def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
-        for number, line in enumerate(text.splitlines(), start=1):
-            tokens = line.split()
-            if tokens and not tokens[0].startswith("#"):
-                yield number, tokens
-
-    def _numbers(self, number: int, tokens: list[str], integers: int, floats: int) -> tuple[list[int], list[float]]:
-        if integers < 0:
-            integers = max(len(tokens) - 1, 1)
-        if len(tokens) != 1 + integers + floats:
-            raise FormatError(
-                f"{tokens[0]} record is truncated or too long",
-                where=self.where(number),
-                got=f"{len(tokens) - 1} numbers",
-                wanted=integers + floats,
-            )
-        try:
-            whole = [int(t) for t in tokens[1 : 1 + integers]]
-            real = [float(t) for t in tokens[1 + integers :]]
-        except ValueError as error:
-            raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
-        for value in real:
-            if not abs(value) <= LARGEST:
-                raise FormatError(
-                    f"{tokens[0]} record holds {value}",
+                    f"unknown record {tokens[0][:40]!r}",
                     where=self.where(number),
-                    wanted=f"finite numbers, at most {LARGEST:g}",
+                    wanted="one of " + ", ".join(layouts),
                 )
-        for value in whole:
-            if not 0 <= value < 2**62:
-                raise FormatError("impossible vertex id", where=self.where(number), got=value, wanted="0 or more")
-        return whole, real
+            lines, whole, real, integers, length = raw[tokens[0]]
+            each = integers < 0
+            if each:
+                integers, length = len(tokens) - 1, max(len(tokens), 2)
+            if len(tokens) != length:
+                raise FormatError(
+                    f"{tokens[0]} record is truncated or too long",
+                    where=self.where(number),
+                    got=f"{len(tokens) - 1} numbers",
+                    wanted=length - 1,
+                )
+            try:
+                whole.extend(map(int, tokens[1 : 1 + integers]))
+                real.extend(map(float, tokens[1 + integers :]))
+            except ValueError as error:
+                raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
+            except OverflowError:
+                self._impossible(number, next(t for t in tokens[1:] if not 0 <= int(t) < 2**62))
+            if each:
+                lines.extend([number] * integers)
+            else:
+                lines.append(number)
+        self.rows = {tag: self._checked(tag, *parts[:3], *layouts[tag]) for tag, parts in raw.items()}
+
+    def _checked(self, tag: str, lines: array[int], whole: array[int], real: array[float], k: int, f: int) -> Rows:
+        n = len(lines)
+        rows = Rows(
+            np.array(lines, dtype=np.int64),
+            np.array(whole, dtype=np.int64).reshape(n, abs(k)),
+            np.array(real, dtype=np.float64).reshape(n, f),
+        )
+        bad = np.flatnonzero(~usable(rows.real).all(axis=1))
+        if len(bad):
+            value = next(v for v in rows.real[bad[0]].tolist() if not abs(v) <= LARGEST)
+            raise FormatError(
+                f"{tag} record holds {value}",
+                where=self.where(int(rows.lines[bad[0]])),
+                wanted=f"finite numbers, at most {LARGEST:g}",
+            )
+        bad = np.flatnonzero(((rows.whole < 0) | (rows.whole >= 2**62)).any(axis=1))
+        if len(bad):
+            value = next(v for v in rows.whole[bad[0]].tolist() if not 0 <= v < 2**62)
+            self._impossible(int(rows.lines[bad[0]]), value)
+        return rows
+
+    def _impossible(self, number: int, got: object) -> NoReturn:
+        raise FormatError("impossible vertex id", where=self.where(number), got=got, wanted="0 or more")
 
     def where(self, number: int) -> str:
         """``file:line``."""
         return f"{self.path}:{number}"
 
-    def __len__(self) -> int:
-        return sum(len(r) for r in self.rows.values())
 
-
-def tags_of(path: str | os.PathLike[str], limit: int = 100_000) -> set[str]:
-    """The set of record tags among the first ``limit`` lines; for telling formats apart."""
-    found: set[str] = set()
-    for number, tokens in Records._lines(read_text(path)):
-        if number > limit:
-            break
-        found.add(tokens[0])
-    return found
+def tagged_lines(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Number, counted from 1, and words of every line that is neither blank nor begins with ``#``."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        tokens = line.split()
+        if tokens and not tokens[0].startswith("#"):
+            yield number, tokens
