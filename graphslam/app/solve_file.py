@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 from graphslam.core.network import PoseNetwork
@@ -24,6 +25,7 @@ def solve_file(
     noise: Noise = "auto",
     create_missing: bool = False,
     max_size: int | None = None,
+    starts: str | Sequence[str] | None = None,
     certificate: bool = False,
     progress: bool = False,
     **options: Any,
@@ -46,6 +48,9 @@ def solve_file(
         Make vertices that only edges name, instead of refusing the file.
     max_size : int, optional
         Bytes of the file that are read at most, after decompression; default 2 GB.
+    starts : "all", name or sequence of names, optional
+        Where the descent begins; several on doubt only if not given
+        (:func:`graphslam.solve.network.solve.solve_network`).
     certificate : bool
         Also say whether the answer is certified to be the global optimum (``"certificate"`` in words, its numbers in
         ``"certificate_numbers"``).
@@ -63,7 +68,9 @@ def solve_file(
     MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
     """
     network = read_network(path, noise=noise, repair=repair, create_missing=create_missing, max_size=max_size)
-    solution = solve_network(network, solver, certificate=certificate, progress=progress, **options)
+    solution = solve_network(
+        network, solver, starts=starts, certificate=certificate, progress=progress, **options
+    )
     if out is not None:
         write_g2o(out, solution.to_network())
     report = report_of(solution)

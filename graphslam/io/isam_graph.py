@@ -82,8 +82,8 @@ def parse_isam_graph(
     lines = np.concatenate([p.lines for p in parts])
     if len(lines):
         order = np.argsort(lines)
-        pairs, values = (np.concatenate(a)[order] for a in ([p.whole for p in parts], [p.real for p in parts]))
-        lines = lines[order]
+        pairs, lines = np.concatenate([p.whole for p in parts])[order], lines[order]
+        values = np.concatenate([p.real for p in parts])[order]
         name = _guess(values[:, 3:], records, lines) if noise == "auto" else noise
         information = _information(values[:, 3:], name, build, edge_labels(pairs))
         build.noise = {

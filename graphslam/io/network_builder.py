@@ -13,6 +13,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.network import (
     Ids,
     Labels,
+    Mask,
     ObservationKind,
     PoseNetwork,
     all_positive_definite,
@@ -226,7 +227,7 @@ class NetworkBuilder:
                 wanted="a record of every vertex (or of none); --create-missing or create_missing=True makes them",
             )
 
-    def _held(self, ids: Ids, has: Array) -> Array:
+    def _held(self, ids: Ids, has: Mask) -> Mask:
         held, lines = self.fixed
         at = np.minimum(np.searchsorted(ids, held), len(ids) - 1)
         lost = np.flatnonzero((ids[at] != held) | ~has[at])

@@ -235,5 +235,5 @@ def tagged_lines(text: str) -> Iterator[tuple[int, list[str]]]:
     """Number, counted from 1, and words of every line that is neither blank nor begins with ``#``."""
     for number, line in enumerate(text.splitlines(), start=1):
         tokens = line.split()
-        if tokens and not tokens[0].startswith("#"):
+        if tokens and tokens[0][0] != "#":
             yield number, tokens

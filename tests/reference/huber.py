@@ -14,7 +14,8 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, polish
+from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.network.descent import polish
 from graphslam.solve.network.model import edge_costs
 
 

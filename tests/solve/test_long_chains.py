@@ -15,7 +15,7 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import optimise_graph
 from graphslam.solve.isam2 import Isam2Solver
-from graphslam.solve.network.batch import is_converged, polish
+from graphslam.solve.network.descent import is_converged, polish
 from graphslam.solve.network.solve import solve_network
 from tests.reference.graph_chain import dense_submap
 

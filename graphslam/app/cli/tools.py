@@ -29,6 +29,9 @@ def solve(
         False, "--create-missing", help="Make vertices that only edges name instead of refusing the file."
     ),
     out: Path | None = typer.Option(None, help="g2o file for the solution."),
+    starts: str | None = typer.Option(
+        None, help="all, or names such as chordal,tree. By default one start, and the others if there is doubt."
+    ),
     certify: bool = typer.Option(False, "--certify", help="Say whether the answer is the global optimum."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
@@ -45,7 +48,10 @@ def solve(
                 f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"
             )
         path = found
-    value = solve_file(path, solver, repair=repair, create_missing=create_missing, out=out, certificate=certify)
+    names = None if starts is None else "all" if starts == "all" else starts.split(",")
+    value = solve_file(
+        path, solver, repair=repair, create_missing=create_missing, out=out, starts=names, certificate=certify
+    )
     emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
 
 

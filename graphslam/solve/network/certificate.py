@@ -30,8 +30,8 @@ import scipy.sparse.linalg as spla
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, polish
-from graphslam.solve.network.multistart import SAME
+from graphslam.solve.network.descent import SAME, polish
+from graphslam.solve.network.multistart import make_problem
 from graphslam.solve.network.sparse import factor
 
 Verdict = Literal["certified", "not certified", "not known"]
@@ -71,7 +71,7 @@ class Certificate:
         return self.verdict if self.verdict == "certified" else f"not known ({self.reason})"
 
 
-def certify(network: PoseNetwork, poses: Array, objective: float) -> Certificate:
+def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue: bool = True) -> Certificate:
     """Say whether a solution is the global optimum.
 
     Parameters
@@ -82,6 +82,8 @@ def certify(network: PoseNetwork, poses: Array, objective: float) -> Certificate
         A stationary point of the objective.
     objective : float
         ``Σ rᵀ Ω r`` there.
+    eigenvalue : bool
+        Also say how far from zero; the verdict needs only its sign.
 
     Returns
     -------
@@ -104,11 +106,13 @@ def certify(network: PoseNetwork, poses: Array, objective: float) -> Certificate
     scale = float(np.median(Q.diagonal()))
     S = sp.csc_matrix(dual_matrix(A, X) / scale)
     negative = _negative_pivots(S + TOLERANCE * sp.identity(S.shape[0], format="csc"))
-    lowest = smallest_eigenvalue(S) if negative else _least_bound(S)
+    lowest = float("nan")
+    if eigenvalue:
+        lowest = smallest_eigenvalue(S) if negative else _least_bound(S)
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
     start = _poses_of(X, network)
-    problem = BatchProblem(network)
+    problem = make_problem(network)
     back = polish(problem, problem.values(start, np.zeros((0, 2)))).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import Any
 
 import gtsam
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.se3 import quat_normalize
+from graphslam.core.se3 import matrix_to_quat, quat_normalize, quat_to_matrix
 from graphslam.solve.network.model import square_root
 
 LANDMARK = "l"
@@ -26,10 +27,9 @@ def pose_values(network: PoseNetwork, poses: Array) -> list[Any]:
     """Poses as GTSAM objects."""
     if network.dim == 2:
         return [gtsam.Pose2(x, y, t) for x, y, t in poses.tolist()]
-    return [
-        gtsam.Pose3(gtsam.Rot3.Quaternion(qw, qx, qy, qz), np.array([x, y, z]))
-        for x, y, z, qx, qy, qz, qw in poses.tolist()
-    ]
+    T = np.zeros((len(poses), 4, 4))
+    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = quat_to_matrix(poses[:, 3:]), poses[:, :3], 1.0
+    return list(map(gtsam.Pose3, T))
 
 
 def pose3_array(pose: gtsam.Pose3) -> Array:
@@ -52,38 +52,31 @@ def from_values(network: PoseNetwork, values: gtsam.Values) -> tuple[Array, Arra
     """Arrays ``(n, 3 | 7)`` and ``(l, 2)`` of GTSAM values that hold every variable."""
     n = len(network)
     if network.dim == 2:
-        poses = np.asarray(gtsam.utilities.extractPose2(values))[:n]
-        poses = poses.copy()
+        poses = np.array(gtsam.utilities.extractPose2(values))[:n]
     else:
-        poses = np.empty((n, 7))
-        for k in range(n):
-            p = values.atPose3(k)
-            poses[k] = pose3_array(p)
+        rows = np.asarray(gtsam.utilities.extractPose3(values))[:n]
+        R = np.ascontiguousarray(rows[:, :9]).reshape(-1, 3, 3)
+        poses = np.concatenate([rows[:, 9:], matrix_to_quat(R)], axis=1)
     landmarks = np.array([values.atPoint2(landmark_key(k)) for k in range(len(network.landmark_ids))])
     return poses, landmarks.reshape(-1, 2)
 
 
-class _Noise:
-    """Noise models by matrix: most files use a handful of different ones."""
-
-    def __init__(self, information: Array) -> None:
-        self._roots = square_root(information)
-        self._models: dict[bytes, gtsam.noiseModel.Base] = {}
-
-    def __getitem__(self, k: int) -> gtsam.noiseModel.Base:
-        root = self._roots[k]
-        key = root.tobytes()
-        if key not in self._models:
-            self._models[key] = gtsam.noiseModel.Gaussian.SqrtInformation(root, True)
-        return self._models[key]
+def _noise(information: Array) -> list[gtsam.noiseModel.Base]:
+    """A noise model for each matrix; equal matrices share one, and most files use a handful of different ones."""
+    if len(information) == 0:
+        return []
+    d = information.shape[1]
+    rows = np.ascontiguousarray(information).reshape(-1, d * d).view(np.dtype((np.void, 8 * d * d))).ravel()
+    _, first, which = np.unique(rows, return_index=True, return_inverse=True)
+    models = [gtsam.noiseModel.Gaussian.SqrtInformation(R, True) for R in square_root(information[first])]
+    return [models[k] for k in which.tolist()]
 
 
 def edge_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
     """One ``BetweenFactor`` an edge, in the order of the edges."""
     make = gtsam.BetweenFactorPose2 if network.dim == 2 else gtsam.BetweenFactorPose3
-    noise = _Noise(network.information)
-    measured = pose_values(network, network.measurements)
-    return [make(i, j, z, noise[k]) for k, ((i, j), z) in enumerate(zip(network.edges.tolist(), measured, strict=True))]
+    i, j = network.edges.T.tolist()
+    return list(map(make, i, j, pose_values(network, network.measurements), _noise(network.information)))
 
 
 def observation_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
@@ -96,13 +89,11 @@ def observation_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
     """
     if len(network.observations) and network.observation_kind != "bearing-range":
         raise SolverError("GTSAM has no native factor for Cartesian landmark observations")
-    noise = _Noise(network.observation_information)
-    factors: list[gtsam.NonlinearFactor] = []
-    for k, ((i, j), (b, r)) in enumerate(
-        zip(network.observations.tolist(), network.observation_values.tolist(), strict=True)
-    ):
-        factors.append(gtsam.BearingRangeFactor2D(i, landmark_key(j), gtsam.Rot2(b), r, noise[k]))
-    return factors
+    i, j = network.observations.T.tolist()
+    bearing, distance = network.observation_values.T.tolist()
+    marks = map(landmark_key, j)
+    noise = _noise(network.observation_information)
+    return list(map(gtsam.BearingRangeFactor2D, i, marks, map(gtsam.Rot2, bearing), distance, noise))
 
 
 def anchor_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
@@ -128,11 +119,11 @@ def anchor_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
 def to_graph(network: PoseNetwork, used: npt.NDArray[np.bool_] | None = None) -> gtsam.NonlinearFactorGraph:
     """Anchors, then edges, then observations; of these two only where ``used`` (m + k,) says so, if given."""
     graph = gtsam.NonlinearFactorGraph()
+    measured = [*edge_factors(network), *observation_factors(network)]
     for factor in anchor_factors(network):
-        graph.push_back(factor)
-    for k, factor in enumerate((*edge_factors(network), *observation_factors(network))):
-        if used is None or used[k]:
-            graph.push_back(factor)
+        graph.add(factor)
+    for factor in measured if used is None else compress(measured, used.tolist()):
+        graph.add(factor)
     return graph
 
 

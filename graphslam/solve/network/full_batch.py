@@ -19,7 +19,7 @@ from graphslam.core.geometry import Array, ArrayLike, rotation2, se2_adjoint, se
 from graphslam.core.network import PoseNetwork
 from graphslam.core.records import LandmarkObservations
 from graphslam.linear.symmetric_factor import SymmetricFactor
-from graphslam.solve.network.batch import is_converged, polish
+from graphslam.solve.network.descent import is_converged, polish
 from graphslam.solve.network.model import Layout, linearise
 from graphslam.solve.network.sparse import SparseProblem
 

@@ -28,8 +28,11 @@ from graphslam.core.geometry import (
     wrap_angle,
 )
 from graphslam.core.network import PoseNetwork
+from graphslam.linear.symmetric_factor import elimination_order
 
 Residual = Literal["gtsam", "g2o"]
+# Above this spread of information normal equations lose the small directions: QR instead of Cholesky.
+CHOLESKY_LIMIT = 1e10
 
 
 def compose(a: Array, b: Array) -> Array:
@@ -147,6 +150,18 @@ def square_root(information: Array) -> Array:
         return np.asarray(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2))
 
 
+def information_spread(network: PoseNetwork) -> float:
+    """Ratio of the extreme positive eigenvalues of all information matrices."""
+    top, low = 0.0, np.inf
+    for information in (network.information, network.observation_information):
+        if len(information):
+            w = np.linalg.eigvalsh(information)
+            top = max(top, float(w.max()))
+            positive = w[w > 0.0]
+            low = min(low, float(positive.min()) if len(positive) else np.inf)
+    return top / low
+
+
 def subnetwork(network: PoseNetwork, used: npt.NDArray[np.bool_]) -> PoseNetwork:
     """The network with only the edges and observations of ``used`` (m + k,)."""
     m = len(network.edges)
@@ -162,12 +177,16 @@ def subnetwork(network: PoseNetwork, used: npt.NDArray[np.bool_]) -> PoseNetwork
     )
 
 
+def _free_nodes(network: PoseNetwork) -> np.ndarray:
+    """Poses that are not held, then landmarks, counted through."""
+    free = np.ones(len(network) + len(network.landmark_ids), dtype=bool)
+    free[network.anchors] = False
+    return np.flatnonzero(free)
+
+
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the free scalars of a network stand in the state vector.
-
-    Poses come first, in order, anchors left out; then the landmarks.
-    """
+    """Where the free scalars of a network stand in the state vector; anchors are left out."""
 
     pose_at: np.ndarray  # (n,) first column of a pose, -1 for an anchor
     mark_at: np.ndarray  # (l,)
@@ -175,21 +194,35 @@ class Layout:
 
     @classmethod
     def of(cls, network: PoseNetwork) -> Layout:
-        """Layout with the network's anchors held."""
-        free = np.ones(len(network), dtype=bool)
-        free[network.anchors] = False
-        pose_at = np.where(free, (np.cumsum(free) - 1) * network.tangent_dim, -1)
-        start = int(free.sum()) * network.tangent_dim
-        marks = start + 2 * np.arange(len(network.landmark_ids))
-        return cls(pose_at, marks, start + 2 * len(marks))
+        """Poses in order, then landmarks."""
+        return cls._in_order(network, _free_nodes(network))
+
+    @classmethod
+    def for_elimination(cls, network: PoseNetwork) -> Layout:
+        """Poses and landmarks in a minimum-degree order of elimination: quicker than to order their scalars."""
+        nodes, n = _free_nodes(network), len(network)
+        at = np.full(n + len(network.landmark_ids), -1)
+        at[nodes] = np.arange(len(nodes))
+        i, j = at[np.concatenate([network.edges, network.observations + [0, n]])].T
+        tied = (i >= 0) & (j >= 0)
+        order = elimination_order(i[tied], j[tied], len(nodes)) if len(nodes) else nodes
+        return cls._in_order(network, nodes[order])
+
+    @classmethod
+    def _in_order(cls, network: PoseNetwork, nodes: np.ndarray) -> Layout:
+        n = len(network)
+        width = np.where(nodes < n, network.tangent_dim, 2)
+        begin = np.full(n + len(network.landmark_ids), -1)
+        begin[nodes] = np.cumsum(width) - width
+        return cls(begin[:n], begin[n:], int(width.sum()))
 
     def retract(self, poses: Array, landmarks: Array, step: Array) -> tuple[Array, Array]:
         """Poses moved by ``Exp`` on the right, landmarks by addition."""
         d = 3 if poses.shape[1] == 3 else 6
-        free = self.pose_at >= 0
+        free = np.flatnonzero(self.pose_at >= 0)
         moved = poses.copy()
-        moved[free] = compose(poses[free], exp(step[: free.sum() * d].reshape(-1, d)))
-        return moved, landmarks + step[len(step) - 2 * len(landmarks) :].reshape(-1, 2)
+        moved[free] = compose(poses[free], exp(step[self.pose_at[free, None] + np.arange(d)]))
+        return moved, landmarks + step[self.mark_at[:, None] + np.arange(2)]
 
 
 def linearise(network: PoseNetwork, poses: Array, landmarks: Array, layout: Layout) -> tuple[sp.csr_matrix, Array]:

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, Polished, Problem, polish
-from graphslam.solve.network.factors import from_values
-from graphslam.solve.network.incremental import run_isam2
+from graphslam.solve.network.descent import SAME, Polished, Problem, polish
 from graphslam.solve.network.model import objective
 from graphslam.solve.network.sparse import SparseProblem
-from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start
+from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
+
+if TYPE_CHECKING:
+    from graphslam.solve.network.batch import BatchProblem
 
 log = logging.getLogger(__name__)
 
 Start = tuple[Array, Array]
-# Two starts agree, and one beats another, at this relative difference of the objective.
-SAME = 1e-6
 # Starts with initial objectives as close as this are one start (a file's values are often its printed odometry).
 TWIN = 1e-5
 # Networks with more residuals than this stop at the first two starts that agree on the lowest objective.
 LARGE = 50_000
+# χ² that far above its expectation, in standard deviations of what the stated noise allows, is no chance.
+BEYOND = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +76,9 @@ def _chordal(network: PoseNetwork) -> Start:
 
 
 def _incremental(network: PoseNetwork) -> Start:
+    from graphslam.solve.network.factors import from_values
+    from graphslam.solve.network.incremental import run_isam2
+
     return from_values(network, run_isam2(network))
 
 
@@ -107,25 +110,83 @@ def canonical_start(network: PoseNetwork) -> Start:
 
 
 def make_problem(network: PoseNetwork) -> Problem:
-    """GTSAM's factors; plain numpy where GTSAM has no native factor (Cartesian landmark observations)."""
-    if len(network.observations) and network.observation_kind != "bearing-range":
-        return SparseProblem(network)
+    """Plain numpy in 2-D, where it beats GTSAM's factors; these in 3-D."""
+    return SparseProblem(network) if network.dim == 2 else native_problem(network)
+
+
+def native(network: PoseNetwork) -> bool:
+    """Whether GTSAM has native factors for every measurement (it has none for Cartesian landmark observations)."""
+    return len(network.observations) == 0 or network.observation_kind == "bearing-range"
+
+
+def native_problem(network: PoseNetwork) -> BatchProblem:
+    """The network as a GTSAM graph."""
+    from graphslam.solve.network.batch import BatchProblem  # gtsam, which most files do not need
+
     return BatchProblem(network)
 
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """Best of several starts."""
+    """Best of the starts that were tried.
+
+    Parameters
+    ----------
+    problem : Problem
+    best : Polished
+    start : str
+        Which won.
+    reports : tuple of StartReport
+    doubt : str
+        What spoke against the first start's answer, so that it was certified or the others were tried; empty if
+        nothing did, or if starts were named.
+    """
 
     problem: Problem
     best: Polished
     start: str
     reports: tuple[StartReport, ...]
+    doubt: str = ""
 
     @property
     def iterations(self) -> int:
         """Steps of all starts together."""
         return sum(r.iterations for r in self.reports)
+
+
+def doubt(problem: Problem, end: Polished) -> str:
+    """Why an answer may not be the best one, in words; empty if nothing speaks against it.
+
+    * The descent did not end at a stationary point.
+    * A cycle of edges is wound (:func:`~graphslam.solve.network.start.wound_cycles`): every minimum other than the
+      best that was met from random starts on the recorded networks shows that, or the next.
+    * χ² is beyond what the stated noise allows, and the cycles do not decide whether it is the noise or the answer.
+    * Landmarks: their observations close loops that no cycle of edges shows.
+    """
+    network = problem.network
+    if end.status != "converged":
+        return f"the first start did not converge ({end.status})"
+    if len(network.observations):
+        return "loops by landmarks show in no cycle of edges"
+    wound, undecided, cycles = wound_cycles(network, problem.arrays(end.values)[0])
+    if wound:
+        return f"{wound} of {cycles} cycles turn once too often"
+    dof = network.residuals - network.states
+    if end.objective > dof + BEYOND * np.sqrt(2.0 * max(dof, 1)):
+        return f"chi2 {end.objective:.4g} for {dof} degrees of freedom"
+    if 2 * undecided > cycles:
+        return f"{undecided} of {cycles} cycles are too noisy to tell turns"
+    return ""
+
+
+def _certified(problem: Problem, end: Polished) -> bool:
+    """Whether duality settles the doubt, which costs less than other starts."""
+    from graphslam.solve.network.certificate import certify
+
+    if end.status != "converged":
+        return False
+    poses, _ = problem.arrays(end.values)
+    return certify(problem.network, poses, end.objective, eigenvalue=False).verdict == "certified"
 
 
 def best_of_starts(
@@ -136,12 +197,13 @@ def best_of_starts(
     problem: Problem | None = None,
     progress: bool = False,
 ) -> Optimum:
-    """Descend from every start that can compete and keep the lowest objective.
+    """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
 
     Parameters
     ----------
     names : sequence of str, optional
-        Keys of :data:`STARTS`; :func:`default_starts` if not given.
+        Keys of :data:`STARTS`, all of which are tried. If not given: the first of :func:`default_starts`, and the
+        others if there is :func:`doubt` that no certificate settles.
     given : dict of str to (poses, landmarks), optional
         Further starts, tried first.
     problem : Problem, optional
@@ -158,6 +220,7 @@ def best_of_starts(
     for name in chosen:
         if name not in STARTS:
             raise UnknownNameError("start", name, STARTS)
+    own = problem is None
     problem = problem or make_problem(network)
     given = given or {}
     offered = [*given, *(n for n in chosen if n not in given)]
@@ -165,7 +228,8 @@ def best_of_starts(
     winner = ""
     reports: list[StartReport] = []
     failure: IndeterminateError | None = None
-    for name in tqdm(offered, desc="starts", unit="start", disable=not progress, leave=False):
+    why = ""
+    for name in _shown(offered) if progress else offered:
         if best is not None and network.residuals > LARGE and _agreed(reports, best.objective):
             break
         try:
@@ -181,14 +245,34 @@ def best_of_starts(
         if twin is not None:
             reports.append(StartReport(name, initial, twin.objective, 0, f"same as {twin.name}"))
             continue
-        end = polish(problem, problem.values(*start), best_known=np.inf if best is None else best.objective)
+        known = np.inf if best is None else best.objective
+        end = polish(problem, problem.values(*start), best_known=known, foretell=True)
+        if own and end.status in ("stalled", "out of iterations") and native(network) and not _is_native(problem):
+            # GTSAM has more ways down: a trust region, and QR
+            problem = native_problem(network)
+            best = best and replace(best, values=problem.values(*best.values))
+            end = polish(problem, problem.values(*end.values), best_known=known, foretell=True)
         reports.append(StartReport(name, initial, end.objective, end.iterations, end.status))
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):
             best, winner = end, name
+        if names is None and not given and len(reports) == 1:
+            why = doubt(problem, end)
+            if not why or _certified(problem, end):
+                break
     if best is None:
         raise failure or IndeterminateError(f"{network.source}: no start could be made")
-    return Optimum(problem, best, winner, tuple(reports))
+    return Optimum(problem, best, winner, tuple(reports), why)
+
+
+def _shown(names: list[str]) -> Iterable[str]:
+    from tqdm import tqdm
+
+    return tqdm(names, desc="starts", unit="start", leave=False)
+
+
+def _is_native(problem: Problem) -> bool:
+    return not isinstance(problem, SparseProblem)
 
 
 def _better(a: Any, b: Any) -> bool:

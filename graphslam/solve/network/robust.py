@@ -23,8 +23,9 @@ from tqdm import tqdm
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, Polished, polish
+from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
+from graphslam.solve.network.descent import Polished, polish
 from graphslam.solve.network.diagnose import check_determined
 from graphslam.solve.network.model import edge_costs, observation_costs, subnetwork
 from graphslam.solve.network.settle import FEW, Settled, settle

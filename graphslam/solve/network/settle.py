@@ -38,7 +38,8 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, Polished, polish
+from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.network.descent import Polished, polish
 from graphslam.solve.network.model import (
     Layout,
     edge_costs,

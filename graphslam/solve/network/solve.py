@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,22 +13,24 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.batch import BatchProblem, Polished, is_converged, polish
-from graphslam.solve.network.certificate import Certificate, certify
-from graphslam.solve.network.consensus import odometry_edges
+from graphslam.solve.network.descent import SAME, Polished, Problem, is_converged, polish
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
-from graphslam.solve.network.incremental import Isam2Options, relinearise_all, run_isam2
 from graphslam.solve.network.model import objective, subnetwork
 from graphslam.solve.network.multistart import (
-    SAME,
     Optimum,
     StartReport,
     best_of_starts,
     canonical_start,
     default_starts,
+    native,
+    native_problem,
 )
-from graphslam.solve.network.robust import Robust, truncated_cost, truncated_least_squares
 from graphslam.solve.network.sparse import PcgProblem
+
+if TYPE_CHECKING:
+    from graphslam.solve.network.batch import BatchProblem
+    from graphslam.solve.network.certificate import Certificate
+    from graphslam.solve.network.robust import Robust
 
 # A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
 INLIER_PROBABILITY = 0.9999
@@ -62,14 +64,16 @@ class NetworkSolution:
     decrement : float
         Predicted further fall of the objective (gnc: of the inliers' objective).
     gap : float
-        Objective minus the lowest that any start reached in this run; nan where the start that reached it did not
-        converge, because then no optimum is known to measure against. For gnc it is what leaving out outliers costs
-        in the objective of all measurements, against what a few steps of least squares from there reach (or the
-        starts that were asked for); nan if so much is left out that this was not tried.
+        Objective minus the lowest that any start reached in this run (there may be one only); nan where the start that
+        reached it did not converge, because then no optimum is known to measure against. For gnc it is what leaving
+        out outliers costs in the objective of all measurements, against what a few steps of least squares from there
+        reach (or the starts that were asked for); nan if so much is left out that this was not tried.
     start : str
         Which start won.
     starts : tuple of StartReport
-        What the others reached.
+        What every start that was tried reached.
+    initial : tuple of (n, 3 | 7), (l, 2)
+        What the file says.
     details : dict
         What only this solver has to say.
     inliers : (m + k,) bool or None
@@ -91,6 +95,7 @@ class NetworkSolution:
     gap: float
     start: str
     starts: tuple[StartReport, ...]
+    initial: tuple[Array, Array]
     details: dict[str, Any] = field(default_factory=dict)
     inliers: npt.NDArray[np.bool_] | None = None
     certificate: Certificate | None = None
@@ -103,7 +108,7 @@ class NetworkSolution:
     @property
     def objective_g2o_initial(self) -> float:
         """g2o's objective at what the file says."""
-        return objective(self.network, *canonical_start(self.network), "g2o")
+        return objective(self.network, *self.initial, "g2o")
 
     def to_network(self) -> PoseNetwork:
         """The network with the solution as its values, ready to be written."""
@@ -127,7 +132,7 @@ class _Answer:
     start: str
     details: dict[str, Any]
     # what the solver minimised, where that is not the whole objective
-    minimised: BatchProblem | None = None
+    minimised: Problem | None = None
     minimum: float | None = None
     inliers: npt.NDArray[np.bool_] | None = None
 
@@ -139,7 +144,7 @@ def solve_network(
     network: PoseNetwork,
     solver: str = "lm",
     *,
-    starts: Sequence[str] | None = None,
+    starts: Sequence[str] | str | None = None,
     certificate: bool = False,
     progress: bool = False,
     **options: Any,
@@ -151,8 +156,10 @@ def solve_network(
     network : PoseNetwork
     solver : {"lm", "isam2", "gnc", "pcg"}
         Key of :data:`SOLVERS`.
-    starts : sequence of str, optional
-        Starts to try (:data:`graphslam.solve.network.multistart.STARTS`).
+    starts : sequence of str or "all", optional
+        Starts to try (:data:`graphslam.solve.network.multistart.STARTS`); "all" that are worth trying for this
+        network. If not given one, and the others if there is doubt of its answer
+        (:func:`graphslam.solve.network.multistart.doubt`).
     certificate : bool
         Also say whether the answer is the global optimum of what was minimised (for gnc: of the inliers), in
         ``NetworkSolution.certificate``.
@@ -176,14 +183,16 @@ def solve_network(
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ConfigError(f"solver {solver} has no option {unknown[0]!r}; known: {', '.join(known) or 'none'}")
+    if starts is not None:
+        starts = default_starts(network) if starts == "all" else [starts] if isinstance(starts, str) else list(starts)
     begin = time.perf_counter()
     check_determined(network)
     initial = canonical_start(network)
     check_full_rank(network, *initial)
     answer = run(network, starts, options, progress)
     poses, landmarks = answer.arrays
-    value = objective(network, poses, landmarks)
     best = answer.optimum.best
+    value = best.objective if answer.values is best.values else objective(network, poses, landmarks)
     gap = value - best.objective
     if answer.values is best.values and best.status == "converged":
         # judged where the descent ended: evaluated again one step on, a decrement at the limit may lie beyond it
@@ -194,6 +203,8 @@ def solve_network(
     at_optimum = gap <= SAME * abs(best.objective) + 1e-12 * network.residuals
     shown = None
     if certificate:
+        from graphslam.solve.network.certificate import certify
+
         judged = network if answer.inliers is None else subnetwork(network, answer.inliers)
         shown = certify(judged, poses, objective(judged, poses, landmarks))
     return NetworkSolution(
@@ -210,6 +221,7 @@ def solve_network(
         gap=max(gap, 0.0) if best.status == "converged" or answer.minimised is not None else float("nan"),
         start=answer.start,
         starts=answer.optimum.reports,
+        initial=initial,
         details=answer.details,
         inliers=answer.inliers,
         certificate=shown,
@@ -219,7 +231,8 @@ def solve_network(
 def _lm(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
     optimum = best_of_starts(network, starts, progress=progress)
     best = optimum.best
-    return _Answer(best.values, optimum.problem.arrays(best.values), best.iterations, optimum, optimum.start, {})
+    arrays = optimum.problem.arrays(best.values)
+    return _Answer(best.values, arrays, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
 
 
 def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
@@ -227,6 +240,7 @@ def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
     optimum = best_of_starts(network, starts, problem=problem, progress=progress)
     best, report = optimum.best, problem.report
     details = {
+        "doubt": optimum.doubt,
         "linear_solves": report.solves,
         "cg_iterations": report.iterations,
         "cg_unconverged": report.unconverged,
@@ -237,6 +251,8 @@ def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
 
 
 def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    from graphslam.solve.network.incremental import Isam2Options, relinearise_all, run_isam2
+
     options = dict(options)
     close = bool(options.pop("relinearise", True))
     problem = _native(network, "isam2")
@@ -272,6 +288,9 @@ def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str
 
 
 def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+    from graphslam.solve.network.consensus import odometry_edges  # scipy's statistics take a second to load
+    from graphslam.solve.network.robust import truncated_cost, truncated_least_squares
+
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
     scale = options.get("noise_scale")
     problem = _native(network, "gnc")
@@ -335,12 +354,12 @@ def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: Robust) ->
 
 
 def _native(network: PoseNetwork, solver: str) -> BatchProblem:
-    if len(network.observations) and network.observation_kind != "bearing-range":
+    if not native(network):
         raise SolverError(
             f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "
             "observations; use lm or pcg"
         )
-    return BatchProblem(network)
+    return native_problem(network)
 
 
 # name -> (function, its options)

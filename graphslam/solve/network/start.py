@@ -8,16 +8,24 @@ which are linear given the rotations.
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from graphslam.core import se3
-from graphslam.core.geometry import Array, rotation2, se2_transform
+from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network.model import compose, inverse
+
+Index = npt.NDArray[np.intp]
+
+# A cycle that the measurements themselves close no better than this [rad] says nothing about turns too many.
+UNDECIDED = 2.0 * np.pi / 3.0
 
 
 def identity(network: PoseNetwork, n: int) -> Array:
@@ -26,18 +34,6 @@ def identity(network: PoseNetwork, n: int) -> Array:
     if network.dim == 3:
         out[:, 6] = 1.0
     return out
-
-
-def _walk(network: PoseNetwork, order: list[tuple[int, int, bool]]) -> Array:
-    """Poses by chaining edges: (edge, vertex to set, whether the edge points at it)."""
-    poses = identity(network, len(network))
-    anchors = network.anchors
-    poses[anchors] = network.poses[anchors]
-    z, z_inv = network.measurements, inverse(network.measurements)
-    for edge, vertex, forward in order:
-        i, j = network.edges[edge]
-        poses[vertex] = compose(poses[i] if forward else poses[j], z[edge] if forward else z_inv[edge])
-    return poses
 
 
 def neighbours(network: PoseNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -51,55 +47,131 @@ def neighbours(network: PoseNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return first, edge[order], there[order]
 
 
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """A spanning tree of the edges, rooted at the anchors.
+
+    Parameters
+    ----------
+    parent : (n,)
+        Vertex towards the root; a root is its own parent.
+    edge : (n,)
+        Edge to the parent, -1 for a root.
+    forward : (n,) bool
+        Whether the edge points from the parent.
+    """
+
+    parent: Index
+    edge: Index
+    forward: npt.NDArray[np.bool_]
+
+    def rooted(self, step: Array, join: Callable[[Array, Array], Array]) -> Array:
+        """``step[root] ∘ … ∘ step[v]`` for every vertex, ``(n, …)``, in log2(depth) rounds."""
+        total, up = step.copy(), self.parent.copy()
+        while len(move := np.flatnonzero(up != up[up])):
+            total[move] = join(total[up[move]], total[move])
+            up[move] = up[up[move]]
+        below = np.flatnonzero(self.parent != np.arange(len(up)))
+        total[below] = join(step[up[below]], total[below])
+        return total
+
+
+def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> Tree:
+    """Breadth first: fewest edges between a vertex and an anchor, so the least accumulated error.
+
+    With ``chain`` edges between neighbours in id order have precedence: dead reckoning.
+    """
+    n, (i, j) = len(network), network.edges.T
+    # anchors hang from one extra node; of parallel edges the first counts, one that points forward before another
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    order = np.lexsort((np.arange(len(i)), i > j))
+    pair, first = np.unique((low * n + high)[order], return_index=True)
+    edge, low, high = order[first], pair // n, pair % n
+    weight = np.where(high - low == 1, 1.0, 2.0) if chain else np.ones(len(pair))
+    anchors = network.anchors
+    links = sp.csr_matrix(
+        (
+            np.concatenate([weight, np.full(len(anchors), 0.5)]),
+            (np.concatenate([low, anchors]), np.concatenate([high, np.full(len(anchors), n)])),
+        ),
+        shape=(n + 1, n + 1),
+    )
+    if chain:
+        links = minimum_spanning_tree(links)
+    _, parent = breadth_first_order(links, n, directed=False, return_predecessors=True)
+    parent = parent[:n].astype(np.intp)
+    vertex = np.arange(n)
+    rooted = (parent < 0) | (parent == n)
+    parent[rooted] = vertex[rooted]
+    key = np.minimum(parent, vertex) * n + np.maximum(parent, vertex)
+    used = np.full(n, -1)
+    used[~rooted] = edge[np.searchsorted(pair, key[~rooted])]
+    return Tree(parent, used, np.where(used >= 0, j[used] == vertex, True))
+
+
+def tree_poses(network: PoseNetwork, tree: Tree) -> Array:
+    """Poses by chaining the measurements of a tree from the anchors."""
+    step = identity(network, len(network))
+    roots = tree.edge < 0
+    step[network.anchors] = network.poses[network.anchors]
+    z = network.measurements[tree.edge[~roots]]
+    step[~roots] = np.where(tree.forward[~roots, None], z, inverse(z))
+    return tree.rooted(step, compose)
+
+
 def odometry_start(network: PoseNetwork) -> Array:
     """Dead reckoning: every vertex from its predecessor in id order where an edge joins them, else from any edge."""
-    n = len(network)
-    i, j = network.edges.T
-    chain = np.full(n, -1)
-    forward = np.flatnonzero(j == i + 1)[::-1]
-    backward = np.flatnonzero(i == j + 1)[::-1]
-    chain[i[backward]] = backward
-    chain[j[forward]] = forward  # an edge that points forward has precedence, the first of several
-    first, edge, other = neighbours(network)
-    done = np.zeros(n, dtype=bool)
-    done[network.anchors] = True
-    order: list[tuple[int, int, bool]] = []
-    queue = deque(sorted(int(a) for a in network.anchors))
-    while queue:
-        v = queue.popleft()
-        while v + 1 < n and not done[v + 1] and chain[v + 1] >= 0:
-            e = int(chain[v + 1])
-            order.append((e, v + 1, bool(j[e] == v + 1)))
-            done[v + 1] = True
-            queue.append(v + 1)
-            v += 1
-        if done.all():
-            break
-        # side branches and gaps of the chain, from whatever is known
-        for k in range(first[v], first[v + 1]):
-            if not done[other[k]]:
-                order.append((int(edge[k]), int(other[k]), bool(j[edge[k]] == other[k])))
-                done[other[k]] = True
-                queue.append(int(other[k]))
-    return _walk(network, order)
+    return tree_poses(network, spanning_tree(network, chain=True))
 
 
 def tree_start(network: PoseNetwork) -> Array:
     """Breadth-first spanning tree: fewest edges between a vertex and an anchor, so the least accumulated error."""
-    first, edge, other = neighbours(network)
-    done = np.zeros(len(network), dtype=bool)
-    done[network.anchors] = True
-    queue = deque(int(a) for a in network.anchors)
-    order: list[tuple[int, int, bool]] = []
-    while queue:
-        v = queue.popleft()
-        for k in range(first[v], first[v + 1]):
-            w = int(other[k])
-            if not done[w]:
-                done[w] = True
-                order.append((int(edge[k]), w, bool(network.edges[edge[k], 1] == w)))
-                queue.append(w)
-    return _walk(network, order)
+    return tree_poses(network, spanning_tree(network))
+
+
+def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
+    """Cycles of edges around which a solution turns once more (or less) than the measurements do.
+
+    Given the rotations of a pose network its positions are linear, so another minimum has other rotations; and what
+    no small change of rotations undoes is a turn too many around some cycle. Every edge outside a spanning tree closes
+    one cycle. In 2-D the residual angles around it must add up to less than half a turn; in 3-D the product of the
+    residual rotations, each lifted to the nearer of its two quaternions, must have the sign of what was measured (two
+    turns are none there). A cycle whose measurements miss by more than a third of a turn decides nothing.
+
+    Returns
+    -------
+    wound, undecided, cycles : int
+    """
+    tree, (i, j) = spanning_tree(network), network.edges.T
+    branch = tree.edge >= 0
+    chord = np.ones(len(network.edges), dtype=bool)
+    chord[tree.edge[branch]] = False
+    i, j = i[chord], j[chord]
+    if network.dim == 2:
+        residual = wrap_angle(
+            poses[network.edges[:, 1], 2] - poses[network.edges[:, 0], 2] - network.measurements[:, 2]
+        )
+        step = np.zeros(len(network))
+        step[branch] = np.where(tree.forward[branch], 1.0, -1.0) * residual[tree.edge[branch]]
+        along = tree.rooted(step, np.add)
+        around = along[i] + residual[chord] - along[j]
+        decided = np.abs(wrap_angle(around)) < UNDECIDED
+        wound = np.abs(around) > np.pi
+    else:
+        q = network.measurements[:, 3:]
+        step = np.tile([0.0, 0.0, 0.0, 1.0], (len(network), 1))
+        ways = q[tree.edge[branch]]
+        step[branch] = np.where(tree.forward[branch, None], ways, ways * [-1.0, -1.0, -1.0, 1.0])
+        measured = tree.rooted(step, se3.quat_multiply)
+        # signs of the poses' quaternions such that no edge of the tree turns by more than half a turn
+        x = poses[:, 3:]
+        turned = np.sum(se3.quat_multiply(x[tree.parent], step) * x, axis=1)
+        x = x * tree.rooted(np.where(branch & (turned < 0.0), -1.0, 1.0), np.multiply)[:, None]
+        closes = np.sum(se3.quat_multiply(measured[i], q[chord]) * measured[j], axis=1)
+        solved = np.sum(se3.quat_multiply(x[i], q[chord]) * x[j], axis=1)
+        decided = np.abs(closes) > np.cos(UNDECIDED / 2.0)
+        wound = closes * solved < 0.0
+    return int((wound & decided).sum()), int((~decided).sum()), len(i)
 
 
 def chordal_start(network: PoseNetwork) -> tuple[Array, Array]:

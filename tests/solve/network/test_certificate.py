@@ -12,7 +12,7 @@ from graphslam.app.solve_file import solve_file
 from graphslam.core.network import PoseNetwork
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
-from graphslam.solve.network.batch import BatchProblem, polish
+from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.certificate import (
     _descend,
     _matrices,
@@ -22,6 +22,7 @@ from graphslam.solve.network.certificate import (
     isotropic,
     residual_matrix,
 )
+from graphslam.solve.network.descent import polish
 from graphslam.solve.network.model import exp
 from graphslam.solve.network.solve import solve_network
 from tests.solve.network.test_model import random_network

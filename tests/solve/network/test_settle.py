@@ -10,7 +10,8 @@ from scipy import stats
 
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
-from graphslam.solve.network.batch import BatchProblem, polish
+from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.network.descent import polish
 from graphslam.solve.network.model import edge_costs, subnetwork
 from graphslam.solve.network.settle import (
     LARGEST,

@@ -1,0 +1,192 @@
+"""Descent to a minimum of a pose network: Gauss-Newton while it helps, damped steps where it does not.
+
+Stopping rules that look at the fall of the objective say nothing where progress is merely slow. So an answer counts as
+converged only if the *predicted* remaining fall of a full Gauss-Newton step (the decrement
+``‖r‖² - min_δ ‖J δ + r‖²``, by exact sparse elimination) is negligible; or, after full steps that did what was
+predicted of them, if it will be by the rate at which the decrement falls.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+
+log = logging.getLogger(__name__)
+
+Status = Literal["converged", "rejected", "stalled", "out of iterations"]
+# Converged: the next step would lower the objective by less than this share of it …
+RELATIVE = 1e-9
+# … or by less than this per residual (a network without noise has objective zero).
+ABSOLUTE = 1e-14
+# Two starts agree, and one beats another, at this relative difference of the objective.
+SAME = 1e-6
+# Gauss-Newton may climb to this multiple of the best objective, and for this many steps.
+CLIMB, PATIENCE = 1e4, 8
+# The decrement may be foretold if the last step changed the objective by what it predicted to this share of it, and if
+# each decrement is at most this share of the one before (a third of the limit is asked for then).
+TRUE_TO_WORD, FAST = 0.1, 0.02
+# A start that after so many steps is still above the best of the others is given up.
+CHALLENGE = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Polished:
+    """Where a local solver ended.
+
+    Parameters
+    ----------
+    values : object
+        As the problem holds them.
+    objective : float
+        ``Σ rᵀ Ω r``.
+    decrement : float
+        Predicted further fall of the objective; infinite if the linear system could not be solved.
+    iterations : int
+        Steps taken, Gauss-Newton and damped.
+    status : str
+    """
+
+    values: Any
+    objective: float
+    decrement: float
+    iterations: int
+    status: Status
+
+
+class Problem(Protocol):
+    """What :func:`polish` needs of a problem; ``values`` are whatever the problem makes of them."""
+
+    network: PoseNetwork
+    factorization: str
+
+    def values(self, poses: Array, landmarks: Array) -> Any: ...
+
+    def arrays(self, values: Any) -> tuple[Array, Array]: ...
+
+    def objective(self, values: Any) -> float: ...
+
+    def newton_step(self, values: Any) -> tuple[Any, float, float]: ...
+
+    def decrement(self, values: Any) -> float: ...
+
+    def damped(self, values: Any, objective: float, budget: int) -> tuple[Any, list[float], int]: ...
+
+
+def is_converged(network: PoseNetwork, objective: float, decrement: float) -> bool:
+    """Whether a decrement is negligible: 1e-9 of the objective, or 1e-14 per residual."""
+    return bool(decrement <= RELATIVE * objective + ABSOLUTE * network.residuals)
+
+
+def polish(
+    problem: Problem,
+    values: Any,
+    *,
+    best_known: float = np.inf,
+    max_iterations: int = 200,
+    foretell: bool = False,
+) -> Polished:
+    """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
+
+    Parameters
+    ----------
+    best_known : float
+        Objective that another start has reached. The descent is rejected once it cannot get below it in reasonable
+        time: after 10 steps, or when its recent rate kept up for twenty times as long would not do.
+    max_iterations : int
+        Gauss-Newton and damped steps together.
+    foretell : bool
+        Save the last step where the rate of convergence foretells that it changes nothing that counts.
+
+    Returns
+    -------
+    Polished
+        Never worse than ``values``.
+    """
+    best = _descend(problem, values, best_known, max_iterations, foretell)
+    if best.status == "stalled" and not np.isfinite(best.decrement) and problem.factorization == "CHOLESKY":
+        # the normal equations are what failed; QR squares no condition number
+        log.info("%s: Cholesky made no progress, going on with QR", problem.network.source)
+        problem.factorization = "QR"
+        again = _descend(problem, best.values, best_known, max_iterations, foretell)
+        if again.objective <= best.objective:
+            best = Polished(
+                again.values, again.objective, again.decrement, best.iterations + again.iterations, again.status
+            )
+    return best
+
+
+def _descend(problem: Problem, values: Any, best_known: float, budget: int, foretell: bool) -> Polished:
+    objective, used, attempts = problem.objective(values), 0, 0
+    history = [objective]
+    while used < budget:
+        patience = PATIENCE if attempts == 0 else 2
+        found = _newton(problem, values, objective, min(budget - used, 40), patience, foretell)
+        used, attempts = used + found.iterations, attempts + 1
+        if found.objective < objective:
+            values, objective = found.values, found.objective
+            history.append(objective)
+        if found.status == "converged":
+            return Polished(values, objective, found.decrement, used, "converged")
+        if _hopeless(history, best_known, used):
+            return Polished(values, objective, found.decrement, used, "rejected")
+        # damped: always downhill, until Gauss-Newton is worth another try
+        before = objective
+        values, taken, steps = problem.damped(values, objective, budget - used)
+        history += taken
+        objective = history[-1]
+        used += max(steps, 1)
+        if _hopeless(history, best_known, used):
+            return Polished(values, objective, float("inf"), used, "rejected")
+        if not objective < before:
+            decrement = problem.decrement(values)
+            done = is_converged(problem.network, objective, decrement)
+            return Polished(values, objective, decrement, used, "converged" if done else "stalled")
+    decrement = problem.decrement(values)
+    done = is_converged(problem.network, objective, decrement)
+    return Polished(values, objective, decrement, used, "converged" if done else "out of iterations")
+
+
+def _newton(problem: Problem, values: Any, objective: float, budget: int, patience: int, foretell: bool) -> Polished:
+    """Full Gauss-Newton steps, allowed to climb for a while.
+
+    After rotations-first the first step often trades a higher objective for the right shape, and the next ones fall
+    far below the start; a monotone method creeps instead. ``patience`` steps without a new best end the attempt.
+    """
+    best, lowest, steps, since, before = values, objective, 0, 0, float("inf")
+    while steps < budget and since < patience:
+        try:
+            moved, fall, now = problem.newton_step(values)
+        except RuntimeError:
+            break
+        steps += 1
+        # at a minimum to rounding the step may go either way by a trifle; a clearly negative fall is a failed solve
+        if values is best and is_converged(problem.network, lowest, abs(fall)):
+            if now < lowest:
+                best, lowest = moved, now
+            return Polished(best, lowest, max(fall, 0.0), steps, "converged")
+        if not np.isfinite(now) or fall < 0.0 or now > CLIMB * lowest:
+            break
+        held = values is best and abs(lowest - now - fall) <= TRUE_TO_WORD * fall
+        left, before = fall * fall / before if np.isfinite(before) else float("inf"), fall
+        values, since = moved, since + 1
+        if now < lowest:
+            best, lowest, since = moved, now, 0
+            if foretell and held and left <= FAST * fall and is_converged(problem.network, lowest, 3.0 * left):
+                return Polished(best, lowest, left, steps, "converged")
+    return Polished(best, lowest, float("inf"), steps, "stalled")
+
+
+def _hopeless(history: list[float], best_known: float, used: int) -> bool:
+    """Whether a descent is above the best known objective and will not get below it in reasonable time."""
+    if not history[-1] > best_known * (1.0 + 1e-6):
+        return False
+    if used > CHALLENGE and history[-1] > 1.001 * best_known:
+        return True
+    recent = history[-5:]
+    return len(history) > 8 and recent[-1] - 20.0 * (recent[0] - recent[-1]) > best_known
