@@ -27,6 +27,8 @@ ObservationKind = Literal["cartesian", "bearing-range"]
 ROUNDING = 1e-9
 # A repaired matrix keeps this share of its largest eigenvalue in every direction, so that it has an inverse.
 REPAIR_FLOOR = 1e-9
+# So many matrices are checked at a time.
+_PART = 1 << 15
 
 
 class Labels(Sequence[str]):
@@ -83,36 +85,50 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
         GTSAM would take every one of these in silence.
     """
     info = np.array(information, dtype=np.float64)
-    if len(info) == 0:
-        return info
-    bad = np.flatnonzero(~usable(info).all(axis=(1, 2)))
+    bad = _where(info, lambda part: ~usable(part).all(axis=(1, 2)))
     if len(bad):
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are not finite: {_names(labels, bad)}", where=where, wanted="finite"
         )
-    scale = np.sqrt(np.abs(np.diagonal(info, axis1=1, axis2=2)))
-    bound = 1e-6 * np.maximum(scale[:, :, None] * scale[:, None, :], np.finfo(float).tiny)
-    swapped = np.swapaxes(info, 1, 2)
-    bad = np.flatnonzero((np.abs(info - swapped) > bound).any(axis=(1, 2)))
+    bad = _where(info, _asymmetric)
     if len(bad):
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are not symmetric: {_names(labels, bad)}",
             where=where,
             wanted="symmetric matrices",
         )
-    info = 0.5 * (info + swapped)
-    if all_positive_definite(info):
-        return info
-    low, top = _eigen_floor(info)
-    bad = np.flatnonzero(low < -ROUNDING * top)
+    for k in range(0, len(info), _PART):
+        part = info[k : k + _PART]
+        part[...] = 0.5 * (part + np.swapaxes(part, 1, 2))
+    bad = _where(info, _indefinite)
     if len(bad):
-        values = [f"smallest eigenvalue {v:.3g}" for v in low[bad[:5]]]
+        low, _ = _eigen_floor(info[bad[:5]])
+        values = [f"smallest eigenvalue {v:.3g}" for v in low]
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are indefinite: {_names(labels, bad, values)}",
             where=where,
             wanted="positive semi-definite matrices, or repair=True to project them",
         )
     return info
+
+
+def _where(matrices: Array, test: Callable[[Array], Mask]) -> Index:
+    """Indices of the matrices that ``test`` is true of, a part at a time: a million of them fill memory once only."""
+    found = [k + np.flatnonzero(test(matrices[k : k + _PART])) for k in range(0, len(matrices), _PART)]
+    return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
+
+
+def _asymmetric(matrices: Array) -> Mask:
+    scale = np.sqrt(np.abs(np.diagonal(matrices, axis1=1, axis2=2)))
+    bound = 1e-6 * np.maximum(scale[:, :, None] * scale[:, None, :], np.finfo(float).tiny)
+    return np.asarray((np.abs(matrices - np.swapaxes(matrices, 1, 2)) > bound).any(axis=(1, 2)))
+
+
+def _indefinite(matrices: Array) -> Mask:
+    if all_positive_definite(matrices):
+        return np.zeros(len(matrices), dtype=np.bool_)
+    low, top = _eigen_floor(matrices)
+    return np.asarray(low < -ROUNDING * top)
 
 
 def repair_informations(information: ArrayLike) -> tuple[Array, Index]:

@@ -15,9 +15,12 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_adjoint
 from graphslam.core.network import PoseNetwork
 from graphslam.core.se3 import se3_adjoint
+from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
+from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.solve.network.model import Layout, inverse, linearise, objective
 
 Values = tuple[Array, Array]
@@ -25,6 +28,8 @@ Values = tuple[Array, Array]
 DELAY = 10
 # Columns that SuperLU takes together: its default of 20 suits larger fronts than those of pose networks.
 PANEL = 10
+# Beyond so many free scalars poses are eliminated as blocks.
+MANY = 20_000
 
 
 def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
@@ -57,7 +62,10 @@ class SparseProblem:
 
     def __init__(self, network: PoseNetwork) -> None:
         self.network = network
-        self.layout = Layout.for_elimination(network)
+        # many poses: compiled block elimination, which begins with half a second of loading
+        self._by_block = network.states > MANY and len(network.landmark_ids) == 0
+        self.layout = Layout.of(network) if self._by_block else Layout.for_elimination(network)
+        self._symbolic: BlockSymbolic | None = None
 
     def values(self, poses: Array, landmarks: Array) -> Values:
         """Arrays are the values."""
@@ -79,13 +87,26 @@ class SparseProblem:
         RuntimeError
             Singular, or refinement corrects more than a hundredth of the energy: too few digits are left.
         """
-        lu = factor(H, ordered=True)
+        lu = self._blocks(H) if self._by_block else factor(H, ordered=True)
         x = lu.solve(b)
         left = b - H @ x
         more = lu.solve(left)
         if not abs(more @ left) <= 0.01 * abs(x @ b):
             raise RuntimeError("the linear system is singular to working precision")
         return np.asarray(x + more)
+
+    def _blocks(self, H: sp.csc_matrix) -> BlockFactor:
+        d = self.network.tangent_dim
+        B = sp.csr_matrix(H).tobsr((d, d))
+        if self._symbolic is None:
+            n, row = B.shape[0] // d, np.repeat(np.arange(B.shape[0] // d), np.diff(B.indptr))
+            order = elimination_order(row, B.indices, n).astype(np.int64)
+            pattern = B.indptr.astype(np.int64), B.indices.astype(np.int64)
+            self._symbolic = BlockSymbolic(order, np.full(n, d), *pattern)
+        try:
+            return self._symbolic.factor(np.arange(len(B.data)) * d * d, B.data.ravel())
+        except IndeterminateError as error:
+            raise RuntimeError(str(error)) from None
 
     def newton_step(self, values: Values) -> tuple[Values, float, float]:
         """One Gauss-Newton step, the fall of the objective that it predicts, and the objective after it.
