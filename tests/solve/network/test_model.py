@@ -70,9 +70,7 @@ def random_network(
             "landmarks": points,
             "has_landmark": np.ones(4, bool),
             "observations": seen,
-            "observation_values": np.abs(values + noise * rng.standard_normal((n, 2)))
-            if marks == "bearing-range"
-            else values + noise * rng.standard_normal((n, 2)),
+            "observation_values": values + noise * rng.standard_normal((n, 2)),
             "observation_information": B @ np.swapaxes(B, 1, 2) + np.eye(2),
             "observation_kind": marks,
         }
