@@ -68,9 +68,7 @@ def solve_file(
     MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
     """
     network = read_network(path, noise=noise, repair=repair, create_missing=create_missing, max_size=max_size)
-    solution = solve_network(
-        network, solver, starts=starts, certificate=certificate, progress=progress, **options
-    )
+    solution = solve_network(network, solver, starts=starts, certificate=certificate, progress=progress, **options)
     if out is not None:
         write_g2o(out, solution.to_network())
     report = report_of(solution)

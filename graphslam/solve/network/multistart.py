@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network.descent import SAME, Polished, Problem, polish
 from graphslam.solve.network.model import objective
-from graphslam.solve.network.sparse import SparseProblem
+from graphslam.solve.network.sparse import MANY, SparseProblem
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
 
 if TYPE_CHECKING:
@@ -110,8 +110,8 @@ def canonical_start(network: PoseNetwork) -> Start:
 
 
 def make_problem(network: PoseNetwork) -> Problem:
-    """Plain numpy in 2-D, where it beats GTSAM's factors; these in 3-D."""
-    return SparseProblem(network) if network.dim == 2 else native_problem(network)
+    """Plain numpy in 2-D and for many poses, where it beats GTSAM's factors; these for the rest of 3-D."""
+    return SparseProblem(network) if network.dim == 2 or len(network) > MANY else native_problem(network)
 
 
 def native(network: PoseNetwork) -> bool:
@@ -179,22 +179,13 @@ def doubt(problem: Problem, end: Polished) -> str:
     return ""
 
 
-def _certified(problem: Problem, end: Polished) -> bool:
-    """Whether duality settles the doubt, which costs less than other starts."""
-    from graphslam.solve.network.certificate import certify
-
-    if end.status != "converged":
-        return False
-    poses, _ = problem.arrays(end.values)
-    return certify(problem.network, poses, end.objective, eigenvalue=False).verdict == "certified"
-
-
 def best_of_starts(
     network: PoseNetwork,
     names: Sequence[str] | None = None,
     *,
     given: dict[str, Start] | None = None,
     problem: Problem | None = None,
+    certified: Callable[[Problem, Polished], bool] | None = None,
     progress: bool = False,
 ) -> Optimum:
     """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
@@ -207,7 +198,9 @@ def best_of_starts(
     given : dict of str to (poses, landmarks), optional
         Further starts, tried first.
     problem : Problem, optional
-        How the network is solved; GTSAM if it can.
+        How the network is solved; :func:`make_problem` if not given.
+    certified : callable, optional
+        Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
 
     Raises
     ------
@@ -258,7 +251,7 @@ def best_of_starts(
             best, winner = end, name
         if names is None and not given and len(reports) == 1:
             why = doubt(problem, end)
-            if not why or _certified(problem, end):
+            if not why or (certified is not None and end.status == "converged" and certified(problem, end)):
                 break
     if best is None:
         raise failure or IndeterminateError(f"{network.source}: no start could be made")

@@ -228,8 +228,15 @@ def solve_network(
     )
 
 
+def _certified(problem: Problem, end: Polished) -> bool:
+    from graphslam.solve.network.certificate import certify
+
+    poses, _ = problem.arrays(end.values)
+    return certify(problem.network, poses, end.objective, eigenvalue=False).verdict == "certified"
+
+
 def _lm(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
-    optimum = best_of_starts(network, starts, progress=progress)
+    optimum = best_of_starts(network, starts, certified=_certified, progress=progress)
     best = optimum.best
     arrays = optimum.problem.arrays(best.values)
     return _Answer(best.values, arrays, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
@@ -237,7 +244,7 @@ def _lm(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, A
 
 def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
     problem = PcgProblem(network, **options)
-    optimum = best_of_starts(network, starts, problem=problem, progress=progress)
+    optimum = best_of_starts(network, starts, problem=problem, certified=_certified, progress=progress)
     best, report = optimum.best, problem.report
     details = {
         "doubt": optimum.doubt,

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network.model import compose, inverse
+from graphslam.solve.network.sparse import MANY, BlockElimination, factor
 
 Index = npt.NDArray[np.intp]
 
@@ -185,12 +185,20 @@ def chordal_start(network: PoseNetwork) -> tuple[Array, Array]:
     return translations_from(network, chordal_rotations(network))
 
 
-def _least_squares(A: sp.csc_matrix, b: Array) -> Array:
+def _least_squares(A: sp.csc_matrix, b: Array, width: int) -> Array:
+    """Least squares of variables of ``width`` real scalars each (a complex number is two)."""
     H = sp.csc_matrix(A.conj().T @ A)
     # every vertex of a component without an anchor would be singular; a rounding-size ridge keeps the factor finite
-    H = H + sp.identity(H.shape[0], format="csc") * (1e-12 * float(np.abs(H.diagonal()).max()))
-    factor = spla.splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(factor.solve(np.asarray(A.conj().T @ b)))
+    H = sp.csc_matrix(H + sp.identity(H.shape[0], format="csc") * (1e-12 * float(np.abs(H.diagonal()).max())))
+    rhs = np.asarray(A.conj().T @ b)
+    whole = np.iscomplexobj(rhs)
+    if H.shape[0] // (1 if whole else width) <= MANY:
+        return np.asarray(factor(H).solve(rhs))
+    lu = BlockElimination(H, width).factor(H)
+    if whole:
+        x = lu.solve(np.stack([rhs.real, rhs.imag], axis=1).ravel()).reshape(-1, 2)
+        return np.asarray(x[:, 0] + 1j * x[:, 1])
+    return np.stack([lu.solve(column) for column in rhs.reshape(len(rhs), -1).T], axis=1).reshape(rhs.shape)
 
 
 def chordal_rotations(network: PoseNetwork) -> Array:
@@ -209,7 +217,7 @@ def chordal_rotations(network: PoseNetwork) -> Array:
         A, b = _relaxed(np.ones_like(z), z, weight, i, j, free, at, known)
         u = known.copy()
         if free.any():
-            u[free] = _least_squares(A, b)
+            u[free] = _least_squares(A, b, 2)
         return rotation2(np.angle(u))
     # R_jᵀ = Z_ijᵀ R_iᵀ: the columns of Rᵀ obey the same 3n × 3n system
     weight = np.sqrt(np.trace(network.information[:, :3, :3], axis1=1, axis2=2) / 3.0)
@@ -230,7 +238,7 @@ def chordal_rotations(network: PoseNetwork) -> Array:
     out = known3.copy()
     if size:
         A3 = sp.csc_matrix((values, (r, c)), shape=(3 * m, size))
-        out[free] = _least_squares(A3, rhs).reshape(-1, 3, 3)
+        out[free] = _least_squares(A3, rhs, 3).reshape(-1, 3, 3)
     U, _, Vt = np.linalg.svd(np.swapaxes(out, 1, 2))
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]  # nearest *rotation*
     return np.asarray(U @ Vt)
@@ -286,7 +294,7 @@ def translations_from(network: PoseNetwork, rotations: Array) -> tuple[Array, Ar
     positions = known.copy()
     if free.any():
         A = sp.csc_matrix((values, (r, c)), shape=(m * p, p * int(free.sum())))
-        positions[free] = _least_squares(A, b.ravel()).reshape(-1, p)
+        positions[free] = _least_squares(A, b.ravel(), p).reshape(-1, p)
     if p == 2:
         poses = np.concatenate([positions[:n], np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])[:, None]], axis=1)
     else:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import graphslam.core.network as core
-import graphslam.solve.network.multistart as multistart
+import graphslam.solve.network.solve as solving
 import graphslam.solve.network.sparse as sparse
+import graphslam.solve.network.start as starts
 from graphslam.core.errors import CovarianceError
 from graphslam.core.network import PoseNetwork
 from graphslam.solve.network.batch import BatchProblem
@@ -20,6 +21,7 @@ from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.sparse import SparseProblem
 from graphslam.solve.network.start import (
     chordal_rotations,
+    chordal_start,
     odometry_start,
     spanning_tree,
     translations_from,
@@ -102,7 +104,7 @@ def test_doubt_that_a_certificate_settles_needs_no_other_start(
     said = solve_network(quiet)
     assert "degrees of freedom" in said.details["doubt"]
     assert [s.name for s in said.starts] == ["chordal"]
-    monkeypatch.setattr(multistart, "_certified", lambda problem, end: False)
+    monkeypatch.setattr(solving, "_certified", lambda problem, end: False)
     assert len(solve_network(quiet).starts) > 1
 
 
@@ -126,6 +128,19 @@ def test_a_tree_is_walked_as_one_walks_it(rng: np.random.Generator) -> None:
     chained = spanning_tree(replace(net, fixed=np.arange(len(net)) == 0), chain=True)
     assert (chained.parent[1:] == np.arange(len(net) - 1)).all()
     assert np.allclose(odometry_start(replace(net, fixed=np.arange(len(net)) == 0)), net.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_chordal_start_by_blocks_is_the_same(
+    rng: np.random.Generator, dim: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = grid_world(150, rng, dim=dim, share=0.8)
+    fixed = np.zeros(len(net), bool)
+    fixed[[0, 149]] = True
+    plain, held = chordal_start(net)[0], chordal_start(replace(net, fixed=fixed))[0]
+    monkeypatch.setattr(starts, "MANY", 0)
+    assert np.allclose(chordal_start(net)[0], plain, atol=1e-6)
+    assert np.allclose(chordal_start(replace(net, fixed=fixed))[0], held, atol=1e-6)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
