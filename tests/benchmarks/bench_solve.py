@@ -9,8 +9,8 @@ of the two that ends at the best-known objective stands in the table; where none
 by its distance. "whole" is the CPU time of the process with its imports, "work" without them; the ratio is ours by
 GTSAM's.
 
-``--large N`` solves a drawn network of N poses instead (a drive through a city of square blocks, the information known),
-from arrays: GTSAM's graph is built from the same arrays, and its time counts from there. 10⁴ with ``--quick``.
+``--large N`` solves a drawn network of N poses instead (a drive through a city of square blocks), from arrays: GTSAM's
+graph is built from the same arrays, and its time counts from there. 10⁴ poses with ``--quick``.
 
 Exit code 1 if our objective is above the best known by more than 1e-6 of it.
 """
@@ -132,8 +132,8 @@ def drawn(n: int, solvers: tuple[str, ...]) -> int:
             off = r["objective"] / theirs["objective"] - 1.0
             failed += off > 1e-6
             print(
-                f"{n} poses, {dim}-D: {solver} {r['work']:.2f} s, {r['iterations']} iterations, {r['peak']:.0f} MB; GTSAM "
-                f"{theirs['work']:.2f} s, {theirs['iterations']} iterations, {theirs['peak']:.0f} MB; ratio "
+                f"{n} poses, {dim}-D: {solver} {r['work']:.2f} s, {r['iterations']} iterations, {r['peak']:.0f} MB; "
+                f"GTSAM {theirs['work']:.2f} s, {theirs['iterations']} iterations, {theirs['peak']:.0f} MB; ratio "
                 f"{r['work'] / theirs['work']:.2f}; objective / GTSAM's - 1 = {off:.1e}",
                 flush=True,
             )

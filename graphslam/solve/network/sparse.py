@@ -31,7 +31,7 @@ DELAY = 10
 # Columns that SuperLU takes together: its default of 20 suits larger fronts than those of pose networks.
 PANEL = 10
 # Beyond so many poses they are eliminated as blocks, in an order by nested dissection.
-MANY = 10_000
+MANY = 5_000
 
 
 def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
