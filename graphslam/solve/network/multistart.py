@@ -193,8 +193,8 @@ def best_of_starts(
     Parameters
     ----------
     names : sequence of str, optional
-        Keys of :data:`STARTS`, all of which are tried. If not given: the first of :func:`default_starts`, and the
-        others if there is :func:`doubt` that no certificate settles.
+        Keys of :data:`STARTS`, all of which are tried. If not given: the first (of ``given``, then of
+        :func:`default_starts`), and the others if there is :func:`doubt` that no certificate settles.
     given : dict of str to (poses, landmarks), optional
         Further starts, tried first.
     problem : Problem, optional
@@ -249,7 +249,7 @@ def best_of_starts(
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):
             best, winner = end, name
-        if names is None and not given and len(reports) == 1:
+        if names is None and len(reports) == 1:
             why = doubt(problem, end)
             if not why or (certified is not None and end.status == "converged" and certified(problem, end)):
                 break

@@ -268,12 +268,12 @@ def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str
     grown = run_isam2(network, settings, progress=progress)
     seconds = time.perf_counter() - begin
     # the batch optimum is what the gap is measured against; iSAM2's own estimate is one of its starts
-    names = tuple(n for n in (starts if starts is not None else default_starts(network)) if n != "incremental")
-    optimum = best_of_starts(
-        network, names, given={"incremental": problem.arrays(grown)}, problem=problem, progress=progress
-    )
+    names = None if starts is None else [n for n in starts if n != "incremental"]
+    given = {"incremental": problem.arrays(grown)}
+    optimum = best_of_starts(network, names, given=given, problem=problem, certified=_certified, progress=progress)
     lowest, raw = optimum.best.objective, problem.objective(grown)
     details: dict[str, Any] = {
+        "doubt": optimum.doubt,
         "objective_incremental": raw,
         "gap_incremental": raw - lowest,
         "seconds_incremental": seconds,
