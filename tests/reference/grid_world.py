@@ -39,7 +39,7 @@ def loops_of(poses: Array, rng: np.random.Generator, *, share: float, apart: int
 def grid_world(
     n: int, rng: np.random.Generator, *, dim: int = 2, share: float = 0.3, sigma: tuple[float, float] = (0.05, 0.01)
 ) -> PoseNetwork:
-    """A pose network of ``n`` poses with white noise of ``sigma`` (m, rad) a step, and its odometry as initial values."""
+    """A pose network of ``n`` poses, white noise of ``sigma`` (m, rad) a step, its odometry as initial values."""
     truth = drive(n, rng, side=5 * max(4, round(np.sqrt(n) / 12.0)))
     k = np.arange(n - 1)
     edges = np.concatenate([np.stack([k, k + 1], axis=1), loops_of(truth, rng, share=share)[:, ::-1]])
