@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,47 @@ def test_heavy_packages_stay_in_their_rooms(path: Path) -> None:
             assert rel.startswith(CONFINED[top]), f"{rel} imports {name}"
         if top == "numba":
             assert path.name == "kernels.py" or path.name.endswith("_kernels.py"), f"{rel} imports numba"
+
+
+def links(files: list[Path]) -> dict[str, set[str]]:
+    """Module → modules that it imports, also inside functions; a block ``if TYPE_CHECKING`` imports nothing."""
+    modules = {module_of(p): p for p in files}
+    out = {}
+    for module, path in modules.items():
+        tree = ast.parse(path.read_text())
+        types = {
+            id(n)
+            for block in ast.walk(tree)
+            if isinstance(block, ast.If) and isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING"
+            for statement in block.body
+            for n in ast.walk(statement)
+        }
+        found = set()
+        for node in (n for n in ast.walk(tree) if id(n) not in types):
+            if isinstance(node, ast.Import):
+                found |= {a.name for a in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names = {f"{node.module}.{a.name}" for a in node.names}
+                found |= {n if n in modules else node.module for n in names}
+        out[module] = (found & set(modules)) - {module}
+    return out
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    try:
+        TopologicalSorter(links(FILES)).prepare()
+    except CycleError as error:
+        pytest.fail("import circle: " + " ← ".join(error.args[1]))
+
+
+def test_a_circle_is_seen_also_inside_functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    (tmp_path / "a.py").write_text("import b\n")
+    (tmp_path / "b.py").write_text("def f():\n    from a import x\n")
+    (tmp_path / "c.py").write_text("if TYPE_CHECKING:\n    import d\n")
+    (tmp_path / "d.py").write_text("import c\n")
+    found = links([tmp_path / f"{n}.py" for n in "abcd"])
+    assert found == {"a": {"b"}, "b": {"a"}, "c": set(), "d": {"c"}}
 
 
 def test_every_package_has_a_storey() -> None:

@@ -24,6 +24,7 @@ from types import TracebackType
 import graphslam
 from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
+from graphslam.join.registry import join
 
 logger = logging.getLogger(__name__)
 
@@ -93,8 +94,6 @@ def _status(field: str) -> int:
 
 def _measure_here(folder: str, method: str, polish: bool) -> float:
     """Load, settle, reset the high-water mark, join, read the mark [MB]."""
-    from graphslam.app.compare import join
-
     submaps = read_submaps(folder)
     join(submaps[:2], method, polish=polish)  # modules and thread pools that load on first use
     gc.collect()

@@ -22,6 +22,7 @@ from graphslam.app.worlds import simulate as simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
+from graphslam.join.registry import join
 
 __all__ = [
     "compare",
@@ -73,11 +74,11 @@ def compare(
 
 
 def join_submaps(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
-    """Join submaps by one method; see :func:`graphslam.app.compare.join`."""
+    """Join submaps by one method; see :func:`graphslam.join.registry.join`."""
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
-        return comparing.join(s.submaps, method, **options)
+        return join(s.submaps, method, **options)
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.atomic import read_npz, write_npz
+from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, FormatError, GridError
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import Pieces, check_reach, grid_of, overlap, pieces_of
+from graphslam.evidence.compact import Pieces, check_reach, grid_of, overlap
 from graphslam.evidence.dense_kernels import dense_log_odds, dense_values, known_box
-from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.grid import FORMAT, EvidenceGrid
 from graphslam.evidence.layout import (
     BRICK_EDGE,
     BRICK_VOXELS,
@@ -27,8 +27,6 @@ from graphslam.evidence.layout import (
     half_edge,
 )
 from graphslam.evidence.pool import GridPool
-
-FORMAT = "graphslam.evidence/1"
 
 DENSE_LIMIT = 1 << 34
 """Largest dense array that is made [bytes]; a wish beyond it is a mistake in the bounds."""
@@ -211,34 +209,8 @@ def _steps_of(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
 # --- npz ---------------------------------------------------------------------------------------------------------
 
 
-def save_npz(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
-    """Write a grid as an npz archive: whole or not at all, and the same map always as the same bytes.
-
-    The archive holds no unknown brick, and a cube of one value as its corner, size and value only (format
-    ``graphslam.evidence/1``: arrays ``voxel_size``, ``dim``, ``levels``, ``model`` (hit, miss, clamp low, clamp high,
-    threshold), and those of `compact.Pieces`).
-    """
-    pieces = pieces_of(grid)
-    m = grid.model
-    write_npz(
-        path,
-        {
-            "format": FORMAT,
-            "voxel_size": np.float64(grid.voxel_size),
-            "dim": np.int64(grid.dim),
-            "levels": np.int64(grid.pool.levels),
-            "model": np.array([m.hit, m.miss, *m.clamp, m.threshold], np.float64),
-            "bricks": pieces.bricks.astype(np.int32),
-            "values": pieces.values,
-            "cubes": pieces.cubes.astype(np.int32),
-            "cube_log_edges": pieces.log_edges.astype(np.uint8),
-            "cube_values": pieces.cube_values.astype(np.int16),
-        },
-    )
-
-
 def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> EvidenceGrid:
-    """Read what :func:`save_npz` wrote.
+    """Read what `EvidenceGrid.save` wrote.
 
     Parameters
     ----------

@@ -8,11 +8,13 @@ particles share their history, and a submap that is entered again starts as a co
 from __future__ import annotations
 
 import math
+import os
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.atomic import write_npz
 from graphslam.core.errors import GridError, GridLockedError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
@@ -20,6 +22,7 @@ from graphslam.core.markup import element, join, pairs
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, own_grids, report_of
 from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.compact import pieces_of
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
 from graphslam.evidence.memory import Memory, memory
 from graphslam.evidence.merge import merge
@@ -27,6 +30,7 @@ from graphslam.evidence.pool import GridPool, RootBox
 from graphslam.evidence.scan import UpdateReport, point_rows, pose_row, scan_rows
 from graphslam.evidence.tree_kernels import gather_bricks, list_bricks, read_values, write_bricks
 
+FORMAT = "graphslam.evidence/1"
 _DEFAULT_MODEL = BeamModel()
 
 
@@ -338,11 +342,30 @@ class EvidenceGrid:
         """Memory of this grid, and what of it no other grid shares; for sets of grids, `memory.memory`."""
         return memory(self)
 
-    def save(self, path: Any) -> None:
-        """Write an ``.npz`` that `formats.load_npz` reads, without loss; what is of one value is written once."""
-        from graphslam.evidence.formats import save_npz
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an npz archive that `formats.load_npz` reads: whole or not at all, the same map always as the same
+        bytes.
 
-        save_npz(self, path)
+        The archive holds no unknown brick, and a cube of one value as its corner, size and value only (format
+        ``graphslam.evidence/1``: arrays ``voxel_size``, ``dim``, ``levels``, ``model`` (hit, miss, clamp low, clamp
+        high, threshold), and those of `compact.Pieces`).
+        """
+        pieces, m = pieces_of(self), self.model
+        write_npz(
+            path,
+            {
+                "format": FORMAT,
+                "voxel_size": np.float64(self.voxel_size),
+                "dim": np.int64(self.dim),
+                "levels": np.int64(self.pool.levels),
+                "model": np.array([m.hit, m.miss, *m.clamp, m.threshold], np.float64),
+                "bricks": pieces.bricks.astype(np.int32),
+                "values": pieces.values,
+                "cubes": pieces.cubes.astype(np.int32),
+                "cube_log_edges": pieces.log_edges.astype(np.uint8),
+                "cube_values": pieces.cube_values.astype(np.int16),
+            },
+        )
 
     def _repr_html_(self) -> str:
         counts, box, m = self.voxel_counts(), self.bounding_box(), self.memory()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from graphslam.core.errors import DataError
+from graphslam.loops.candidates import FRONT_END
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -189,3 +190,66 @@ class LoopLedger:
             row["margin"] = gates.get("margin", math.nan)
             rows.append(row)
         return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+DECIDED = "decided on with all loops"
+"""Why a factor of a front end's match is taken out where it is a loop among others from then on."""
+
+
+def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
+    """Ledger of all loops in the events of a graph; see :func:`loops_of_run`."""
+    ledger = LoopLedger.from_events(events, where=where)
+    number = 1 + max((d.loop for d in ledger.decisions), default=-1)
+    removed = {e.get("factor_id"): str(e.get("reason", "")) for e in events if e.get("event") == "removed"}
+    for e in events:
+        match = _match(e, number, removed)
+        if match is not None:
+            ledger.write(match)
+            number += 1
+    return ledger
+
+
+def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Decision | None:
+    """A front end's match that became a factor, or did not; None for other events."""
+    taken = e.get("event") == "between" and e.get("group") == "match"
+    if not taken and e.get("event") != "match-not-used":
+        return None
+
+    def figure(name: str) -> float:
+        value = e.get(name)
+        return math.nan if value is None else float(value)
+
+    fid = int(e.get("factor_id", -1))
+    gone = taken and fid in removed
+    if gone and removed[fid] == DECIDED:
+        return None  # it is among the loops
+    support = figure("support")
+    why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
+    return Decision(
+        loop=number,
+        verdict="undone" if gone else "accepted" if taken else "rejected",
+        why=why if taken else f"{why} is too little",
+        i=int(e.get("i", -1)),
+        j=int(e.get("j", -1)),
+        submap_i=int(e.get("target", -1)),
+        submap_j=int(e.get("submap", -1)),
+        source=FRONT_END,
+        score=support,
+        gates={"fitness": figure("fitness")},
+        weight=math.nan if taken and not gone else 0.0,
+        factor_id=-1 if gone or not taken else fid,
+    )
+
+
+def same_loop(d: Decision, ledger: LoopLedger) -> Decision | None:
+    """The loop of another ledger that is in the graph, between the same nodes, and found the same way; or None.
+
+    Numbers may differ where something else was tried in between; of several the one of that number is taken.
+    """
+    found = [x for x in ledger.current() if x.verdict == "accepted" and _identity(x) == _identity(d)]
+    found.sort(key=lambda x: x.loop != d.loop)
+    return found[0] if found else None
+
+
+def _identity(d: Decision) -> tuple[str, int, int, int, int]:
+    return d.source, d.submap_i, d.submap_j, d.i, d.j

@@ -8,13 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.compare import DEFAULT_METHODS, JSON_COLUMNS, compare, join, join_json, map_nees, methods_json
+from graphslam.app.compare import DEFAULT_METHODS, JSON_COLUMNS, compare, join_json, map_nees, methods_json
 from graphslam.app.memory import MemoryProbe
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.map_truth import MapTruth
 from graphslam.join.association import Association
+from graphslam.join.registry import join
 from tests.reference.submap_chain import submap_chain
 
 

@@ -22,7 +22,7 @@ import graphslam
 import graphslam.frontends
 from graphslam.app.run.run import GlobalMap, Run
 from graphslam.app.run.without_truth import WithoutTruth
-from graphslam.app.sessions.merge import MergedMap
+from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.studies.study import Study
 from graphslam.core.log import SensorLog, Truth

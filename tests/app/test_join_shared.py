@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.compare import join
 from graphslam.core.cluster import require_distributed
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.io.joined_map import read_joined
 from graphslam.io.submap_store import write_submaps
+from graphslam.join.registry import join
 from graphslam.sim.local_maps import simulate_local_maps
 
 

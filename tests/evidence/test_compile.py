@@ -6,10 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from graphslam.evidence import compile as compiling
+from graphslam.evidence import first_use
 from graphslam.evidence.mark_kernels import mark_grids
 from graphslam.evidence.pool import GridPool
 
@@ -31,7 +33,8 @@ def test_what_the_second_process_does_not_do_is_done_here(
     other: Process | None, here: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(compiling, "_start_other_half", lambda: other)
+    monkeypatch.setattr(compiling, "start_compiling", lambda part, start: other)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
     monkeypatch.setattr(compiling, "_first_half", lambda: [("a", lambda: done.append("a"))])
     monkeypatch.setattr(compiling, "_second_half", lambda: [("b", lambda: done.append("b"))])
     compiling.compile_kernels()
@@ -41,25 +44,50 @@ def test_what_the_second_process_does_not_do_is_done_here(
 
 def test_nothing_is_said_where_the_kernels_are_compiled(capfd: pytest.CaptureFixture[str]) -> None:
     GridPool()
-    assert compiling.is_compiled(mark_grids)
-    compiling._state["checked"] = False
+    assert first_use.is_compiled(mark_grids)
+    first_use._state["checked"] = False
     GridPool()
     assert capfd.readouterr().err == ""
 
 
-def test_the_second_process_starts_none_of_its_own(tmp_path: Path) -> None:
-    """With an empty cache it compiles by itself, or there would be no end to processes."""
+def test_code_older_than_its_source_is_compiled_again_and_announced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, code = tmp_path / "mark_kernels.py", tmp_path / "cache" / "mark_kernels.mark_grids-1.nbi"
+    code.parent.mkdir()
+    for file, seconds in ((source, 100), (code, 200)):
+        file.touch()
+        os.utime(file, (seconds, seconds))
+
+    def mark_grids() -> None: ...
+
+    kernel = SimpleNamespace(py_func=mark_grids, stats=SimpleNamespace(cache_path=str(code.parent)))
+    started: list[str] = []
+    monkeypatch.setattr(first_use, "mark_grids", kernel)
+    monkeypatch.setattr(first_use, "start_compiling", lambda part, start: started.append(part))
+    monkeypatch.setattr(first_use.inspect, "getsourcefile", lambda function: str(source))
+    for seconds, wanted in ((100, []), (300, ["all"])):
+        os.utime(source, (seconds, seconds))
+        first_use._state["checked"] = False
+        GridPool()
+        GridPool()
+        assert started == wanted
+
+
+@pytest.mark.parametrize("compiling_already", [False, True])
+def test_a_machine_without_code_is_told_once_and_processes_that_compile_start_none(
+    compiling_already: bool, tmp_path: Path
+) -> None:
+    """With an empty cache; or there would be no end to processes."""
     code = (
         "import subprocess\n"
-        "def refuse(*a, **k): raise SystemExit('a process of its own')\n"
-        "subprocess.Popen = refuse\n"
-        "from graphslam.evidence import compile as c\n"
-        "c._second_half = lambda: [('pool', c_pool)]\n"
-        "def c_pool():\n"
-        "    from graphslam.evidence.pool import GridPool\n"
-        "    GridPool()\n"
-        "c._as_other_half()\n"
+        "started = []\n"
+        "subprocess.run = lambda command, **k: started.append(command[-1])\n"
+        "from graphslam.evidence.pool import GridPool\n"
+        "GridPool(); GridPool()\n"
+        "print(started)\n"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    environment |= {first_use.COMPILING: "1"} if compiling_already else {}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ("[]" if compiling_already else "['all']"), done.stderr

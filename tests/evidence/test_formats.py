@@ -14,7 +14,7 @@ import pytest
 from graphslam.core.errors import FormatError, GridError
 from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.formats import DenseGrid, from_dense, known_bounds, load_npz, save_npz, to_dense
+from graphslam.evidence.formats import DenseGrid, from_dense, known_bounds, load_npz, to_dense
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import STEP, UNKNOWN
 from graphslam.evidence.map_server import save_map_server
@@ -156,11 +156,11 @@ def test_npz_gives_the_same_map(rng: np.random.Generator, tmp_path: Path, levels
 
 def test_npz_of_a_scanned_2d_grid(rng: np.random.Generator, tmp_path: Path) -> None:
     grid = scanned_grid(rng, dim=2)
-    save_npz(grid, tmp_path / "flat.npz")
+    grid.save(tmp_path / "flat.npz")
     back = load_npz(tmp_path / "flat.npz")
     assert back.dim == 2
     assert map_of_grid(back) == map_of_grid(grid)
-    save_npz(EvidenceGrid(0.1), tmp_path / "empty.npz")
+    EvidenceGrid(0.1).save(tmp_path / "empty.npz")
     assert map_of_grid(load_npz(tmp_path / "empty.npz")) == {}
 
 
@@ -177,23 +177,23 @@ def test_equal_maps_give_equal_bytes(rng: np.random.Generator, tmp_path: Path) -
     order = rng.permutation(len(one.brick_coordinates()))
     two.write_bricks(one.brick_coordinates()[order], one.brick_values()[order])
     for name, grid in (("a", one), ("b", two), ("c", load_npz_of(one, tmp_path))):
-        save_npz(grid, tmp_path / name)
+        grid.save(tmp_path / name)
     data = (tmp_path / "a").read_bytes()
     assert data == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
     del voxels[next(iter(voxels))]
-    save_npz(grid_of_map(voxels), tmp_path / "d")
+    grid_of_map(voxels).save(tmp_path / "d")
     assert data != (tmp_path / "d").read_bytes()
     assert len(map_of_grid(held)) == 2
 
 
 def load_npz_of(grid: EvidenceGrid, folder: Path) -> EvidenceGrid:
-    save_npz(grid, folder / "through.npz")
+    grid.save(folder / "through.npz")
     return load_npz(folder / "through.npz")
 
 
 def test_cubes_are_written_once(tmp_path: Path) -> None:
     """64³ equal voxels are one entry, not 512 bricks."""
-    save_npz(grid_of_map(cube((0, 0, 0), 32, 9) | {(-1, 0, 0): 2}), tmp_path / "cube.npz")
+    grid_of_map(cube((0, 0, 0), 32, 9) | {(-1, 0, 0): 2}).save(tmp_path / "cube.npz")
     with np.load(tmp_path / "cube.npz") as archive:
         assert archive["cubes"].tolist() == [[0, 0, 0]]
         assert archive["cube_log_edges"].tolist() == [5]
@@ -215,7 +215,7 @@ def test_a_submap_takes_a_grid_as_payload(rng: np.random.Generator, tmp_path: Pa
 def test_a_failed_write_leaves_the_old_file(rng: np.random.Generator, tmp_path: Path, monkeypatch: Any) -> None:
     path = tmp_path / "map.npz"
     grid = scanned_grid(rng)
-    save_npz(grid, path)
+    grid.save(path)
     before = path.read_bytes()
 
     def fail(*_: Any) -> None:
@@ -223,7 +223,7 @@ def test_a_failed_write_leaves_the_old_file(rng: np.random.Generator, tmp_path: 
 
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OSError, match="no space"):
-        save_npz(grid.empty(), path)
+        grid.empty().save(path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["map.npz"]
 
@@ -275,7 +275,7 @@ import sys
 import numpy as np
 from pathlib import Path
 from graphslam.evidence.compact import compact
-from graphslam.evidence.formats import load_npz, save_npz, to_dense
+from graphslam.evidence.formats import load_npz, to_dense
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_maps import cube, grid_of_map
@@ -283,11 +283,11 @@ folder = Path(sys.argv[1])
 voxels = cube((0, 0, 0), 16, 7) | cube((16, 0, 0), 16, 7) | {(-30, 5, 8): -4, (63, -64, 0): 5}
 grid = grid_of_map(voxels, levels=2)
 freed = compact(grid)
-save_npz(grid, folder / "map.npz")
+grid.save(folder / "map.npz")
 for suffix in (".bt", ".ot"):
     write_octomap(grid, folder / f"map{suffix}")
-    save_npz(read_octomap(folder / f"map{suffix}", pool=GridPool(2)), folder / f"back{suffix}")
-save_npz(load_npz(folder / "map.npz"), folder / "back.npz")
+    read_octomap(folder / f"map{suffix}", pool=GridPool(2)).save(folder / f"back{suffix}")
+load_npz(folder / "map.npz").save(folder / "back.npz")
 np.save(folder / "dense.npy", to_dense(grid, dtype=np.float32).values)
 print(freed)
 """

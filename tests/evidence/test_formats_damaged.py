@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import FormatError, MissingDataError
-from graphslam.evidence.formats import load_npz, save_npz
+from graphslam.evidence.formats import load_npz
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_maps import cube, grid_of_map, map_of_grid
@@ -21,7 +21,7 @@ from tests.reference.evidence_maps import cube, grid_of_map, map_of_grid
 @pytest.fixture
 def archive(tmp_path: Path) -> dict[str, np.ndarray]:
     """Arrays of a good file: a brick, a cube of 32³ and one of 8³."""
-    save_npz(grid_of_map(cube((0, 0, 0), 32, 9) | cube((40, 40, 40), 8, -3) | {(-1, 0, 0): 2}), tmp_path / "good.npz")
+    grid_of_map(cube((0, 0, 0), 32, 9) | cube((40, 40, 40), 8, -3) | {(-1, 0, 0): 2}).save(tmp_path / "good.npz")
     with np.load(tmp_path / "good.npz") as good:
         return {name: good[name] for name in good.files}
 
@@ -84,7 +84,7 @@ def test_every_field_is_checked(archive: dict[str, np.ndarray], tmp_path: Path, 
 
 def test_truncated_and_damaged_archives_are_refused(rng: np.random.Generator, tmp_path: Path) -> None:
     path = tmp_path / "bad.npz"
-    save_npz(grid_of_map({(0, 0, 0): 1}), path)
+    grid_of_map({(0, 0, 0): 1}).save(path)
     data = path.read_bytes()
     for n in range(0, len(data), 37):
         path.write_bytes(data[:n])

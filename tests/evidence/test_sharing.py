@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from graphslam.core.errors import GridError
-from graphslam.evidence import compile as compiling
-from graphslam.evidence import pool as pool_module
 from graphslam.evidence.aligned import LINE, aligned_empty, aligned_zeros
 from graphslam.evidence.batch import SERIAL_BATCH, update_grids
 from graphslam.evidence.beams import BeamModel
@@ -130,14 +126,3 @@ def test_voxels_begin_where_cache_lines_do(rng: np.random.Generator) -> None:
     assert zeros.flags.writeable
     assert not zeros.any()
     assert empty.shape == (0, 7)
-
-
-def test_code_of_an_older_source_is_announced_once_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[bool] = []
-    monkeypatch.setattr(compiling, "compile_kernels", lambda: said.append(True))
-    monkeypatch.setattr(compiling, "is_compiled", lambda kernel: True)
-    for misses, wanted in (({}, []), ({"signature": 1}, [True])):
-        monkeypatch.setattr(compiling, "mark_grids", SimpleNamespace(stats=SimpleNamespace(cache_misses=misses)))
-        monkeypatch.setitem(compiling._state, "checked", False)
-        pool_module.announce_compilation()
-        assert said == wanted

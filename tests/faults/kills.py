@@ -40,7 +40,7 @@ from graphslam.app.cli import app
 from graphslam.app.folders.generations import new_generation
 from graphslam.app.report.report import make_report
 from graphslam.app.run import outputs
-from graphslam.app.run.loops import loops_of_run
+from graphslam.app.run.files import loops_of_run
 from graphslam.app.sessions import merge_outputs
 from graphslam.app.studies import folder as study_folder
 from graphslam.app.studies.folder import StudyFolder

@@ -24,8 +24,7 @@ from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.config import read_toml
-from graphslam.app.run.files import read_merged_dense
-from graphslam.app.run.loops import loops_of_run
+from graphslam.app.run.files import loops_of_run, read_merged_dense
 from graphslam.app.run.outputs import open_run
 from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.studies.study import open_study
@@ -48,7 +47,7 @@ from graphslam.core.records import (
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.evidence.formats import load_npz, save_npz
+from graphslam.evidence.formats import load_npz
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
@@ -493,7 +492,7 @@ def a_grid() -> Any:
 
 
 def evidence(root: Path) -> None:
-    save_npz(a_grid(), root / "map.grid.npz")
+    a_grid().save(root / "map.grid.npz")
 
 
 def read_evidence(root: Path) -> Any:

@@ -12,11 +12,11 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.patches import Rectangle
 
 import graphslam as gs
-from graphslam.app.compare import join
 from graphslam.app.run.local_maps import first_particles, local_maps
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.submap_consistency import true_submap
+from graphslam.join.registry import join
 from graphslam.plots.gap import FLOOR, plot_convergence, plot_gap_along, plot_tree_gap
 from graphslam.plots.method_maps import plot_method_maps
 from graphslam.plots.particles import (

@@ -17,7 +17,7 @@ import numpy as np
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.compact import compact
-from graphslam.evidence.formats import load_npz, save_npz, to_dense
+from graphslam.evidence.formats import load_npz, to_dense
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.memory import memory
 from graphslam.evidence.octomap import read_octomap, write_octomap
@@ -92,7 +92,7 @@ def digest(threads: int = 1, dim: int = 3) -> dict[str, str]:
     out["memory"] = _hash(repr(memory(grids[:2])).encode())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.npz"
-        save_npz(g, path)
+        g.save(path)
         out["npz"] = _hash(path.read_bytes(), _grids([load_npz(path)]).encode())
         for suffix in (".bt", ".ot") if dim == 3 else ():
             path = Path(folder) / f"a{suffix}"

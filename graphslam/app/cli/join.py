@@ -35,13 +35,14 @@ def join(
     as_json: bool = JSON,
 ) -> None:
     """Join submaps into one map by one method."""
-    from graphslam.app import compare as comparing
+    from graphslam.app.compare import join_json
     from graphslam.app.submap_sources import submap_source
     from graphslam.io.joined_map import write_joined
+    from graphslam.join.registry import join as join_by
 
     s = submap_source(source)
     factor = s.covariance_scale if scale is None else scale
-    estimate = comparing.join(
+    estimate = join_by(
         s.submaps,
         method,
         polish=polish,
@@ -52,7 +53,7 @@ def join(
         progress=not as_json,
     )
     truth = s.truth if associate == "given" else None
-    value = comparing.join_json(s.submaps, method, estimate, truth=truth)
+    value = join_json(s.submaps, method, estimate, truth=truth)
     if out is not None:
         times = [m.interval[0] for m in s.submaps] + [s.submaps[-1].interval[1]]
         write_joined(out, times, estimate.poses, estimate.landmark_ids, estimate.landmarks)

@@ -27,7 +27,8 @@ def loops(
     as_json: bool = JSON,
 ) -> None:
     """Loops of a run: where each came from, its gates, χ², weight and effect, accepted or not, and why."""
-    from graphslam.app.run.loops import loops_of_run, redo_loop, undo_loop
+    from graphslam.app.run.files import loops_of_run
+    from graphslam.app.run.loops import redo_loop, undo_loop
     from graphslam.core.errors import ConfigError
 
     if undo is not None and redo is not None:

@@ -21,9 +21,9 @@ from graphslam.app.folders.generations import check_same, consistent
 from graphslam.app.hypotheses.alternatives import Alternative, Choice, built, choose, write_choice
 from graphslam.app.run import config as cfg
 from graphslam.app.run.back_end import BackEnd
+from graphslam.app.run.files import read_options
 from graphslam.app.run.imu_use import ImuPart, imus_of
-from graphslam.app.run.loops import ledger_of_events
-from graphslam.app.run.maps import RunMap, folder_options, solved_poses
+from graphslam.app.run.maps import RunMap, solved_poses
 from graphslam.app.run.run import Run
 from graphslam.app.run.taken import read_taken
 from graphslam.core.errors import MissingDataError
@@ -32,7 +32,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.loops.candidates import FRONT_END, TIE
 from graphslam.loops.graph_loops import GraphLoops
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import Decision, ledger_of_events
 from graphslam.loops.measure import Loop
 from graphslam.loops.rules import LoopConfig
 from graphslam.loops.ties import ties_entries
@@ -177,7 +177,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     Parameters
     ----------
     run : Run
-        Read back with its grids (`run_maps.map_of_folder`).
+        Read back with its grids (`remake_map.map_of_folder`).
     made : RunMap
         Its fused map.
     progress : bool
@@ -188,7 +188,7 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
     MissingDataError
         The graph of the run held GPS or an IMU, whose records are not in its folder: an older version wrote it.
     """
-    values: Mapping[str, Any] = folder_options(run.folder) if run.folder is not None else {}
+    values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
     gps: cfg.GpsConfig = cfg.build(cfg.GpsConfig, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
         raise MissingDataError(

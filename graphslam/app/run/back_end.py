@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from graphslam.app.run.config import BackEndConfig, GpsConfig
 from graphslam.app.run.imu_use import ImuPart, recentred
-from graphslam.app.run.loops import DECIDED, ledger_of_events, same_loop
 from graphslam.association.identity import doubtful_identities
 from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
@@ -27,7 +26,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, find_loops
-from graphslam.loops.ledger import Decision, LoopLedger
+from graphslam.loops.ledger import DECIDED, Decision, LoopLedger, ledger_of_events, same_loop
 from graphslam.loops.ties import TieConfig, ties_entries
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution

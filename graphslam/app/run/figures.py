@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from graphslam.app.run.plan_view import plan_pose, plan_submap
-from graphslam.app.run.run import Run
 from graphslam.core.geometry import rotation2, se2_transform
 from graphslam.core.log import Truth
 from graphslam.core.poses import group_of
@@ -21,6 +20,9 @@ from graphslam.plots.save import save
 from graphslam.plots.submaps import plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
 from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
+
+if TYPE_CHECKING:
+    from graphslam.app.run.run import Run
 
 # A dead-reckoned path this many times larger than the map would shrink the map to a dot.
 _MAX_STRETCH = 2.5

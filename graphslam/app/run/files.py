@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from graphslam.app.folders.generations import check_same
+from graphslam.app.folders.generations import check_same, consistent, outputs
 from graphslam.app.run.config import read_toml
 from graphslam.app.run.run import GlobalMap
 from graphslam.core.atomic import read_json, read_npz
@@ -27,7 +27,7 @@ from graphslam.core.reading import LARGEST, read_text
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
-from graphslam.loops.ledger import EVENT
+from graphslam.loops.ledger import EVENT, Decision, LoopLedger, ledger_of_events
 
 GENERATION_EVENT = "generation"
 """First line of ``events.jsonl``: which state of the folder it is of."""
@@ -403,3 +403,30 @@ def read_fixes(root: Path) -> Gps | None:
         return Gps(**a)
     except DataError as error:
         raise FormatError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None
+
+
+def loops_of_run(folder: str | Path) -> LoopLedger:
+    """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not.
+
+    Raises
+    ------
+    RunFolderError, DataError, FormatError
+    """
+    events = consistent(folder, lambda root: read_events(root, home=folder))
+    return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
+
+
+def undone_of_run(folder: str | Path) -> list[Decision]:
+    """Loops that were taken out of a finished run by hand; none where a run was not finished.
+
+    Raises
+    ------
+    DataError, FormatError
+        The folder's events are damaged.
+    """
+    if not (outputs(folder) / "events.jsonl").is_file():
+        return []
+    return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]
+
+
+RESUMED = "resumed_submaps"

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,13 @@ import numpy as np
 
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.config import MapConfig
-from graphslam.app.run.files import read_options
 from graphslam.app.run.metrics import Metrics
-from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.run import GlobalMap
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.submap import Submap
-from graphslam.evidence.formats import load_npz
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.io.submap_store import read_submaps
 from graphslam.maps.export import save_maps, storeys
 from graphslam.maps.fuse import FusedMap, fuse
 from graphslam.maps.pieces import DivisionConfig, PieceId
@@ -233,58 +230,6 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
     ax = plot_cut(grid, path, truth=truth, title=f"{name}: fused map, cut from the side")
     made.append(save(ax, figures / "fused_cut.png"))
     return made
-
-
-def map_of_folder(path: str | Path, *, heights: Callable[[MapConfig], MapConfig] | None = None) -> tuple[Run, RunMap]:
-    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their grids.
-
-    Parameters
-    ----------
-    path : path
-    heights : callable, optional
-        Changes the options that the run had.
-
-    Raises
-    ------
-    RunFolderError
-        Not a finished run.
-    MissingDataError
-        A run of a front end without grids, or one that left them out.
-    FormatError, DataError
-    """
-    from graphslam.app.run.outputs import open_run
-
-    run = open_run(path)
-    root = Path(path)
-    if not any((root / "submaps").glob("*.grid.npz")):
-        raise MissingDataError(
-            f"{root}: the run has no evidence grids to make a map of",
-            got=f"front end {run.report.get('frontend')}",
-            wanted="a run of a front end with grids: segslam, rbpf-grid",
-        )
-    submaps = read_submaps(root, load_grid=load_npz)
-    values = folder_options(root)
-    own = map_config(values)
-    made = make_run_map(submaps, run.map, reach=sensor_reach(values), config=heights(own) if heights else own)
-    return replace(run, submaps=submaps, fused=made), made
-
-
-def folder_options(root: Path) -> dict[str, Any]:
-    """``config.toml`` of a run folder; nothing where there is none."""
-    return read_options(root)
-
-
-def map_config(values: Mapping[str, Any]) -> MapConfig:
-    """Options of the map from those of a run."""
-    from graphslam.app.run.config import build
-
-    made: MapConfig = build(MapConfig, values.get("map", {}), "map")
-    return made
-
-
-def with_heights(config: MapConfig, low: float | None, high: float | None) -> MapConfig:
-    """The same options with other heights of the floor plans, where they are given [m]."""
-    return replace(config, low=config.low if low is None else low, high=config.high if high is None else high)
 
 
 def sensor_reach(values: Mapping[str, Any]) -> float | None:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from graphslam.app.folders.generations import Generation, consistent, new_generation
 from graphslam.app.folders.output_files import json_lines
+from graphslam.app.report.report import report_beside
 from graphslam.app.run.figures import save_figures
 from graphslam.app.run.files import (
     ASSOCIATION_FORMAT,
@@ -21,6 +22,7 @@ from graphslam.app.run.files import (
     GENERATION_EVENT,
     GPS_FORMAT,
     MAP_FORMAT,
+    RESUMED,
     check_state,
     read_association,
     read_events,
@@ -46,7 +48,6 @@ from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, wri
 from graphslam.io.tum import read_tum, write_tum
 
 logger = logging.getLogger(__name__)
-RESUMED = "resumed_submaps"
 OF_THE_CLOCK = ("seconds", RESUMED)
 """Parts of a run's report that are not in ``run.json``, which no clock and no kill changes, but in ``timings.json``."""
 
@@ -85,9 +86,7 @@ def write_outputs(folder: Path, run: Run) -> Run:
         if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
             for pattern in _MADE_OF_MAP:
                 new.adopt(only=pattern)
-        from graphslam.app.report.report import report_beside  # the page is made from the files, so they come first
-
-        report_beside(new)
+        report_beside(new)  # made from the files, so they come first
     return run
 
 

@@ -18,14 +18,13 @@ from graphslam.app.folders.lock import locked
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.files import read_options
+from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.front_to_back import FrontEndWork, front_to_back
 from graphslam.app.run.gps_use import split, used_fixes
 from graphslam.app.run.graph_facts import graph_facts
 from graphslam.app.run.imu_use import ImuPart, imu_metrics, imus_of
-from graphslam.app.run.loops import undone_of_run
 from graphslam.app.run.maps import RunMap, has_grids, make_run_map, sensor_reach
 from graphslam.app.run.metrics import (
     Metrics,

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.app.folders.generations import new_generation, outputs
 from graphslam.app.folders.lock import locked
 from graphslam.app.hypotheses.runs import Clearest, clearest_of_run, write_clearest
 from graphslam.app.report.report import report_beside
-from graphslam.app.run.maps import RunMap, draw_run_map, map_of_folder, with_heights, write_run_map
+from graphslam.app.run.config import MapConfig, build, merge
+from graphslam.app.run.files import read_options
+from graphslam.app.run.maps import (
+    RunMap,
+    draw_run_map,
+    make_run_map,
+    sensor_reach,
+    write_run_map,
+)
 from graphslam.app.run.outputs import open_run
+from graphslam.app.run.run import Run
+from graphslam.core.errors import MissingDataError
+from graphslam.evidence.formats import load_npz
+from graphslam.io.submap_store import read_submaps
 
 
 @dataclass(frozen=True)
@@ -66,7 +78,7 @@ def remake_map(
     if not (outputs(home) / "run.json").is_file():
         open_run(home)  # says what is wrong
     with locked(home):
-        run, made = map_of_folder(home, heights=lambda c: with_heights(c, low, high))
+        run, made = map_of_folder(home, low=low, high=high)
         found = clearest_of_run(run, made, progress=progress) if minimum_entropy else None
         with new_generation(home) as new:
             files = write_run_map(new, made, run.report.get("generation"))
@@ -82,3 +94,36 @@ def remake_map(
             report_beside(new)  # the page of the run shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
+
+
+def map_of_folder(path: str | Path, *, low: float | None = None, high: float | None = None) -> tuple[Run, RunMap]:
+    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their grids.
+
+    Parameters
+    ----------
+    path : path
+    low, high : float, optional
+        Heights of the floor plans above the path [m]; default the run's.
+
+    Raises
+    ------
+    RunFolderError
+        Not a finished run.
+    MissingDataError
+        A run of a front end without grids, or one that left them out.
+    FormatError, DataError
+    """
+    run = open_run(path)
+    root = Path(path)
+    if not any((root / "submaps").glob("*.grid.npz")):
+        raise MissingDataError(
+            f"{root}: the run has no evidence grids to make a map of",
+            got=f"front end {run.report.get('frontend')}",
+            wanted="a run of a front end with grids: segslam, rbpf-grid",
+        )
+    submaps = read_submaps(root, load_grid=load_npz)
+    values = read_options(root)
+    heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
+    config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")
+    made = make_run_map(submaps, run.map, reach=sensor_reach(values), config=config)
+    return replace(run, submaps=submaps, fused=made), made

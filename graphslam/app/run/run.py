@@ -112,7 +112,7 @@ class Run:
     checks : WithoutTruth or None
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
-        Fused evidence grid of submaps that have grids. For a run read back from disk: ``run_maps.map_of_folder``.
+        Fused evidence grid of submaps that have grids. For a run read back from disk: ``remake_map.map_of_folder``.
     """
 
     name: str

@@ -6,27 +6,25 @@ import logging
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from graphslam.app.run.outputs import open_run
-from graphslam.app.run.run import GlobalMap, Run, metric_value
+from graphslam.app.run.run import GlobalMap, Run
 from graphslam.app.sessions.dense import is_dense
 from graphslam.app.sessions.merge_align import By, align_runs, of_session
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
 from graphslam.app.sessions.merge_metrics import merge_metrics
+from graphslam.app.sessions.merged_map import MergedMap, Session
 from graphslam.app.threads import one_blas_thread
 from graphslam.association.identity import doubtful_identities
 from graphslam.association.merging import mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import element, frame, join
-from graphslam.evaluate.gauge import gauge_directions, inner_covariance
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.loops.sessions import Alignment
@@ -37,84 +35,6 @@ logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 IDENTITY_GATE = 25.0
 MERGE_GATE = 11.8
-
-
-@dataclass(frozen=True, slots=True)
-class Session:
-    """One run inside a merged map.
-
-    Parameters
-    ----------
-    name : str
-        Unique among the sessions.
-    run : Run
-    keys : tuple of int
-        Keys of its submaps in the common graph.
-    first_node : int
-        Node of its first base.
-    alignment : Alignment or None
-        Start value from the landmarks; None for the session whose first base is fixed.
-    map : GlobalMap
-        Its path in the common frame, with all landmarks of the merged map.
-    """
-
-    name: str
-    run: Run
-    keys: tuple[int, ...]
-    first_node: int
-    alignment: Alignment | None
-    map: GlobalMap
-
-
-@dataclass(frozen=True)
-class MergedMap:
-    """Result of :func:`graphslam.merge`: everything in the frame of the first run's first base.
-
-    Parameters
-    ----------
-    sessions : list of Session
-    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
-    landmark_sessions : (n,) int64
-        How many sessions saw it.
-    solution : Solution
-        One least-squares problem over all chains.
-    graph : PoseGraph
-    metrics : DataFrame
-    report : dict
-    """
-
-    sessions: list[Session]
-    landmark_ids: Ints
-    landmarks: Array
-    landmark_covariances: Array
-    landmark_sessions: Ints
-    solution: Solution
-    graph: PoseGraph
-    metrics: pd.DataFrame
-    report: dict[str, Any] = field(default_factory=dict)
-
-    def metric(self, key: str) -> float:
-        """Value of one metric; KeyError if there is none."""
-        return metric_value(self.metrics, key)
-
-    def plot(self, ax: Any = None) -> Any:
-        """Landmarks and the path of every session; the ellipses say how well the *shape* of the map is known."""
-        from graphslam.plots.merged import plot_merged
-
-        columns = self.solution.covariance.layout.columns_of([f"l{i}" for i in self.landmark_ids.tolist()])
-        centred = self.landmarks - self.landmarks.mean(axis=0)
-        P = inner_covariance(self.solution.covariance.columns(columns), gauge_directions(np.zeros((0, 3)), centred))
-        k = 2 * np.arange(len(centred))[:, None] + np.arange(2)
-        blocks = P[k[:, :, None], k[:, None, :]] + 1e-12 * np.eye(2)
-        paths = {s.name: s.map.trajectory for s in self.sessions}
-        return plot_merged(ax, paths, self.landmarks, blocks, self.landmark_sessions)
-
-    def __repr__(self) -> str:
-        shared = int(np.sum(self.landmark_sessions > 1))
-        return f"MergedMap({len(self.sessions)} sessions, {len(self.landmarks)} landmarks, {shared} of them shared)"
-
-    def _repr_html_(self) -> str:
-        return join([element("b", repr(self)), frame(self.metrics[["key", "value", "unit"]])])
 
 
 def merge(

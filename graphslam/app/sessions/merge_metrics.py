@@ -19,7 +19,7 @@ from graphslam.evaluate.trajectory_error import associate
 from graphslam.solve.solution import Solution
 
 if TYPE_CHECKING:
-    from graphslam.app.sessions.merge import Session
+    from graphslam.app.sessions.merged_map import Session
 
 
 def merge_metrics(

@@ -14,8 +14,8 @@ from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
 from graphslam.app.run.graph_facts import graph_facts
 from graphslam.app.run.outputs import landmarks_csv
-from graphslam.app.sessions.merge import MergedMap
 from graphslam.app.sessions.merge_dense import MergedSubmaps
+from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
 from graphslam.evaluate.without_truth import class_consistency

@@ -13,13 +13,12 @@ from graphslam.app.hypotheses.alternatives import Alternative, chi2_of, choose, 
 from graphslam.app.hypotheses.runs import LOOP, choices_of_matches, solve_choice
 from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.config import BackEndConfig, GpsConfig
-from graphslam.app.run.loops import ledger_of_events
 from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.noise import Robust
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import Decision, ledger_of_events
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps

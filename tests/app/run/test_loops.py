@@ -14,11 +14,13 @@ from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.config import BackEndConfig
-from graphslam.app.run.loops import ledger_of_events, loops_of_run, undo_loop
+from graphslam.app.run.files import loops_of_run
+from graphslam.app.run.loops import undo_loop
 from graphslam.core import se3
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.loops.ledger import ledger_of_events
 from tests.reference.box_submaps import mapped, straight_path
 from tests.reference.box_world import hall
 

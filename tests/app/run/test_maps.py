@@ -13,8 +13,9 @@ import pytest
 
 from graphslam.app.hypotheses.runs import choices_of_matches, clearest_of_run, solve_choice
 from graphslam.app.run import config as cfg
-from graphslam.app.run.maps import floor_bands, make_run_map, map_of_folder, nodes_by_submap, sensor_reach
+from graphslam.app.run.maps import floor_bands, make_run_map, nodes_by_submap, sensor_reach
 from graphslam.app.run.pipeline import run
+from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, DataError, MissingDataError

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import loops as app_loops
-from graphslam.app.run import pipeline
 from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.config import BackEndConfig
-from graphslam.app.run.loops import ledger_of_events
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Match, Submap
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import Decision, ledger_of_events
 from tests.app.run.test_loops import there_and_back
 
 C = np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 0.03]) ** 2
@@ -80,7 +78,7 @@ def test_a_match_is_undone_with_its_ties(
     asked: list[Decision] = []
     monkeypatch.setattr(app_loops, "loops_of_run", lambda folder: ledger_of_events(back.graph.events))
     monkeypatch.setattr(app_loops, "undone_of_run", lambda folder: undone)
-    monkeypatch.setattr(pipeline, "again", lambda folder, gone, progress: asked.extend(gone))
+    monkeypatch.setattr(app_loops, "again", lambda folder, gone, progress: asked.extend(gone))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
     tie = next(d.loop for d in undone if d.source == "tie")

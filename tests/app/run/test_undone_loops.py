@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphslam.app.run.loops import loops_of_run, redo_loop, undo_loop, undone_of_run
+from graphslam.app.run.files import loops_of_run, undone_of_run
+from graphslam.app.run.loops import redo_loop, undo_loop
 from graphslam.app.run.outputs import SAME_BYTES, open_run
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
