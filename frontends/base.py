@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import Submap
+
+Watch: TypeAlias = Callable[[Any], None]
+"""Takes the progress of a front end, of its own kind (``segslam``: `graphslam.frontends.segslam.progress.Progress`)."""
 
 
 @runtime_checkable
 class FrontEnd(Protocol):
     """A front end registered under the entry point ``graphslam.frontends``.
 
-    A front end is built from its configuration alone. Everything it draws comes from ``seed.child(key of the submap)``
-    and a submap depends on nothing but the log and the end of the one before, so that a run resumed after submap k is
-    the run that was never stopped.
+    Classes inherit from it. A front end is built from its configuration alone. Everything it draws comes from
+    ``seed.child(key of the submap)`` and a submap depends on nothing but the log and the end of the one before, so that
+    a run resumed after submap k is the run that was never stopped.
     """
 
-    name: str
+    name: ClassVar[str]
     config: Any
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """Yield submaps in order.
 
@@ -33,5 +43,14 @@ class FrontEnd(Protocol):
             The last submap that is already there; the next one starts at its end.
         drops : DropCounter or None
             Where records that are not used are counted.
+        watch : callable or None
+            Called with the front end's own progress after every step that it can show; changes nothing.
         """
         ...
+
+    def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
+        """Name of the stream of landmarks that it reads, and the observations in it; None where it tells none.
+
+        They are what ``sightings`` of its submaps are counted in, so that their identities can be audited.
+        """
+        return None

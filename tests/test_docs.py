@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from graphslam.app.run import config as cfg
+from graphslam.backend.config import BackEndConfig
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,7 +124,7 @@ assert low < nees < high, (low, nees, high)
 def test_options_of_the_how_to_exist_with_the_values_it_gives() -> None:
     rows = re.findall(r"^\| `((?:frontend|backend)\.[\w.]+)`(?:, `\.(\w+)`)? \| ([^|]+) \|", page("how-to.md"), re.M)
     assert len(rows) >= 7
-    roots = {"frontend": RbpfEkfConfig(), "backend": cfg.BackEndConfig()}
+    roots = {"frontend": RbpfEkfConfig(), "backend": BackEndConfig()}
     for key, second, stated in rows:
         first, *rest = key.split(".")
         for option in [rest, [*rest[:-1], second]] if second else [rest]:

@@ -27,6 +27,7 @@ STOREY = {
     "graphslam.io": 6,
     "graphslam.sim": 6,
     "graphslam.plots": 7,
+    "graphslam.backend": 7,
     "graphslam.app": 8,
 }
 # third-party packages and the only places that may import them

@@ -24,6 +24,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.grid.ancestry import Ancestry
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter import GridFilter, GridParticles, Tally
@@ -250,7 +251,7 @@ class RbpfGridConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RbpfGrid:
+class RbpfGrid(FrontEnd):
     """The front end ``rbpf-grid``: the whole log as one submap with an evidence grid.
 
     Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion.
@@ -260,7 +261,13 @@ class RbpfGrid:
     name: ClassVar[str] = "rbpf-grid"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:

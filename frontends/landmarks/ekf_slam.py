@@ -17,6 +17,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam.frontends.landmarks.ekf_filter import EkfMap
 from graphslam.frontends.landmarks.prepare import Prepared, known_slots, prepare
@@ -192,7 +193,7 @@ class _Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Ekf:
+class Ekf(FrontEnd):
     """The front end ``ekf``: EKF local maps, each a Gaussian in the frame of its base.
 
     Needs a stream of motion and one of landmark observations or, with the tree detector, of laser scans. Draws no
@@ -207,7 +208,13 @@ class Ekf:
     name: ClassVar[str] = "ekf"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`."""
         data = _prepare(log, self.config, drops)
@@ -243,7 +250,7 @@ class Ekf:
 
 
 @dataclass(frozen=True, slots=True)
-class EkfSlam:
+class EkfSlam(FrontEnd):
     """The front end ``ekf-slam``: one EKF map over the whole log, handed over as a single submap.
 
     Parameters
@@ -259,7 +266,13 @@ class EkfSlam:
     name: ClassVar[str] = "ekf-slam"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`; there is nothing after the one submap."""
         if after is not None:

@@ -16,6 +16,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 from graphslam.frontends.landmarks.filter import ParticleSet
 from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
@@ -29,7 +30,7 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class RbpfEkf:
+class RbpfEkf(FrontEnd):
     """The front end ``rbpf-ekf``.
 
     Needs a stream of controls and one of landmark observations or, with the tree detector, of laser scans.
@@ -39,7 +40,13 @@ class RbpfEkf:
     name: ClassVar[str] = "rbpf-ekf"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`."""
         for submap, _ in self.with_particles(log, seed=seed, after=after, drops=drops):

@@ -20,6 +20,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.config import RbpfSlamConfig
 from graphslam.frontends.landmarks.lineage import WholeMapParticles
 from graphslam.frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
@@ -132,7 +133,7 @@ def rbpf_snapshots(
 
 
 @dataclass(frozen=True, slots=True)
-class RbpfSlam:
+class RbpfSlam(FrontEnd):
     """The front end ``rbpf-slam``: the whole log as one submap.
 
     Needs a stream of controls or odometry, and one of landmark observations or, with the tree detector, of laser scans.
@@ -142,7 +143,13 @@ class RbpfSlam:
     name: ClassVar[str] = "rbpf-slam"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:

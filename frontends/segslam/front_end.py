@@ -9,12 +9,12 @@ from typing import ClassVar
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
+from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.segslam.config import SegSlamConfig
-from graphslam.frontends.segslam.progress import Watch
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
@@ -35,7 +35,7 @@ class SegSlamFrontEndConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SegSlam:
+class SegSlam(FrontEnd):
     """The front end ``segslam``.
 
     Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. Particles decide late
@@ -44,17 +44,21 @@ class SegSlam:
     """
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
-    watch: Watch | None = field(default=None, compare=False, repr=False)
-    """Called after every step of the filter with how far it is; changes nothing."""
     name: ClassVar[str] = "segslam"
 
     def submaps(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`~graphslam.frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
         c = self.config
         steps = checked_steps(log, c.steps, drops)
-        result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=self.watch)
+        result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=watch)
         for submap in settled(result, c.drift, c.segslam):
             if submap.key == 0:
                 submap = with_findings(submap, steps)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -55,7 +53,3 @@ class Progress:
             out.append(g.compose(np.broadcast_to(base, local.shape), local))
             base = g.compose(base, g.between(entry, base_of(self.segmap, s.T_exit)))
         return out
-
-
-Watch: TypeAlias = Callable[[Progress], None]
-"""Called after every step."""

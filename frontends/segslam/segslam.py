@@ -21,12 +21,13 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
+from graphslam.frontends.base import Watch
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter import GridFilter
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.segslam.config import SegSlamConfig
 from graphslam.frontends.segslam.matching import Attempt, Matcher
-from graphslam.frontends.segslam.progress import Progress, Watch
+from graphslam.frontends.segslam.progress import Progress
 from graphslam.frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
 from graphslam.frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
 from graphslam.frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
+from graphslam.backend.back_end import Observer
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
@@ -60,12 +61,12 @@ def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool
     truth = None if log.truth is None else log.truth.trajectory
     with DemoProgress(out / "figures" / "progress.png", truth, shown=progress) as watch:
         return run(
-            log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=False, watch=watch
+            log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=False, observers=[watch]
         )
 
 
 @dataclass
-class DemoProgress:
+class DemoProgress(Observer):
     """One line on stderr that says where the demo is, and a picture of the segments so far.
 
     Parameters
@@ -92,7 +93,7 @@ class DemoProgress:
     def __exit__(self, *_: object) -> None:
         self.bar.close()
 
-    def __call__(self, at: Progress) -> None:
+    def front_end_at(self, at: Progress) -> None:
         """After every step of the filter."""
         if self.bar.total is None:
             self.bar.total = at.steps

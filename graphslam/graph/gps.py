@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.config import spelled
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import Robust
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,7 @@ class GpsConfig:
         A pause longer than this [s] starts a new segment.
     """
 
-    robust: Robust = NO_KERNEL
+    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
     sigma: float | None = None
     baseline: float = 20.0
     bias_sigma: float | None = None

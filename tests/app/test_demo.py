@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from graphslam.app.demo import DemoProgress, demo_log
-from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.core.config import merge
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
@@ -43,7 +43,7 @@ def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:
 def test_watching_changes_nothing_and_sees_the_chain() -> None:
     log = demo_log("quick", 3)
     options = recommended(log, "segslam")["frontend"]
-    options = cfg.merge(options, {"filter": {"particles": 2}})
+    options = merge(options, {"filter": {"particles": 2}})
     config = make_front_end("segslam", options).config
     steps = make_steps(log, config.steps)
     seen: list[tuple[int, int, list[np.ndarray]]] = []
@@ -85,7 +85,7 @@ def test_picture_is_drawn_when_a_segment_ends_and_stays_whole(tmp_path: Path, mo
     picture = tmp_path / "figures" / "progress.png"
     with DemoProgress(picture, Trajectory(np.array([0.0, 1.0]), poses), shown=False) as watch:
         for k, n in enumerate([0, 0, 1, 1, 1, 2]):
-            watch(Fake(k + 1, n))  # type: ignore[arg-type]
+            watch.front_end_at(Fake(k + 1, n))  # type: ignore[arg-type]
             assert picture.is_file() == (n > 0)
     assert drawn == [1, 2]
     assert [p.name for p in picture.parent.iterdir()] == ["progress.png"]

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.config import BackEndConfig
 from graphslam.association.identity import doubtful_identities, identity_statistics
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig
 from graphslam.core.errors import DataError
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.pose_graph import PoseGraph

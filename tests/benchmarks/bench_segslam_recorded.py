@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import recommended
+from graphslam.core.config import build
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -49,7 +49,7 @@ RANDOM_PAIRS = 5000
 
 def settings(log: SensorLog, particles: int | None = None) -> SegSlamFrontEndConfig:
     """The preset of a log for the front end ``segslam``."""
-    c: SegSlamFrontEndConfig = cfg.build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    c: SegSlamFrontEndConfig = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
     return c if particles is None else dataclasses.replace(c, filter=dataclasses.replace(c.filter, particles=particles))
 
 

@@ -23,13 +23,13 @@ import scipy.sparse as sp
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
-from graphslam.app.run.config import read_toml
 from graphslam.app.run.files import loops_of_run, read_merged_dense
 from graphslam.app.run.outputs import open_run
 from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
+from graphslam.core.config import read_toml
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
@@ -269,12 +269,13 @@ def report_of_run(root: Path) -> Any:
 
 def read_config(root: Path) -> Any:
     """What a resumed run does first."""
-    from graphslam.app.run import config as cfg
     from graphslam.app.run.files import read_options
+    from graphslam.backend.config import BackEndConfig, GpsOptions
+    from graphslam.core.config import build
 
     values = read_options(root)
-    for part, kind in (("backend", cfg.BackEndConfig), ("gps", cfg.GpsConfig)):
-        cfg.build(kind, values.get(part, {}), part)
+    for part, kind in (("backend", BackEndConfig), ("gps", GpsOptions)):
+        build(kind, values.get(part, {}), part)
     return read_toml(root / "config.toml")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.terminal import emit, table, verdict_text
-from graphslam.app.run import config as cfg
+from graphslam.core.config import merge, parse_setting, read_toml
 from graphslam.core.reading import set_size_limit
 
 
@@ -80,10 +80,10 @@ def run(
 
 
 def _options(config: Path | None, settings: list[str]) -> dict[str, Any]:
-    values: dict[str, Any] = cfg.read_toml(config) if config else {}
+    values: dict[str, Any] = read_toml(config) if config else {}
     values.pop("run", None)  # an effective config.toml of another run may be given as it is
     for text in settings:
-        values = cfg.merge(values, cfg.parse_setting(text))
+        values = merge(values, parse_setting(text))
     return values
 
 
@@ -165,7 +165,7 @@ def simulate(
 
     changes: dict[str, Any] = {}
     for text in setting:
-        changes |= cfg.parse_setting(text)
+        changes |= parse_setting(text)
     log = make(world, seed=seed, preset=preset, layout=layout, progress=not as_json, **changes)
     write_simulated(log, out)
     streams = {name: len(s.times) for name, s in log.streams.items()}

@@ -17,9 +17,9 @@ from typing import Any
 from scipy import stats
 
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.config import BackEndConfig, GpsConfig
-from graphslam.app.run.imu_use import ImuPart
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.streams import ImuPart
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -170,7 +170,7 @@ def built(
     config: BackEndConfig,
     *,
     fixes: Gps | None = None,
-    gps: GpsConfig | None = None,
+    gps: GpsOptions | None = None,
     imu: ImuPart | None = None,
 ) -> BackEnd:
     """A back end with a graph of submaps, not yet at its optimum.
@@ -181,13 +181,13 @@ def built(
     config : BackEndConfig
     fixes : Gps, optional
         Those that count.
-    gps : GpsConfig, optional
+    gps : GpsOptions, optional
     imu : ImuPart, optional
         Of this graph alone.
     """
     back = BackEnd(config, "batch", imu=imu)
     if fixes is not None:
-        back.add_gps(fixes, GpsConfig() if gps is None else gps)
+        back.add_gps(fixes, GpsOptions() if gps is None else gps)
     for s in submaps:
         if fixes is None:
             back.append(s)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from graphslam.app.hypotheses.alternatives import CONTRADICTION, Alternative, Choice, built, choose
-from graphslam.app.run.config import BackEndConfig
+from graphslam.backend.config import BackEndConfig
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel

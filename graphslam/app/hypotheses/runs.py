@@ -19,13 +19,14 @@ from tqdm import tqdm
 
 from graphslam.app.folders.generations import check_same, consistent
 from graphslam.app.hypotheses.alternatives import Alternative, Choice, built, choose, write_choice
-from graphslam.app.run import config as cfg
-from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.files import read_options
-from graphslam.app.run.imu_use import ImuPart, imus_of
 from graphslam.app.run.maps import RunMap, solved_poses
 from graphslam.app.run.run import Run
 from graphslam.app.run.taken import read_taken
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
+from graphslam.backend.streams import ImuPart, imus_of
+from graphslam.core.config import build
 from graphslam.core.errors import MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.records import Gps
@@ -124,12 +125,12 @@ def choices_of_matches(
 def solve_choice(
     submaps: Sequence[Submap],
     chosen: Chosen,
-    config: cfg.BackEndConfig,
+    config: BackEndConfig,
     *,
     loops: Sequence[Decision] = (),
     decided: Sequence[Decision] = (),
     fixes: Gps | None = None,
-    gps: cfg.GpsConfig | None = None,
+    gps: GpsOptions | None = None,
     imu: ImuPart | None = None,
 ) -> BackEnd:
     """The graph of submaps with some of their matches and loops, solved to its optimum.
@@ -189,19 +190,19 @@ def clearest_of_run(run: Run, made: RunMap, *, progress: bool = True) -> Cleares
         The graph of the run held GPS or an IMU, whose records are not in its folder: an older version wrote it.
     """
     values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
-    gps: cfg.GpsConfig = cfg.build(cfg.GpsConfig, values.get("gps", {}), "gps")
+    gps: GpsOptions = build(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
         raise MissingDataError(
             f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
-    imu: cfg.ImuConfig = cfg.build(cfg.ImuConfig, values.get("imu", {}), "imu")
+    imu: ImuOptions = build(ImuOptions, values.get("imu", {}), "imu")
     imus: dict[str, Imu] = {}
     if imu.use != "none" and run.folder is not None:
         taken, generation = consistent(run.folder, read_taken)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
         imus = imus_of(taken.log)
-    config: cfg.BackEndConfig = cfg.build(cfg.BackEndConfig, values.get("backend", {}), "backend")
+    config: BackEndConfig = build(BackEndConfig, values.get("backend", {}), "backend")
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
     decided = [d for d in ledger if d.verdict == "accepted" and d.source == FRONT_END and d.T_ij]

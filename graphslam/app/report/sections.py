@@ -11,10 +11,10 @@ import pandas as pd
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import compact, folded, missing, note, section
 from graphslam.app.report.verdict import figures_of, stopped
-from graphslam.app.run.config import dump_toml
 from graphslam.app.run.files import RESUMED
 from graphslam.app.run.metrics import is_time
 from graphslam.app.run.verdict import CONFIDENCE, class_rows
+from graphslam.core.config import dump_toml
 from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.ledger import EXCLUSIVE

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +12,7 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam.frontends.base import FrontEnd
 from graphslam.io.catalog import locate
 from graphslam.io.victoria_park_published import read_slsjf_observations
 
@@ -47,16 +47,16 @@ def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints
     return np.where(rows >= 0, published.ids[rows], -1)
 
 
-def reference_identities(log: SensorLog, front: Any) -> Ints | None:
+def reference_identities(log: SensorLog, front: FrontEnd) -> Ints | None:
     """Identity of every observation that a front end read ``(q,)``, by a reference that it never saw; None = nowhere.
 
     Parameters
     ----------
     log : SensorLog
-    front : front end
-        One without ``observations`` sees no landmarks.
+    front : FrontEnd
     """
-    return reference_labels(log, front.observations(log)[1]) if hasattr(front, "observations") else None
+    seen = front.observations(log)
+    return None if seen is None else reference_labels(log, seen[1])
 
 
 def audit_association(out: Metrics, reference: Ints, observation: Ints, landmark: Ints) -> None:

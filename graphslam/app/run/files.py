@@ -16,9 +16,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.folders.generations import check_same, consistent, outputs
-from graphslam.app.run.config import read_toml
 from graphslam.app.run.run import GlobalMap
 from graphslam.core.atomic import read_json, read_npz
+from graphslam.core.config import read_toml
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.core.geometry import Array
 from graphslam.core.json_file import check_json, parse_json, read_json_lines

@@ -16,8 +16,8 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_links, is_empty, outputs, sweep
 from graphslam.app.folders.lock import locked, make_folder
-from graphslam.app.run.config import dump_toml, read_toml
 from graphslam.core.atomic import atomic_open
+from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
 from graphslam.io.submap_store import GridLoader, SubmapStore
 

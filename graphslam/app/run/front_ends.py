@@ -8,7 +8,8 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from graphslam.app.run import config as cfg
-from graphslam.core.errors import GraphSlamError, UnknownNameError
+from graphslam.core.config import build, merge
+from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.frontends.base import FrontEnd
 
@@ -40,7 +41,11 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
     UnknownNameError, ConfigError
     """
     kind, config_type = _kind(name)
-    made: FrontEnd = kind(config=cfg.build(config_type, options, "frontend"))
+    made = kind(config=build(config_type, options, "frontend"))
+    if not isinstance(made, FrontEnd):
+        raise ConfigError(
+            f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam.frontends.base.FrontEnd"
+        )
     return made
 
 
@@ -57,5 +62,5 @@ def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
     if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):
         scale = float(noise.get("scale", 1.0))
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
-        values = cfg.merge({"frontend": {"motion": motion}}, values)
+        values = merge({"frontend": {"motion": motion}}, values)
     return values

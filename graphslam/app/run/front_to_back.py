@@ -10,15 +10,36 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.folder import RunFolder
+from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
+from graphslam.frontends.base import FrontEnd
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
+
+
+class ProgressBar(Observer):
+    """How much of the log is in the graph, on stderr."""
+
+    def __init__(self, log: SensorLog, shown: bool) -> None:
+        first, last = log.interval
+        self.bar = tqdm(total=round(last - first, 1), unit="s", desc=log.name, disable=not shown, leave=False)
+        self.bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
+
+    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+        """A step."""
+        self.bar.update(submap.interval[1] - submap.interval[0])
+        self.bar.set_postfix(submaps=len(graph.submaps), landmarks=len(graph.values.landmarks))
+
+    def solved(self, solution: Solution) -> None:
+        """The end."""
+        self.bar.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +62,11 @@ class FrontEndWork:
 
 def front_to_back(
     log: SensorLog,
-    front: Any,
+    front: FrontEnd,
     back: BackEnd,
     seed: SeedTree,
     folder: RunFolder | None,
     drops: DropCounter,
-    progress: bool,
     with_grids: bool,
 ) -> tuple[list[Submap], FrontEndWork]:
     """Feed every submap to the back end as soon as it is finished and stored."""
@@ -54,16 +74,18 @@ def front_to_back(
     submaps = store.complete_prefix() if store is not None else []
     if store is not None:
         store.truncate(len(submaps))
-    t_first, t_last = log.interval
-    bar = tqdm(total=round(t_last - t_first, 1), unit="s", desc=log.name, disable=not progress, leave=False)
     for s in submaps:
         back.add(s)
     if submaps:
         logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
-        bar.update(submaps[-1].interval[1] - t_first)
-    bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
     front_s, resumed, cost = 0.0, len(submaps), []
-    stream = front.submaps(log, seed=seed.child("frontend"), after=submaps[-1] if submaps else None, drops=drops)
+
+    def watch(at: Any) -> None:
+        for o in back.observers:
+            o.front_end_at(at)
+
+    last = submaps[-1] if submaps else None
+    stream = front.submaps(log, seed=seed.child("frontend"), after=last, drops=drops, watch=watch)
     while True:
         start = time.perf_counter()
         submap = next(stream, None)
@@ -76,7 +98,4 @@ def front_to_back(
         back.add(submap)
         submaps.append(submap)
         cost.append(spent / max(int(submap.report.get("scans", 1)), 1))
-        bar.update(submap.interval[1] - submap.interval[0])
-        bar.set_postfix(submaps=len(submaps), landmarks=len(back.graph.values.landmarks))
-    bar.close()
     return submaps, FrontEndWork(front_s, resumed, np.array(cost[1:]))

@@ -12,6 +12,7 @@ from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.threads import one_blas_thread
+from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -21,9 +22,7 @@ from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
 
 
 def _front_end(log: SensorLog, frontend: str, options: Mapping[str, Any] | None) -> Any:
-    settings: cfg.RunConfig = cfg.build(
-        cfg.RunConfig, cfg.merge(recommended(log, frontend), {"frontend": options or {}})
-    )
+    settings: cfg.RunConfig = build(cfg.RunConfig, merge(recommended(log, frontend), {"frontend": options or {}}))
     return make_front_end(frontend, settings.frontend)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from graphslam.app.run.plan_view import plan_path, plan_pose
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
-from graphslam.core.log import SensorLog
+from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
@@ -25,7 +26,11 @@ from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
 from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.trajectory_error import ate
+from graphslam.evaluate.without_truth import class_consistency, two_sided
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
 
 TRUTH_GAP = 0.5
 """Between records of truth farther apart than this the true pose is unknown [s]."""
@@ -300,4 +305,41 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
         quarter = len(cost) // 4
         out.add(
             "frontend_last_to_first_quarter", float(np.median(cost[-quarter:]) / np.median(cost[:quarter])), "x", "one"
+        )
+
+
+def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
+    """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
+    said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
+    for stream in graph.imus:
+        states = graph.imu_states(stream)
+        mine = [e for e in said if e["stream"] == stream]
+        for reason, n in (mine[-1]["dropped"] if mine else {}).items():
+            drops.drop(stream, f"no factor: {reason}", n)
+        if not states.order:
+            continue
+        row = states.bias[states.order[-1]]
+        bias, P = graph.values.imu_biases[row], graph.covariance().marginal(f"imubias{row}")
+        sigma = np.sqrt(np.diag(P))
+        prefix = stream if stream.startswith("imu") else f"imu_{stream}"
+        out.add(f"{prefix}_nodes", len(states.order))
+        for name, part, unit in (("gyro", slice(0, 3), "rad/s"), ("force", slice(3, 6), "m/s²")):
+            out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
+            out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
+        graph.note("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
+    _contradiction(graph)
+
+
+def _contradiction(graph: PoseGraph) -> None:
+    """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
+    ways = class_consistency(graph).get("imu") if graph.imus else None
+    if ways is None or not np.isfinite(ways.ratio):
+        return
+    high = two_sided(ways.ratio, ways.dof, 0.999)[1]
+    if ways.ratio > high:
+        graph.note("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
+        logger.warning(
+            "submaps and IMU contradict each other (χ²/dof %.1f, at most %.1f): one of them states too little noise",
+            ways.ratio,
+            high,
         )

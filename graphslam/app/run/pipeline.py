@@ -5,26 +5,22 @@ from __future__ import annotations
 import logging
 import time
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.app.folders.generations import consistent
 from graphslam.app.folders.lock import locked
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
-from graphslam.app.run.back_end import BackEnd
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.run.front_to_back import FrontEndWork, front_to_back
-from graphslam.app.run.gps_use import split, used_fixes
+from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_back
 from graphslam.app.run.graph_facts import graph_facts
-from graphslam.app.run.imu_use import ImuPart, imu_metrics, imus_of
 from graphslam.app.run.maps import RunMap, has_grids, make_run_map, sensor_reach
 from graphslam.app.run.metrics import (
     Metrics,
@@ -32,6 +28,7 @@ from graphslam.app.run.metrics import (
     flag_counts,
     front_end_metrics,
     gps_metrics,
+    imu_metrics,
     map_truth,
     solution_metrics,
     time_metrics,
@@ -49,6 +46,9 @@ from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.versions import versions
+from graphslam.backend.back_end import BackEnd, Observer
+from graphslam.backend.streams import ImuPart, imus_of, split, used_fixes
+from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.findings import verdict_json
 from graphslam.core.json_file import check_json
@@ -60,6 +60,7 @@ from graphslam.evaluate.landmark_checks import sighting_findings
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evidence.formats import load_npz
+from graphslam.frontends.base import FrontEnd
 from graphslam.io.catalog import load
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
@@ -80,7 +81,7 @@ def run(
     resume: bool = False,
     progress: bool = True,
     undo: Sequence[int | Decision] | None = None,
-    watch: Callable[[Any], None] | None = None,
+    observers: Sequence[Observer] = (),
 ) -> Run:
     """Run a front end over a log, join its submaps in a graph, and score what can be scored.
 
@@ -102,9 +103,9 @@ def run(
     undo : sequence of int or Decision, optional
         Loops that are taken out again at the end, by their numbers in the ledger of loops, or as an earlier ledger has
         them. By default those that were undone before where the run is resumed, none otherwise.
-    watch : callable, optional
-        Handed to a front end that can be watched (``segslam``: `graphslam.frontends.segslam.progress`); others ignore
-        it.
+    observers : sequence of Observer
+        Told what goes on while it does: steps of a front end that can be watched, submaps, loops, the solution
+        (`graphslam.backend.back_end.Observer`).
 
     Raises
     ------
@@ -112,7 +113,7 @@ def run(
         Or one of its children; says what, where, got, wanted.
     """
     with one_blas_thread():
-        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, watch)
+        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, observers)
 
 
 def _run(
@@ -125,47 +126,44 @@ def _run(
     resume: bool,
     progress: bool,
     undo: Sequence[int | Decision] | None,
-    watch: Callable[[Any], None] | None,
+    observers: Sequence[Observer],
 ) -> Run:
     begin = time.perf_counter()
     log = load_log_source(source)
     seconds = {"load": time.perf_counter() - begin}
-    options = cfg.merge(recommended(log, frontend), config)
-    settings: cfg.RunConfig = cfg.build(cfg.RunConfig, options)
-    front: Any = make_front_end(frontend, settings.frontend)
-    if watch is not None and hasattr(front, "watch"):
-        front = replace(front, watch=watch)
+    options = merge(recommended(log, frontend), config)
+    settings: cfg.RunConfig = build(cfg.RunConfig, options)
+    front = make_front_end(frontend, settings.frontend)
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     noticed = check_streams(log)
-    back = _back_end(log, settings, solver)
+    back = _back_end(log, settings, solver, [ProgressBar(log, progress), *observers])
     if out is None:
-        return _made(log, front, back, settings, effective, None, seconds, begin, progress, undo or (), noticed)
+        return _made(log, front, back, settings, effective, None, seconds, begin, undo or (), noticed)
     effective["run"]["log"] = log_digest(log)
-    effective = tomllib.loads(cfg.dump_toml(effective))  # as it comes back from the folder, order and all
+    effective = tomllib.loads(dump_toml(effective))  # as it comes back from the folder, order and all
     with RunFolder.start(out, effective, resume=resume) as folder:
         if undo is None:  # what was taken out of a run stays out when it is gone on with
             undo = undone_of_run(folder.path) if resume else ()
-        result = _made(log, front, back, settings, effective, folder, seconds, begin, progress, undo, noticed)
+        result = _made(log, front, back, settings, effective, folder, seconds, begin, undo, noticed)
         return write_outputs(folder.path, result)
 
 
 def _made(
     log: SensorLog,
-    front: Any,
+    front: FrontEnd,
     back: BackEnd,
     settings: cfg.RunConfig,
     effective: dict[str, Any],
     folder: RunFolder | None,
     seconds: dict[str, float],
     begin: float,
-    progress: bool,
     undo: Sequence[int | Decision],
     noticed: Sequence[Noticed],
 ) -> Run:
     """Submaps of the front end, in the graph of the back end, solved and judged."""
     drops = DropCounter()
     tree, grids = SeedTree(effective["run"]["seed"]), _with_grids(settings)
-    submaps, work = front_to_back(log, front, back, tree, folder, drops, progress, grids)
+    submaps, work = front_to_back(log, front, back, tree, folder, drops, grids)
     if not submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
     taken = take(log, drops.counts, reference_identities(log, front), noticed)
@@ -202,20 +200,20 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
         effective = read_options(root)
         wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
         said = check_json(effective, wanted, str(root / CONFIG))["run"]
-        settings: cfg.RunConfig = cfg.build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-        back = _back_end(taken.log, settings, said["solver"])
+        settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+        back = _back_end(taken.log, settings, said["solver"], [ProgressBar(taken.log, progress)])
         submaps = read_submaps(root, load_grid=load_npz if _with_grids(settings) else None)
         seconds = {"load": time.perf_counter() - begin}
-        for s in tqdm(submaps, desc=str(said["source"]), unit="submap", disable=not progress, leave=False):
+        for s in submaps:
             back.add(s)
         work = FrontEndWork(0.0, len(submaps), np.zeros(0))
         result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
         return write_outputs(root, result)
 
 
-def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str) -> BackEnd:
+def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
     """A back end that has its IMUs, and the fixes that are to be used."""
-    back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu))
+    back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu), observers=observers)
     gps = gps_stream(log)
     if gps is not None and settings.gps.use != "none":
         back.add_gps(split(gps, settings.gps)[0], settings.gps)
@@ -272,11 +270,11 @@ def effective_config(
     run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
     return {
         "run": run_part,
-        "frontend": cfg.as_dict(front_config),
-        "backend": cfg.as_dict(settings.backend),
-        "gps": cfg.as_dict(settings.gps),
-        "imu": cfg.as_dict(settings.imu),
-        "map": cfg.as_dict(settings.map),
+        "frontend": as_dict(front_config),
+        "backend": as_dict(settings.backend),
+        "gps": as_dict(settings.gps),
+        "imu": as_dict(settings.imu),
+        "map": as_dict(settings.map),
     }
 
 

@@ -9,7 +9,7 @@ from graphslam.app.folders.generations import new_generation, outputs
 from graphslam.app.folders.lock import locked
 from graphslam.app.hypotheses.runs import Clearest, clearest_of_run, write_clearest
 from graphslam.app.report.report import report_beside
-from graphslam.app.run.config import MapConfig, build, merge
+from graphslam.app.run.config import MapConfig
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import (
     RunMap,
@@ -20,6 +20,7 @@ from graphslam.app.run.maps import (
 )
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
+from graphslam.core.config import build, merge
 from graphslam.core.errors import MissingDataError
 from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps

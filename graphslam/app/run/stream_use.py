@@ -13,7 +13,6 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
 from graphslam.graph.factors.gps import GpsRecord
-from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.pose_graph import PoseGraph
 
 Role = Literal["input", "gps", "imu", "unused"]
@@ -96,7 +95,7 @@ def stream_use(
                 why = "gps.use is none"
             elif used == 0 and spent.any():
                 why = (
-                    f"its {int(spent.sum())} fixes on the path span less than {GpsFactorConfig().baseline:g} m, on the "
+                    f"its {int(spent.sum())} fixes on the path span less than {settings.gps.baseline:g} m, on the "
                     "ground or in the map, so that the heading of their frame stays unknown"
                 )
             elif used < len(times) and settings.gps.use != "all":

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.run.config import RunConfig
-from graphslam.app.run.gps_use import split
 from graphslam.app.run.metrics import Metrics
+from graphslam.backend.streams import split
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import frame

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.folders.generations import consistent
-from graphslam.app.run import config as cfg
-from graphslam.app.run.config import BackEndConfig, GpsConfig
 from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.run import Run
+from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.core.config import build
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
@@ -22,7 +22,6 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import read_g2o
@@ -61,7 +60,7 @@ class DenseSession:
         Seconds that were added to its clock.
     fixes : Gps or None
         On the common clock.
-    gps : GpsConfig
+    gps : GpsOptions
     T_gps_base : (7,) or (3,) or None
         First base in the GPS frame by the run's own graph.
     """
@@ -73,7 +72,7 @@ class DenseSession:
     inner: list[InnerTie]
     shift: float = 0.0
     fixes: Gps | None = None
-    gps: GpsConfig = field(default_factory=GpsConfig)
+    gps: GpsOptions = field(default_factory=GpsOptions)
     T_gps_base: Array | None = None
 
     @property
@@ -123,7 +122,7 @@ def _options(run: Run, part: str, kind: Any) -> Any:
         values = read_options(file.parent).get(part)
     if values is None:
         raise DataError(f"a run does not say its {part} options", where=run.name, wanted="a finished run")
-    return cfg.build(kind, {k: v for k, v in values.items() if v is not None}, part)
+    return build(kind, {k: v for k, v in values.items() if v is not None}, part)
 
 
 def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.inf) -> DenseSession:
@@ -142,7 +141,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     fixes = None if run.fixes is None else replace(run.fixes, times=run.fixes.times + shift)
     return DenseSession(
         name, submaps, config, SessionMap(submaps, config.node_spacing), _inner(run, config), shift, fixes,
-        _options(run, "gps", GpsConfig), run.map.T_gps_world,
+        _options(run, "gps", GpsOptions), run.map.T_gps_world,
     )  # fmt: skip
 
 
@@ -226,9 +225,6 @@ def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, 
             robust=t.robust, group="match",
         )  # fmt: skip
     if use_gps and session.fixes is not None:
-        o = session.gps
-        kernel = NO_KERNEL if o.robust == "none" else Robust(o.robust, o.robust_width)
-        gps = GpsFactorConfig(robust=kernel, sigma=o.sigma, bias_sigma=o.bias_sigma, segment_gap=o.segment_gap)
-        graph.add_gps(session.fixes, config=gps)
+        graph.add_gps(session.fixes, config=session.gps)
         graph.finish_gps()
     return node

@@ -11,8 +11,8 @@ import pytest
 
 from graphslam.app.hypotheses.alternatives import Alternative, chi2_of, choose, noise_scale, write_choice
 from graphslam.app.hypotheses.runs import LOOP, choices_of_matches, solve_choice
-from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.config import BackEndConfig, GpsConfig
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
@@ -177,7 +177,7 @@ def test_fixes_of_a_run_are_in_every_choice(run: tuple) -> None:
     keep = np.unique(times, return_index=True)[1]
     fixes = Gps(times=times[keep], positions=at[keep] + [100.0, 0, 0], sigma=np.full(len(keep), 0.5),
                 lever=np.zeros(3))  # fmt: skip
-    back = solve_choice(submaps, frozenset(), OPTIONS, fixes=fixes, gps=GpsConfig(use="all"))
+    back = solve_choice(submaps, frozenset(), OPTIONS, fixes=fixes, gps=GpsOptions(use="all"))
     solution = back.finish()
     assert back.graph.objective()["gps"].factors > 10
     np.testing.assert_allclose(solution.T_gps_world[:3], [100.0, 0, 0], atol=1.0)

@@ -16,11 +16,12 @@ import graphslam as gs
 from graphslam.app.hypotheses.runs import solve_choice
 from graphslam.app.run import config as cfg
 from graphslam.app.run import pipeline
-from graphslam.app.run.config import BackEndConfig
 from graphslam.app.run.folder import RunFolder
-from graphslam.app.run.imu_use import ImuPart, imus_of
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.pipeline import again
+from graphslam.backend.config import BackEndConfig
+from graphslam.backend.streams import ImuPart, imus_of
+from graphslam.core.config import build
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.log import SensorLog
 from graphslam.io.log_digest import log_digest
@@ -80,7 +81,7 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.undo()
     assert run.graph.imus
     remade(tmp_path / "run")
-    settings = cfg.build(cfg.RunConfig, {"imu": {"use": "auto"}})
+    settings = build(cfg.RunConfig, {"imu": {"use": "auto"}})
     back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(imus_of(short), settings.imu))
     back.finish()
     assert back.graph.objective().total == pytest.approx(run.metric("objective"), rel=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import tomllib
 from pathlib import Path
@@ -11,13 +12,18 @@ import pytest
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.worlds import simulate
+from graphslam.backend.config import GpsOptions, ImuOptions
+from graphslam.core.config import as_dict, build, dump_toml, merge, parse_setting, read_toml
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
+from graphslam.graph.factors.imu.config import ImuConfig
+from graphslam.graph.gps import GpsConfig
+from graphslam.graph.noise import Robust
 
 
 def test_nested_options_are_built_and_checked():
-    c = cfg.build(
+    c = build(
         RbpfEkfConfig, {"particles": 7, "motion": {"speed": 1}, "noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}}
     )
     assert (c.particles, c.motion.speed, c.noise.range_sigma) == (7, 1.0, 0.1)
@@ -25,11 +31,11 @@ def test_nested_options_are_built_and_checked():
 
 
 def test_lists_of_any_length_and_of_a_given_one():
-    c = cfg.build(
+    c = build(
         SegSlamFrontEndConfig, {"segslam": {"registration": {"radii": [3, 1, 0.5]}}, "steps": {"scanners": ["a"]}}
     )
     assert (c.segslam.registration.radii, c.steps.scanners) == ((3.0, 1.0, 0.5), ("a",))
-    assert cfg.build(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
+    assert build(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +48,7 @@ def test_lists_of_any_length_and_of_a_given_one():
 )
 def test_wrong_lists_are_refused(values, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        cfg.build(SegSlamFrontEndConfig, values)
+        build(SegSlamFrontEndConfig, values)
 
 
 @pytest.mark.parametrize(
@@ -79,22 +85,22 @@ def test_unknown_front_end_is_refused():
     ],
 )
 def test_settings_of_the_command_line(text, value):
-    assert cfg.parse_setting(text) == value
+    assert parse_setting(text) == value
 
 
 @pytest.mark.parametrize("text", ["a", "=3", "a..b=1", ""])
 def test_malformed_settings_are_refused(text):
     with pytest.raises(ConfigError, match="--set"):
-        cfg.parse_setting(text)
+        parse_setting(text)
 
 
 def test_merge_is_deep_and_the_later_wins():
-    assert cfg.merge({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
+    assert merge({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
 
 
 def test_effective_configuration_round_trips_through_toml():
     front = make_front_end("rbpf-ekf", {"trim": 16.0, "smoothing_noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}})
-    text = cfg.dump_toml(cfg.as_dict(front.config))
+    text = dump_toml(as_dict(front.config))
     assert make_front_end("rbpf-ekf", tomllib.loads(text)).config == front.config
 
 
@@ -105,9 +111,36 @@ def test_simulated_log_brings_its_own_noise():
     assert options["frontend"]["association"] == "known"
 
 
+def test_every_option_of_gps_and_imu_can_be_set_and_comes_back_from_toml():
+    """One definition each: the factors' own options and those of the run are the same."""
+    gps = {"use": "all", "sigma": 0.5, "baseline": 7.0, "bias_sigma": 1.5, "segment_gap": 3.0}
+    imu = {"use": "auto", "longest": 4.0, "pause": 0.3, "accelerometer": False, "gravity": False, "window": 2.0}
+    imu |= {"acceleration": 0.1, "still": 0.02, "axes": "warn"}
+    values = {
+        "gps": gps | {"robust": "huber", "robust_width": 1.2},
+        "imu": imu | {"robust": "cauchy", "robust_width": 1.7},
+    }
+    run = build(cfg.RunConfig, values)
+    for part, kind in ((run.gps, GpsConfig), (run.imu, ImuConfig)):
+        assert isinstance(part, kind)
+        assert all(getattr(part, f.name) != f.default for f in dataclasses.fields(part))
+    written = dump_toml(as_dict(run))
+    assert {k: tomllib.loads(written)[k] for k in values} == values
+    assert build(cfg.RunConfig, tomllib.loads(written)) == run
+
+
+def test_a_width_alone_leaves_the_kernel_as_it_was():
+    assert build(GpsOptions, parse_setting("robust_width=1.5")).robust == Robust("cauchy", 1.5)
+    assert build(ImuOptions, parse_setting("robust=huber")).robust == Robust("huber", 2.385)
+    with pytest.raises(ConfigError, match=r"gps.robust_width = 'wide'"):
+        build(GpsOptions, {"robust_width": "wide"}, "gps")
+    with pytest.raises(ConfigError, match="width must be positive"):
+        build(GpsOptions, {"robust_width": -1.0}, "gps")
+
+
 def test_presets_are_valid():
     for name in ("victoria-park.rbpf-ekf", "landmark-field.rbpf-ekf"):
-        run = cfg.build(cfg.RunConfig, cfg.preset(name))
+        run = build(cfg.RunConfig, cfg.preset(name))
         make_front_end("rbpf-ekf", run.frontend)
     assert cfg.preset("never-heard-of") == {}
 
@@ -129,6 +162,6 @@ def test_broken_toml_is_refused(tmp_path):
     file = tmp_path / "c.toml"
     file.write_text("a = [1,")
     with pytest.raises(ConfigError, match="not a TOML"):
-        cfg.read_toml(file)
+        read_toml(file)
     with pytest.raises(ConfigError, match="cannot be read"):
-        cfg.read_toml(tmp_path / "nothing.toml")
+        read_toml(tmp_path / "nothing.toml")

@@ -13,6 +13,7 @@ import pytest
 import graphslam as gs
 from graphslam.app.run import front_ends
 from graphslam.core.errors import UnknownNameError
+from graphslam.frontends.base import FrontEnd
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Plain:
 
 
 @dataclass(frozen=True)
-class WithoutMotion:
+class WithoutMotion(FrontEnd):
     config: Plain = field(default_factory=Plain)
     name: ClassVar[str] = "plain"
 

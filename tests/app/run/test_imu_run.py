@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import pipeline
-from graphslam.app.run.config import RunConfig, build
+from graphslam.app.run.config import RunConfig
+from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog, Truth
@@ -106,6 +107,18 @@ def test_a_contradiction_is_said(monkeypatch, caplog):
     (said,) = [e for e in r.events if e["event"] == "imu-contradicted"]
     assert said["chi2_per_dof"] > said["high"] > 1
     assert "contradict each other" in caplog.text
+
+
+def test_options_of_the_factors_are_options_of_a_run(monkeypatch):
+    log, submaps = made()
+    thinned = replace(log, streams={"imu": log["imu"].take(slice(None, None, 3))})
+    between = float(np.median(np.diff(thinned["imu"].times)))
+    r = solved(thinned, submaps, monkeypatch, config={"imu": {"use": "auto", "pause": 0.5 * between}})
+    (said,) = [e for e in r.events if e["event"] == "imu"]
+    assert any("pause" in reason for reason in said["dropped"])
+    r = solved(thinned, submaps, monkeypatch, config={"imu": {"use": "auto", "pause": 2.0 * between}})
+    (said,) = [e for e in r.events if e["event"] == "imu"]
+    assert not any("pause" in reason for reason in said["dropped"])
 
 
 def test_in_the_plane_it_is_left_out(monkeypatch):

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.config import BackEndConfig
 from graphslam.app.run.files import loops_of_run
 from graphslam.app.run.loops import undo_loop
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig
 from graphslam.core import se3
 from graphslam.core.errors import DataError, FormatError, RunFolderError
 from graphslam.core.submap import Match, Submap

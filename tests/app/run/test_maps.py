@@ -18,6 +18,8 @@ from graphslam.app.run.pipeline import run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
+from graphslam.backend.config import BackEndConfig
+from graphslam.core.config import build, read_toml
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.poses import SE3, level
 from graphslam.core.submap import Match
@@ -77,8 +79,8 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     """No matches and exits as they are: nothing moves, so the two entropies are those of one map."""
     bare = [replace(s, matches=()) for s in finished.submaps]
     assert finished.folder is not None
-    values = cfg.read_toml(finished.folder / "config.toml")
-    config = cfg.build(cfg.BackEndConfig, {**values["backend"], "level_sigma": 0.0})
+    values = read_toml(finished.folder / "config.toml")
+    config = build(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
     from graphslam.app.run.pipeline import make_map
 
     m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
@@ -175,7 +177,7 @@ def test_what_does_not_belong_together_is_refused(finished: Run) -> None:
     with pytest.raises(MissingDataError, match=re.escape(f"{len(finished.submaps)} of {len(finished.submaps)}")):
         make_run_map([replace(s, grid=None) for s in finished.submaps], finished.map)
     with pytest.raises(ConfigError, match="low < high"):
-        cfg.build(cfg.RunConfig, {"map": {"low": 2.0}})
+        build(cfg.RunConfig, {"map": {"low": 2.0}})
 
 
 def test_floor_plans_of_storeys_and_reach() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import loops as app_loops
-from graphslam.app.run.back_end import BackEnd
-from graphslam.app.run.config import BackEndConfig
+from graphslam.backend.back_end import BackEnd
+from graphslam.backend.config import BackEndConfig
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Match, Submap

@@ -20,6 +20,7 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.io.g2o import read_g2o
 from tests.reference.space_chain import dense_chain
@@ -34,7 +35,7 @@ class NoOptions:
 
 
 @dataclass(frozen=True)
-class Ring:
+class Ring(FrontEnd):
     """Hands over what was made beforehand."""
 
     made: tuple[Submap, ...]
@@ -185,3 +186,12 @@ def test_plan_covariance_against_draws(rng):
     C = plan_covariance(T, P)
     W = np.linalg.inv(np.linalg.cholesky(C))
     np.testing.assert_allclose(W @ np.cov(e.T) @ W.T, np.eye(3), atol=0.05)
+
+
+def test_fixes_wait_for_the_baseline_that_is_asked_for(monkeypatch):
+    use = {"use": "every-second", "robust": "none"}
+    assert solved(2, monkeypatch).map.T_gps_world is not None
+    r = solved(2, monkeypatch, config={"gps": {**use, "baseline": 1e4}})
+    assert r.map.T_gps_world is None
+    (gps,) = [s for s in r.report["streams"] if s["name"] == "gps"]
+    assert (gps["used"], "span less than 10000 m" in gps["why"]) == (0, True)

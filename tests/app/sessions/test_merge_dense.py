@@ -25,6 +25,7 @@ from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.between import BetweenRecord
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
@@ -40,7 +41,7 @@ class NoOptions:
 
 
 @dataclass(frozen=True)
-class Ready:
+class Ready(FrontEnd):
     """Hands over what was made beforehand."""
 
     made: tuple[Submap, ...]

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import recommended
 from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies import segslam_trial
@@ -18,6 +17,7 @@ from graphslam.app.studies.segslam_building import STUDY as BUILDING
 from graphslam.app.studies.segslam_garage import STUDY as GARAGE
 from graphslam.app.studies.segslam_mine import STUDY as MINE
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
+from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, level
@@ -354,9 +354,9 @@ def test_presets_are_the_settings_of_the_studies(world: str) -> None:
     """Who simulates a world and runs a front end on it gets what the study has figures of."""
     study = {**GARAGE.full, **MINE.full, **BUILDING.full}[world]
     log = SensorLog(name=world, streams={})
-    segslam = cfg.build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    segslam = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
     assert (segslam.steps, segslam.filter, segslam.segslam, segslam.drift) == (
         study.steps, study.segslam_filter, study.segslam, study.drift,
     )  # fmt: skip
-    rbpf = cfg.build(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
+    rbpf = build(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
     assert (rbpf.steps, rbpf.filter) == (study.steps, study.filter)

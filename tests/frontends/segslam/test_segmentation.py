@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from graphslam.app.run.config import build
 from graphslam.core import se3
+from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.frontends.segslam.config import SegmentationConfig, SegSlamConfig

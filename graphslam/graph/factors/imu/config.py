@@ -8,12 +8,13 @@ from typing import Literal
 
 import numpy as np
 
+from graphslam.core.config import spelled
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import Robust
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values
 
@@ -52,7 +53,7 @@ class ImuConfig:
     acceleration: float = 0.3
     still: float = 0.05
     axes: Literal["refuse", "warn", "ignore"] = "refuse"
-    robust: Robust = NO_KERNEL
+    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
 
     def __post_init__(self) -> None:
         for name in ("longest", "pause", "window", "acceleration", "still"):

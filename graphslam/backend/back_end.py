@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.app.run.config import BackEndConfig, GpsConfig
-from graphslam.app.run.imu_use import ImuPart, recentred
 from graphslam.association.identity import doubtful_identities
 from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
+from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.streams import ImuPart, recentred
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.gps import GpsConfig as GpsFactorConfig
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
@@ -33,6 +32,25 @@ from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
+
+
+class Observer:
+    """Told what a run does while it does it: a progress bar, a live view. A subclass takes what it needs.
+
+    Nothing that an observer does changes the run; what it raises ends it.
+    """
+
+    def front_end_at(self, progress: Any) -> None:
+        """A front end that can be watched has made a step; ``progress`` is of its own kind."""
+
+    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+        """A submap is in the graph, and the graph is solved with it."""
+
+    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+        """A loop was believed or not, and why."""
+
+    def solved(self, solution: Solution) -> None:
+        """All submaps are in, and everything is solved."""
 
 
 @dataclass
@@ -56,17 +74,18 @@ class BackEnd:
     """With their maps; kept only where loops are looked for."""
     imu: ImuPart | None = None
     """IMUs of the log; None where there is no log."""
+    observers: Sequence[Observer] = ()
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
-        self._waiting: list[tuple[Gps, GpsConfig]] = []
+        self._waiting: list[tuple[Gps, GpsOptions]] = []
         kind = self.config.match_robust
         self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
 
-    def add_gps(self, gps: Gps, config: GpsConfig) -> None:
+    def add_gps(self, gps: Gps, config: GpsOptions) -> None:
         """Give the graph the fixes that count; they wait for the submaps that hold them.
 
         Before the first submap it is not known whether the graph is in the plane: there fixes lose their height.
@@ -77,13 +96,7 @@ class BackEnd:
         have, want = gps.positions.shape[1], self.graph.dim
         if have > want:
             gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
-        kernel = NO_KERNEL if config.robust == "none" else Robust(config.robust, config.robust_width)
-        self.graph.add_gps(
-            gps,
-            config=GpsFactorConfig(
-                robust=kernel, sigma=config.sigma, bias_sigma=config.bias_sigma, segment_gap=config.segment_gap
-            ),
-        )
+        self.graph.add_gps(gps, config=config)
 
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""
@@ -96,6 +109,8 @@ class BackEnd:
         if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
             self.merge()
         self.per_submap_s.append(time.perf_counter() - start)
+        for o in self.observers:
+            o.submap_added(submap, self.graph)
 
     def append(self, submap: Submap) -> float:
         """Associate and add without solving; returns the time at which it was associated [s]."""
@@ -180,6 +195,8 @@ class BackEnd:
         self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start
+        for o in self.observers:
+            o.solved(solution)
         return solution
 
     def find_loops(self) -> LoopLedger:
@@ -200,6 +217,9 @@ class BackEnd:
         ledger = find_loops(self.graph, self.solver, self.submaps, config).ledger
         for event in ledger.events():
             self.graph.note(event.pop("event"), **event)
+        for decision in ledger.current():
+            for o in self.observers:
+                o.loop_decided(decision, self.graph)
         self.seconds["loops"] = time.perf_counter() - start
         return ledger
 

@@ -1,29 +1,51 @@
-"""Which IMUs of a log the graph gets, what came of them, and whether their axes are those of their mounting."""
+"""Which fixes and IMUs of a log the graph gets: those to be used; IMUs as soon as their axes can be believed."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from graphslam.app.run.config import ImuConfig
-from graphslam.app.run.metrics import Metrics
+from graphslam.backend.config import GpsOptions, ImuOptions
 from graphslam.core.errors import MissingDataError
 from graphslam.core.imu import Imu
-from graphslam.core.log import DropCounter, SensorLog
-from graphslam.evaluate.without_truth import class_consistency, two_sided
-from graphslam.graph.factors.imu.config import ImuConfig as ImuFactorConfig
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.core.log import SensorLog
+from graphslam.core.records import Gps
+from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver
 
 logger = logging.getLogger(__name__)
+Mask = npt.NDArray[np.bool_]
 
 CHECKED_AFTER = 30.0
 """Path that is there before axes are first looked at [s]."""
 RECENTRED = 4
 """Times that ways are preintegrated anew about their bias, at most."""
+
+
+def used_fixes(gps: Gps, config: GpsOptions) -> Mask:
+    """Fixes that become factors ``(n,)``; the others are withheld."""
+    n = len(gps.times)
+    index = np.arange(n)
+    segment = fix_segments(gps.times, config.segment_gap)
+    masks = {
+        "none": np.zeros(n, dtype=bool),
+        "all": np.ones(n, dtype=bool),
+        "every-second": index % 2 == 0,
+        "even-segments": segment % 2 == 0,
+        "odd-segments": segment % 2 == 1,
+    }
+    return masks[config.use]
+
+
+def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
+    """(fixes that become factors, fixes withheld)."""
+    mask = used_fixes(gps, config)
+    used, withheld = gps.take(mask), gps.take(~mask)
+    return (used if config.sigma is None else replace(used, sigma=np.full(len(used.times), config.sigma))), withheld
 
 
 def imus_of(log: SensorLog) -> dict[str, Imu]:
@@ -37,7 +59,7 @@ class ImuPart:
     Parameters
     ----------
     imus : dict of str to Imu
-    config : ImuConfig
+    config : ImuOptions
 
     Raises
     ------
@@ -45,7 +67,7 @@ class ImuPart:
         ``config.use`` names a stream that the log does not have.
     """
 
-    def __init__(self, imus: dict[str, Imu], config: ImuConfig) -> None:
+    def __init__(self, imus: dict[str, Imu], config: ImuOptions) -> None:
         self.imus, self.config = imus, config
         self._looked: set[str] = set()
         if config.use not in ("none", "auto") and config.use not in imus:
@@ -82,18 +104,13 @@ class ImuPart:
         EvidenceReusedError
             The stream that is named was used by the front end.
         """
-        c, made = self.config, 0
+        made = 0
         for name in self._wanted(graph):
             if graph.dim != 3:
                 graph.note("imu-not-used", stream=name, why="the graph is in the plane")
                 logger.warning("%s is not used: the graph is in the plane", name)
                 continue
-            kernel = NO_KERNEL if c.robust == "none" else Robust(c.robust, c.robust_width)
-            factor = ImuFactorConfig(
-                longest=c.longest, accelerometer=c.accelerometer, gravity=c.gravity, acceleration=c.acceleration,
-                axes=c.axes, robust=kernel,
-            )  # fmt: skip
-            made += len(graph.add_imu(self.imus[name], stream=name, config=factor))
+            made += len(graph.add_imu(self.imus[name], stream=name, config=self.config))
         return made
 
     def _wanted(self, graph: PoseGraph) -> list[str]:
@@ -112,40 +129,3 @@ def recentred(graph: PoseGraph, solver: Solver) -> None:
         if not graph.recentre_imu():
             return
         solver.solve_to_optimum()
-
-
-def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
-    """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
-    said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
-    for stream in graph.imus:
-        states = graph.imu_states(stream)
-        mine = [e for e in said if e["stream"] == stream]
-        for reason, n in (mine[-1]["dropped"] if mine else {}).items():
-            drops.drop(stream, f"no factor: {reason}", n)
-        if not states.order:
-            continue
-        row = states.bias[states.order[-1]]
-        bias, P = graph.values.imu_biases[row], graph.covariance().marginal(f"imubias{row}")
-        sigma = np.sqrt(np.diag(P))
-        prefix = stream if stream.startswith("imu") else f"imu_{stream}"
-        out.add(f"{prefix}_nodes", len(states.order))
-        for name, part, unit in (("gyro", slice(0, 3), "rad/s"), ("force", slice(3, 6), "m/s²")):
-            out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
-            out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
-        graph.note("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
-    _contradiction(graph)
-
-
-def _contradiction(graph: PoseGraph) -> None:
-    """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
-    ways = class_consistency(graph).get("imu") if graph.imus else None
-    if ways is None or not np.isfinite(ways.ratio):
-        return
-    high = two_sided(ways.ratio, ways.dof, 0.999)[1]
-    if ways.ratio > high:
-        graph.note("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
-        logger.warning(
-            "submaps and IMU contradict each other (χ²/dof %.1f, at most %.1f): one of them states too little noise",
-            ways.ratio,
-            high,
-        )
