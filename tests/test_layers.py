@@ -130,6 +130,45 @@ def test_a_circle_is_seen_also_inside_functions(tmp_path: Path, monkeypatch: pyt
     assert found == {"a": {"b"}, "b": {"a"}, "c": set(), "d": {"c"}}
 
 
+# A study is an experiment: what it computes belongs to no other part, and nothing else imports it.
+STUDIES = ROOT / "graphslam" / "app" / "studies"
+NUMERICS = {"linalg", "einsum", "lstsq", "fft"}
+
+
+def numerics(tree: ast.AST) -> list[str]:
+    """What a file computes itself: linear algebra, distributions, products of matrices."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            names = [a.name for a in node.names]
+            module = getattr(node, "module", None) or names[0]
+            found += [module] if module.split(".")[0] in ("scipy", "numba", "gtsam") else []
+            found += [n for n in names if n.startswith("chi2_")]
+        elif isinstance(node, ast.Attribute) and node.attr in NUMERICS:
+            found.append(node.attr)
+        elif isinstance(node, (ast.BinOp, ast.AugAssign)) and isinstance(node.op, ast.MatMult):
+            found.append("@")
+    return found
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if (ROOT / "graphslam" / "app") in p.parents], ids=lambda p: p.stem)
+def test_app_leaves_the_numbers_to_others(path: Path) -> None:
+    if STUDIES not in path.parents:
+        assert numerics(ast.parse(path.read_text())) == []
+
+
+def test_numbers_are_noticed() -> None:
+    lines = (
+        "np.linalg.norm(x)",
+        "R @ P",
+        "from scipy import stats",
+        "from a.b import chi2_quantile",
+        "np.einsum('i', x)",
+    )
+    assert all(len(numerics(ast.parse(line))) == 1 for line in lines)
+    assert numerics(ast.parse("a = np.mean(x) ** 2")) == []
+
+
 def test_every_package_has_a_storey() -> None:
     packages = {package_of(module_of(p)) for p in FILES} - {None}
     assert packages <= set(STOREY)

@@ -56,14 +56,19 @@ class SegSlam(FrontEnd):
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
         """See :class:`~graphslam.frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
-        c = self.config
-        steps = checked_steps(log, c.steps, drops)
-        result = run_segslam(steps, c.filter, c.segslam, seed.child(0), watch=watch)
-        for submap in settled(result, c.drift, c.segslam):
+        result = self.result(log, seed=seed, drops=drops, watch=watch)
+        for submap in settled(result, self.config.drift, self.config.segslam):
             if submap.key == 0:
-                submap = with_findings(submap, steps)
+                submap = with_findings(submap, result.steps)
             if after is None or submap.key > after.key:
                 yield submap
+
+    def result(
+        self, log: SensorLog, *, seed: SeedTree, drops: DropCounter | None = None, watch: Watch | None = None
+    ) -> SegSlamResult:
+        """The SegMap with all particles, of which :meth:`submaps` hands over the best one's chain."""
+        c = self.config
+        return run_segslam(checked_steps(log, c.steps, drops), c.filter, c.segslam, seed.child(0), watch=watch)
 
 
 def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:

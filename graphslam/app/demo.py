@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from tqdm import tqdm
 
 from graphslam.app.run.pipeline import run
@@ -16,11 +15,9 @@ from graphslam.app.worlds import simulate
 from graphslam.backend.back_end import Observer
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
-from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.segslam.progress import Progress
-from graphslam.plots.comparison import plot_comparison
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
 
@@ -124,19 +121,3 @@ class DemoProgress(Observer):
         part = part_path(self.picture, ".png")
         save(ax, part)
         part.replace(self.picture)
-
-
-def comparison_figure(comparison: pd.DataFrame) -> Any:
-    """NEES per degree of freedom of every method before polishing, beside the two-sided bounds of an honest map."""
-    own = comparison["nees_unpolished"].fillna(comparison["nees"])
-    dof = int(comparison["nees_dof"].iloc[0])
-    low, high = chi2_mean_bounds(dof, 1)
-    return plot_comparison(
-        None,
-        comparison.assign(nees_per_dof=own / comparison["nees_dof"]),
-        "nees_per_dof",
-        reference=(1.0, "honest"),
-        band=(low / dof, high / dof, "95 % bounds, one run"),
-        label="NEES / dof of poses and landmarks, before any polish",
-        title="The same submaps joined five ways",
-    )

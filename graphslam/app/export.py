@@ -11,9 +11,9 @@ from graphslam.app.folders.lock import locked
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
 from graphslam.core.errors import ConfigError, UnknownNameError
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import ellipse_rings, largest_sigmas
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
-from graphslam.core.geometry import Array, rotation2, se2_transform
+from graphslam.core.geometry import Array, se2_transform
 from graphslam.io.geographic import WRITERS, GeographicMap
 
 _RING = 36  # corners of an ellipse
@@ -69,14 +69,7 @@ def geographic_map(
     def place(points: Array) -> Array:
         return enu_to_geodetic(points, *datum)[..., :2]
 
-    R = rotation2(T[2])
-    centres = se2_transform(T, m.landmarks)
-    P = R @ m.landmark_covariances @ R.T
-    turn = np.linspace(0.0, 2.0 * np.pi, _RING + 1)
-    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
-    circle[-1] = circle[0]
-    # c + √χ² L u with L Lᵀ = P; L has a positive determinant, so rings keep their sense
-    rings = centres[:, None] + np.sqrt(chi2_quantile(confidence, 2)) * circle @ np.linalg.cholesky(P).swapaxes(1, 2)
+    centres, P = m.landmarks_in(T)
     scored = run.gps.get("all")
     fixes = np.zeros((0, 2)) if scored is None else scored.points + scored.residuals
     return GeographicMap(
@@ -85,8 +78,8 @@ def geographic_map(
         path=place(se2_transform(T, m.trajectory.positions)),
         landmarks=place(centres),
         landmark_ids=m.landmark_ids,
-        landmark_sigmas=np.sqrt(np.linalg.eigvalsh(P)[:, -1]) if len(P) else np.zeros(0),
-        ellipses=place(rings),
+        landmark_sigmas=largest_sigmas(P),
+        ellipses=place(ellipse_rings(centres, P, confidence, _RING)),
         confidence=confidence,
         gps=place(fixes),
     )

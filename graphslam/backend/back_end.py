@@ -34,6 +34,17 @@ logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 
 
+def find_config(c: BackEndConfig) -> FindConfig:
+    """How the back end looks for loops, the front end's matches among them."""
+    return FindConfig(
+        candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
+        appearance=AppearanceConfig() if c.loop_appearance else None,
+        front_end=True,
+        ties=TieConfig() if c.loop_ties else None,
+        rounds=FindConfig().rounds if c.loops else 0,
+    )
+
+
 class Observer:
     """Told what a run does while it does it: a progress bar, a live view. A subclass takes what it needs.
 
@@ -204,17 +215,11 @@ class BackEnd:
 
         The front end's matches are among them: until now each had a factor by its support alone.
         """
-        start, c = time.perf_counter(), self.config
+        start = time.perf_counter()
         for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
             self.graph.remove(fid, reason=DECIDED)
         self.solver.solve_to_optimum()
-        config = FindConfig(
-            candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
-            appearance=AppearanceConfig() if c.loop_appearance else None,
-            front_end=True,
-            ties=TieConfig() if c.loop_ties else None,
-        )
-        ledger = find_loops(self.graph, self.solver, self.submaps, config).ledger
+        ledger = find_loops(self.graph, self.solver, self.submaps, find_config(self.config)).ledger
         for event in ledger.events():
             self.graph.note(event.pop("event"), **event)
         for decision in ledger.current():

@@ -238,3 +238,29 @@ def chi2_mean_bounds(dof: float, runs: int, confidence: float = 0.95) -> tuple[f
     a = (1.0 - confidence) / 2.0
     n = dof * runs
     return float(stats.chi2.ppf(a, n) / runs), float(stats.chi2.ppf(1.0 - a, n) / runs)
+
+
+def ellipse_rings(centres: ArrayLike, covariances: ArrayLike, confidence: float, corners: int) -> Array:
+    """Closed polygons ``(n, corners + 1, 2)`` of the confidence ellipses of points ``(n, 2)``, counter-clockwise."""
+    turn = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
+    circle[-1] = circle[0]
+    # c + √χ² L u with L Lᵀ = P; L has a positive determinant, so rings keep their sense
+    L = np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))
+    return np.asarray(centres)[:, None] + np.sqrt(chi2_quantile(confidence, 2)) * circle @ L.swapaxes(1, 2)
+
+
+def largest_sigmas(covariances: ArrayLike) -> Array:
+    """Standard deviation ``(n,)`` in the least known direction of each of the covariances ``(n, d, d)``."""
+    P = np.asarray(covariances, dtype=np.float64)
+    return np.sqrt(np.linalg.eigvalsh(P)[:, -1]) if len(P) else np.zeros(0)
+
+
+def first_no_covariance(covariances: Array) -> int | None:
+    """Which of ``(n, d, d)`` is first not symmetric, or has a negative variance that rounding does not explain."""
+    if not covariances.size:
+        return None
+    skew = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))
+    values = np.linalg.eigvalsh(covariances)
+    bad = np.flatnonzero((skew > 1e-6 * values[:, -1]) | (values[:, 0] < -1e-6 * np.abs(values[:, -1])))
+    return int(bad[0]) if len(bad) else None

@@ -114,3 +114,13 @@ def grouped_mean_interval(
     tail = 0.5 * (1.0 - confidence)
     low, high = np.quantile(drawn, [tail, 1.0 - tail])
     return mean, float(low), float(high)
+
+
+def two_sided_width(confidence: float) -> float:
+    """Standard deviations within which a normal variable stays with this probability."""
+    return float(stats.norm.isf(0.5 * (1.0 - confidence)))
+
+
+def by_chance(n: int, share: float, confidence: float) -> float:
+    """Number of n cases, each of which happens with probability ``share``, that is exceeded with ``1 − confidence``."""
+    return float(stats.binom.ppf(confidence, n, share)) if n else 0.0

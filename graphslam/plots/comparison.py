@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.plots import style
 
 
@@ -103,3 +105,19 @@ def plot_comparison(
         ax.set_title(title, fontsize="medium")
     style.legend(ax)
     return ax
+
+
+def comparison_figure(comparison: pd.DataFrame) -> Any:
+    """NEES per degree of freedom of every method before polishing, beside the two-sided bounds of an honest map."""
+    own = comparison["nees_unpolished"].fillna(comparison["nees"])
+    dof = int(comparison["nees_dof"].iloc[0])
+    low, high = chi2_mean_bounds(dof, 1)
+    return plot_comparison(
+        None,
+        comparison.assign(nees_per_dof=own / comparison["nees_dof"]),
+        "nees_per_dof",
+        reference=(1.0, "honest"),
+        band=(low / dof, high / dof, "95 % bounds, one run"),
+        label="NEES / dof of poses and landmarks, before any polish",
+        title="The same submaps joined five ways",
+    )

@@ -20,7 +20,7 @@ import pytest
 
 import graphslam
 import graphslam.frontends
-from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.run import Run
 from graphslam.app.run.without_truth import WithoutTruth
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.app.studies.folder import StudyFolder
@@ -37,6 +37,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.score import ClassScore, Score
 from graphslam.io.cards import list_cards
 from graphslam.join.submap_solver import SubmapEstimate
+from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.batch import BatchSolver
 
 EVIL = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&"

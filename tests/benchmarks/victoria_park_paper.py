@@ -23,7 +23,6 @@ from tqdm import tqdm
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import reference_labels
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.run.reckoning import dead_reckoning
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.config import build, merge
 from graphslam.core.geometry import Array, se2_compose
@@ -34,6 +33,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.gps import gps_residuals
+from graphslam.evaluate.reckoning import dead_reckoning
 from graphslam.join.association import Association
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult

@@ -9,14 +9,13 @@ import numpy as np
 from scipy.stats import chi2
 
 import graphslam as gs
-from graphslam.app.run.metrics import Metrics, map_truth, truth_metrics, truth_path
-from graphslam.app.run.metrics_space import truth_metrics_in_space
 from graphslam.app.run.run import Run
 from graphslam.core.config import merge
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
+from graphslam.evaluate.metrics import Metrics, map_truth, truth_metrics, truth_metrics_in_space, truth_path
 from tests.faults.grid_rows import Row
 from tests.faults.grid_worlds import Drive
 

@@ -11,8 +11,8 @@ from graphslam.app.cli.run import JSON, MAX_SIZE
 from graphslam.app.cli.terminal import emit, table
 
 CANDIDATES = (
-    *("verdict", "choice", "matches", "loops", "objective", "chi2", "dof", "chi2_per_dof"),
-    *("entropy", "known_volume", "why"),
+    *("verdict", "choice", "support", "withdrawn", "submaps", "matches", "loops", "objective", "chi2", "dof"),
+    *("chi2_per_dof", "entropy", "known_volume", "why"),
 )
 
 
@@ -30,27 +30,38 @@ def make_map(
         help="Solve the run with other choices of its matches and loops too, and keep the clearest map that its own "
         "graph does not contradict (clearest.*) and the runners-up (alternatives/).",
     ),
+    hypotheses: int = typer.Option(
+        0,
+        min=0,
+        help="Solve so many topologies that the particles of a SegSLAM run told, for which its log is read once more; "
+        "the clearest map and the others are kept in the same way.",
+    ),
+    log: str | None = typer.Option(None, help="With --hypotheses: card or folder of the run's log, if it was moved."),
     low: float | None = typer.Option(None, help="Floor plans begin this far above the path [m]; default the run's."),
     high: float | None = typer.Option(None, help="Floor plans end this far above the path [m]; default the run's."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """The fused map of a run, made again from its folder: no scan is read."""
+    """The fused map of a run, made again from its folder; no scan is read unless hypotheses are asked for."""
     from graphslam.app.run.remake_map import remake_map
 
-    made = remake_map(run, grid=grid, minimum_entropy=minimum_entropy, low=low, high=high, progress=not as_json)
+    made = remake_map(
+        run, grid=grid, minimum_entropy=minimum_entropy, hypotheses=hypotheses, log=log, low=low, high=high,
+        progress=not as_json,
+    )  # fmt: skip
     value: dict[str, Any] = made.map.facts()
     rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
     text = table(rows)
     found = made.clearest
     if found is not None:
-        value |= {"candidates": found.rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
-        text += f"\n\n{table(found.rows, CANDIDATES)}\nchosen: {found.choice.why()}"
+        rows = found.choice.rows()
+        value |= {"candidates": rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
+        text += f"\n\n{table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
             text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
         text += f"\npaths and graphs of all: {run / 'alternatives'}"
         if found.left_out:
-            text += f"\n{found.left_out} more choices were not solved"
+            text += f"\n{found.left_out} more were not solved"
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
     value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
     text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; figures: {', '.join(p.name for p in made.figures)}"

@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import missing, note, picture, section
 from graphslam.app.run.files import read_map, read_merged_dense
-from graphslam.app.sessions.dense_ties import SESSION
+from graphslam.backend.sessions import SESSION
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.markup import Markup, join
 from graphslam.evaluate.consistency import Consistency, nees, pose_error

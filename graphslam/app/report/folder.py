@@ -17,9 +17,9 @@ from graphslam.app.run.files import (
     read_options,
     read_report,
 )
-from graphslam.app.run.metrics import is_time
 from graphslam.core.atomic import read_json
 from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
+from graphslam.evaluate.metrics import is_time
 from graphslam.io.submap_store import SubmapStore
 from graphslam.loops.ledger import LoopLedger, ledger_of_events
 

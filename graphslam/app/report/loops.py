@@ -109,32 +109,18 @@ def _ties(folder: ReportFolder) -> list[Markup]:
 
 
 def hypotheses(folder: ReportFolder) -> Markup:
-    """Topologies that were solved side by side; and choices of matches by the entropy of their maps."""
+    """Alternative graphs that were solved: topologies, or choices of matches and loops."""
     title = "Hypotheses and runners-up"
-    events = folder.events or []
-    found = [e for e in events if e.get("event") == "hypothesis"]
-    chosen = next((e for e in reversed(events) if e.get("event") == "hypothesis-chosen"), None)
-    parts: list[Any] = []
-    if found:
-        number = None if chosen is None else chosen.get("hypothesis")
-        columns = {
-            **{"hypothesis": "hypothesis", "support": "support", "withdrawn": "entry withdrawn", "submaps": "submaps"},
-            **{"entries": "entries", "loops": "loops", "chi2": "χ²", "dof": "dof", "contradicted": "contradicted"},
-            **{"entropy": "entropy [nat m³]", "known_volume": "known [m³]", "chosen": "chosen"},
-        }
-        rows = [{**e, "chosen": "chosen" if e.get("hypothesis") == number else "runner-up"} for e in found]
-        parts.append(table(rows, columns))
-        if chosen is not None:
-            parts.append(note(join(["Why: ", str(chosen.get("why", "not said")), "."])))
-    candidates = None if folder.clearest is None else folder.clearest.get("candidates")
-    if isinstance(candidates, list) and candidates:
-        columns = {
-            **{"verdict": "verdict", "choice": "choice of matches", "matches": "matches", "loops": "loops"},
-            **{"objective": "objective", "chi2": "χ²", "dof": "dof", "entropy": "entropy [nat m³]"},
-            **{"known_volume": "known [m³]", "why": "why"},
-        }
-        parts.append(element("h3", "Choices of matches and loops, the chosen one first (clearest.json)"))
-        parts.append(table([c for c in candidates if isinstance(c, Mapping)], columns))
-    if not parts:
-        parts.append(missing("other hypotheses: none were solved in this folder."))
-    return section("hypotheses", title, *parts)
+    found = {} if folder.clearest is None else folder.clearest
+    candidates = [c for c in found.get("candidates", ()) if isinstance(c, Mapping)]
+    if not candidates:
+        return section("hypotheses", title, missing("other hypotheses: none were solved in this folder."))
+    columns = {
+        **{"verdict": "verdict", "choice": "choice", "support": "support", "withdrawn": "entry withdrawn"},
+        **{"submaps": "submaps", "entries": "entries", "matches": "matches", "loops": "loops"},
+        **{"objective": "objective", "chi2": "χ²", "dof": "dof", "contradicted": "contradicted"},
+        **{"entropy": "entropy [nat m³]", "known_volume": "known [m³]", "why": "why"},
+    }
+    shown = {k: v for k, v in columns.items() if any(k in c for c in candidates)}
+    why = note(join(["Why: ", str(found.get("why", "not said")), "."]))
+    return section("hypotheses", title, table(candidates, shown), why)

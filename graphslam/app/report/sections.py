@@ -12,16 +12,16 @@ from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import compact, folded, missing, note, section
 from graphslam.app.report.verdict import figures_of, stopped
 from graphslam.app.run.files import RESUMED
-from graphslam.app.run.metrics import is_time
 from graphslam.app.run.verdict import CONFIDENCE, class_rows
 from graphslam.core.config import dump_toml
 from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
+from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.ledger import EXCLUSIVE
 
 BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is honest"}
 ROUTINE = frozenset(
-    {"submap", "attitude", "between", "loop", "match-not-used", "hypothesis", "hypothesis-chosen"}
+    {"submap", "attitude", "between", "loop", "match-not-used"}
 )  # told elsewhere in the page, or once a submap
 _UNFINISHED = "the run was not finished."
 

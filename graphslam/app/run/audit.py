@@ -7,11 +7,11 @@ import logging
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.app.run.metrics import Metrics
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam.evaluate.metrics import Metrics
 from graphslam.frontends.base import FrontEnd
 from graphslam.io.catalog import locate
 from graphslam.io.victoria_park_published import read_slsjf_observations

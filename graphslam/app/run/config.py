@@ -13,27 +13,7 @@ from importlib import resources
 from typing import Any
 
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
-from graphslam.core.errors import ConfigError
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class MapConfig:
-    """The fused map at the end of a run whose submaps have evidence grids."""
-
-    fuse: bool = True
-    """Make it."""
-    low: float = 0.3
-    """Floor plans begin this far above the path [m] …"""
-    high: float = 1.8
-    """… and end this far above it."""
-    threads: int = 1
-    """That put pieces where they are; the map is the same with any number."""
-
-    def __post_init__(self) -> None:
-        if not self.high > self.low:
-            raise ConfigError(f"map: floor plans from {self.low} to {self.high} m; wanted low < high")
-        if self.threads < 1:
-            raise ConfigError(f"map.threads = {self.threads}; wanted ≥ 1")
+from graphslam.maps.run_map import MapConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

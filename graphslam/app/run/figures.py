@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphslam.app.run.plan_view import plan_pose, plan_submap
-from graphslam.core.geometry import rotation2, se2_transform
+from graphslam.core.geometry import se2_transform
 from graphslam.core.log import Truth
+from graphslam.core.plan_view import plan_pose, plan_submap
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -40,7 +40,7 @@ def draw_map(run: Run, ax: Any = None) -> Any:
     scored = run.gps.get("all")
     if scored is not None:
         fixes, T = scored.points + scored.residuals, scored.T_gps_map
-    R = rotation2(T[2])
+    landmarks, covariances = m.landmarks_in(T)
     truth = None
     if run.truth is not None:
         path = run.truth_path
@@ -54,8 +54,8 @@ def draw_map(run: Run, ax: Any = None) -> Any:
     axes = plot_map(
         ax,
         trajectory=m.trajectory.transformed(T),
-        landmarks=se2_transform(T, m.landmarks),
-        covariances=R @ m.landmark_covariances @ R.T,
+        landmarks=landmarks,
+        covariances=covariances,
         gps=fixes,
         truth=truth,
         dead_reckoning=None if reckoned is None else reckoned.transformed(T),

@@ -16,10 +16,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.folders.generations import check_same, consistent, outputs
-from graphslam.app.run.run import GlobalMap
 from graphslam.core.atomic import read_json, read_npz
 from graphslam.core.config import read_toml
 from graphslam.core.errors import DataError, FormatError, RunFolderError
+from graphslam.core.gaussian import first_no_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.json_file import check_json, parse_json, read_json_lines
 from graphslam.core.npz import Field, floats, ints, read_arrays, texts
@@ -28,6 +28,7 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 from graphslam.loops.ledger import EVENT, Decision, LoopLedger, ledger_of_events
+from graphslam.maps.global_map import GlobalMap
 
 GENERATION_EVENT = "generation"
 """First line of ``events.jsonl``: which state of the folder it is of."""
@@ -227,13 +228,9 @@ def read_map(root: Path) -> GlobalMap:
 
 def _check_covariances(covariances: Array, what: str, where: str) -> None:
     """Symmetric, and without a variance that rounding does not explain."""
-    if not covariances.size:
-        return
-    skew = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))
-    values = np.linalg.eigvalsh(covariances)
-    bad = np.flatnonzero((skew > 1e-6 * values[:, -1]) | (values[:, 0] < -1e-6 * np.abs(values[:, -1])))
-    if len(bad):
-        raise FormatError(f"{what}: number {bad[0]} is no covariance", where=where, got=covariances[bad[0]].tolist())
+    bad = first_no_covariance(covariances)
+    if bad is not None:
+        raise FormatError(f"{what}: number {bad} is no covariance", where=where, got=covariances[bad].tolist())
 
 
 def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:

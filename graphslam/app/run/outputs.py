@@ -34,18 +34,19 @@ from graphslam.app.run.files import (
     read_report,
 )
 from graphslam.app.run.maps import draw_run_map, write_run_map
-from graphslam.app.run.metrics import is_time
-from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.run import Run
 from graphslam.app.run.taken import write_taken
 from graphslam.core.atomic import write_npz
 from graphslam.core.digest import Digest
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.metrics import is_time
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
+from graphslam.maps.global_map import GlobalMap
 
 logger = logging.getLogger(__name__)
 OF_THE_CLOCK = ("seconds", RESUMED)

@@ -21,25 +21,9 @@ from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_back
 from graphslam.app.run.graph_facts import graph_facts
-from graphslam.app.run.maps import RunMap, has_grids, make_run_map, sensor_reach
-from graphslam.app.run.metrics import (
-    Metrics,
-    dead_reckoning_metrics,
-    flag_counts,
-    front_end_metrics,
-    gps_metrics,
-    imu_metrics,
-    map_truth,
-    solution_metrics,
-    time_metrics,
-    true_first_base,
-    truth_metrics,
-    truth_path,
-)
-from graphslam.app.run.metrics_space import truth_metrics_in_space
+from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import write_outputs
-from graphslam.app.run.reckoning import dead_reckoning
-from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.run import Run
 from graphslam.app.run.stream_use import stream_use
 from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
@@ -57,6 +41,22 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.landmark_checks import sighting_findings
+from graphslam.evaluate.metrics import (
+    Metrics,
+    dead_reckoning_metrics,
+    flag_counts,
+    front_end_metrics,
+    gps_metrics,
+    imu_metrics,
+    map_truth,
+    solution_metrics,
+    time_metrics,
+    true_first_base,
+    truth_metrics,
+    truth_metrics_in_space,
+    truth_path,
+)
+from graphslam.evaluate.reckoning import dead_reckoning
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evidence.formats import load_npz
@@ -65,6 +65,8 @@ from graphslam.io.catalog import load
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
+from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.run_map import RunMap, has_grids, make_run_map
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -299,7 +301,8 @@ def _judge(
     imu_metrics(out, back.graph, drops)
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     if fused is not None:
-        fused.metrics(out)
+        for row in fused.metrics():
+            out.add(*row)
         seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
         seconds["total"] += seconds["map"]
     scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
@@ -386,21 +389,3 @@ def _fused_map(
     except GraphSlamError as error:  # a run that is solved is not thrown away for its map
         logger.warning("no fused map: %s", error)
         return None, str(error)
-
-
-def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
-    """Trajectory at full rate, nodes, and the landmarks seen at least ``confirmed`` times."""
-    n = np.array([hits.get(int(i), 0) for i in solution.landmark_ids], dtype=np.int64)
-    keep = n >= confirmed
-    return GlobalMap(
-        trajectory=solution.trajectory(),
-        node_times=solution.node_times,
-        node_poses=solution.poses,
-        node_covariances=solution.node_covariances(),
-        landmark_ids=solution.landmark_ids[keep],
-        landmarks=solution.landmarks[keep],
-        landmark_covariances=solution.landmark_covariances()[keep],
-        landmark_hits=n[keep],
-        T_gps_world=solution.T_gps_world,
-        base_nodes=np.append(solution.base_nodes, solution.exit_nodes[-1]).astype(np.int64),
-    )

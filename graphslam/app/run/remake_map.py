@@ -7,23 +7,18 @@ from pathlib import Path
 
 from graphslam.app.folders.generations import new_generation, outputs
 from graphslam.app.folders.lock import locked
-from graphslam.app.hypotheses.runs import Clearest, clearest_of_run, write_clearest
+from graphslam.app.hypotheses import Clearest, clearest_of_choices, clearest_of_topologies, write_clearest
 from graphslam.app.report.report import report_beside
-from graphslam.app.run.config import MapConfig
 from graphslam.app.run.files import read_options
-from graphslam.app.run.maps import (
-    RunMap,
-    draw_run_map,
-    make_run_map,
-    sensor_reach,
-    write_run_map,
-)
+from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
 from graphslam.core.config import build, merge
-from graphslam.core.errors import MissingDataError
+from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.log import SensorLog
 from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps
+from graphslam.maps.run_map import MapConfig, RunMap, make_run_map
 
 
 @dataclass(frozen=True)
@@ -50,6 +45,8 @@ def remake_map(
     *,
     grid: bool = False,
     minimum_entropy: bool = False,
+    hypotheses: int = 0,
+    log: str | Path | SensorLog | None = None,
     low: float | None = None,
     high: float | None = None,
     progress: bool = True,
@@ -63,6 +60,10 @@ def remake_map(
         Write the evidence grid itself too.
     minimum_entropy : bool
         Solve the run with other choices of its matches and loops, and keep the clearest map and the others.
+    hypotheses : int
+        Instead so many topologies that SegSLAM's particles told are solved, for which the log is read once more.
+    log : card name, folder, or SensorLog; optional
+        Where the run's log is by now; default where it was.
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
     progress : bool
@@ -72,15 +73,23 @@ def remake_map(
     RunFolderError
         Not a finished run, or another process is writing into it.
     MissingDataError
-        A run without evidence grids.
+        A run without evidence grids; no log to find hypotheses in.
+    ConfigError
+        Both kinds of alternatives at once, or hypotheses of another front end.
     FormatError, DataError
     """
+    if minimum_entropy and hypotheses:
+        raise ConfigError(
+            "a run is solved with other choices of its matches or with other topologies, not both at once"
+        )
     home = Path(folder)
     if not (outputs(home) / "run.json").is_file():
         open_run(home)  # says what is wrong
     with locked(home):
         run, made = map_of_folder(home, low=low, high=high)
-        found = clearest_of_run(run, made, progress=progress) if minimum_entropy else None
+        found = clearest_of_choices(run, made, progress=progress) if minimum_entropy else None
+        if hypotheses:
+            found = clearest_of_topologies(run, hypotheses, log=log, progress=progress)
         with new_generation(home) as new:
             files = write_run_map(new, made, run.report.get("generation"))
             if grid:

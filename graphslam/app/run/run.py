@@ -12,7 +12,6 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.core.findings import Finding, findings_of_json
-from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.markup import element, frame, join
@@ -20,62 +19,16 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
+from graphslam.maps.global_map import GlobalMap
 
 if TYPE_CHECKING:
-    from graphslam.app.run.maps import RunMap
     from graphslam.app.run.taken import Taken
     from graphslam.app.run.without_truth import WithoutTruth
     from graphslam.graph.pose_graph import PoseGraph
+    from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
 
 Ints = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class GlobalMap:
-    """The solved map, in the frame of the first base.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Full rate, ``T_world_base(t)`` with covariances.
-    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3|7), (m + 1, d, d)
-        Bases of the submaps, their inner nodes, and the end of the last.
-    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
-        Confirmed landmarks.
-    landmark_hits : (n,)
-        Sightings over all submaps.
-    T_gps_world : (3,) or (7,) or None
-        Map → GPS frame, where GPS was in the graph.
-    base_nodes : (k + 1,) int or None
-        Which nodes are bases of submaps or the end of the last; None: all.
-    """
-
-    trajectory: Trajectory
-    node_times: Array
-    node_poses: Array
-    node_covariances: Array
-    landmark_ids: Ints
-    landmarks: Array
-    landmark_covariances: Array
-    landmark_hits: Ints
-    T_gps_world: Array | None = None
-    base_nodes: Ints | None = None
-
-    @property
-    def dim(self) -> int:
-        """2 or 3."""
-        return self.trajectory.dim
-
-    @property
-    def base_poses(self) -> Array:
-        """Bases of the submaps and the end of the last ``(k + 1, 3|7)``."""
-        return self.node_poses if self.base_nodes is None else self.node_poses[self.base_nodes]
-
-    @property
-    def base_times(self) -> Array:
-        """When the body was there ``(k + 1,)`` [s]."""
-        return self.node_times if self.base_nodes is None else self.node_times[self.base_nodes]
 
 
 @dataclass(frozen=True)

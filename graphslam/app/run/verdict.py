@@ -12,11 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from scipy import stats
-
 from graphslam.app.run.stream_use import StreamUse
 from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
+from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
 from graphslam.evaluate.without_truth import two_sided
 
@@ -28,6 +27,8 @@ IN_WORDS = {
     "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
     "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
 }
+CERTAIN_OVER_CONFIDENT = two_sided_width(CERTAIN) / two_sided_width(CONFIDENCE)
+"""Ratio of the two-sided bounds of a normal variable at the two levels."""
 EXACT = 1e-12
 """χ²/dof below which all measurements are met to the last digit, as in a chain that never closes."""
 SMALL_GAP = 1e-6
@@ -236,7 +237,7 @@ def _tests(figures: Figures) -> list[Finding]:
     cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
     judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
     alike, white = m.get("gps_nis_joint_autocorrelation"), m.get("gps_nis_joint_white")
-    if alike is not None and white is not None and abs(alike) > white * stats.norm.isf(0.5e-3) / stats.norm.isf(0.025):
+    if alike is not None and white is not None and abs(alike) > white * CERTAIN_OVER_CONFIDENT:
         text = f"Errors of withheld fixes are alike from one to the next (correlation {alike:.2f}; independent ones "
         text += f"stay within ± {white:.2f} in 95 % of the runs): {_LASTS}"
         out.append(Finding("look", "gps-correlated", text))
@@ -282,7 +283,7 @@ def _flagged(figures: Figures) -> list[Finding]:
         return []
     why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and number(v))
     text = f"{flagged:g} of {n:g} submaps were flagged by the front end ({why})"
-    usual = stats.binom.ppf(CERTAIN, int(n), FLAGGED) if n else 0.0
+    usual = by_chance(int(n), FLAGGED, CERTAIN)
     if flagged <= usual:
         return [Finding("", "flagged", f"{text}: not more than chance flags.")]
     return [Finding("look", "flagged", f"{text}; chance flags more than {usual:g} in one honest run of a thousand.")]

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.run.config import RunConfig
-from graphslam.app.run.metrics import Metrics
 from graphslam.backend.streams import split
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
@@ -18,6 +17,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
 from graphslam.evaluate.loop_consistency import LoopConsistency, find_loops, loop_consistency
+from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.without_truth import ClassConsistency, class_consistency
 from graphslam.graph.pose_graph import PoseGraph
 

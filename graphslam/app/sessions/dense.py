@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,78 +12,20 @@ from graphslam.app.folders.generations import consistent
 from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.sessions import DenseSession, InnerTie, ties_of_graph, ties_of_network
 from graphslam.core.config import build
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import group_of
-from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.formats import load_npz
-from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.session_ties import SessionMap
 
 SPACING = 3.0
 """Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""
-
-
-@dataclass(frozen=True)
-class InnerTie:
-    """A factor between two nodes of one run that are no neighbours: a re-entry or a loop."""
-
-    i: int
-    j: int
-    T_ij: Array
-    covariance: Array
-    robust: Robust
-
-
-@dataclass(frozen=True)
-class DenseSession:
-    """A run of dense submaps, ready to be put into a graph.
-
-    Parameters
-    ----------
-    name : str
-    submaps : list of Submap
-        Keys and clock of the common graph.
-    config : BackEndConfig
-    map : SessionMap
-    inner : list of InnerTie
-        Nodes counted from the session's first base.
-    shift : float
-        Seconds that were added to its clock.
-    fixes : Gps or None
-        On the common clock.
-    gps : GpsOptions
-    T_gps_base : (7,) or (3,) or None
-        First base in the GPS frame by the run's own graph.
-    """
-
-    name: str
-    submaps: list[Submap]
-    config: BackEndConfig
-    map: SessionMap
-    inner: list[InnerTie]
-    shift: float = 0.0
-    fixes: Gps | None = None
-    gps: GpsOptions = field(default_factory=GpsOptions)
-    T_gps_base: Array | None = None
-
-    @property
-    def chain(self) -> Array:
-        """Its nodes by its own exits and paths alone, in the frame of its first base ``(m + 1, 7|3)``."""
-        T = self.map.increments
-        g = group_of(T)
-        out = [g.identity]
-        for step in T:
-            out.append(g.compose(out[-1], step))
-        return np.stack(out)
 
 
 def is_dense(run: Run) -> bool:
@@ -163,19 +105,12 @@ def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
             "a run whose submaps have no inner nodes cannot be tied", where=run.name, wanted="backend.node_spacing > 0"
         )
     if run.graph is not None:
-        rows = [r for r in run.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
-        return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
+        return ties_of_graph(run.graph)
     net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
     kernel = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
-    out, chained = [], set()
-    for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
-        if j == i + 1 and i not in chained:  # the chain itself is made again from the submaps
-            chained.add(i)
-            continue
-        out.append(InnerTie(i, j, T, _inverse(info), kernel))
-    return out
+    return ties_of_network(net, kernel)
 
 
 def _graph_of(run: Run, root: Path) -> PoseNetwork | None:
@@ -186,45 +121,3 @@ def _graph_of(run: Run, root: Path) -> PoseNetwork | None:
     if now != then:
         raise DataError("the run was changed since it was read", where=str(run.folder), got=now, wanted=then)
     return read_g2o(root / "graph.g2o")
-
-
-def _inverse(information: Array) -> Array:
-    P = np.linalg.inv(information)
-    return 0.5 * (P + P.T)
-
-
-def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
-    """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-    session : DenseSession
-    start : (7,) or (3,), optional
-        Where it is thought to begin; None for the first session, which begins at the origin.
-    use_gps : bool
-        With its fixes, if it has any.
-
-    Returns
-    -------
-    int
-        Node of its first base.
-    """
-    c = session.config
-    node = 0 if start is None else graph.start_session(start)
-    for s in session.submaps:
-        graph.add_submap(
-            s,
-            covariance_scale=c.covariance_scale,
-            spacing=c.node_spacing,
-            level_sigma=c.level_sigma if s.dim == 3 and c.level_sigma > 0 else None,
-        )
-    for t in session.inner:
-        graph.add_between(
-            node + t.i, node + t.j, t.T_ij, t.covariance, streams=[f"{session.name}/scan"], evidence="shared-scan",
-            robust=t.robust, group="match",
-        )  # fmt: skip
-    if use_gps and session.fixes is not None:
-        graph.add_gps(session.fixes, config=session.gps)
-        graph.finish_gps()
-    return node

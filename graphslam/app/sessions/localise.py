@@ -16,9 +16,9 @@ from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.run import Run
-from graphslam.app.sessions.dense import DenseSession, back_end_config, is_dense, put, session_of, with_grids
-from graphslam.app.sessions.dense_ties import attach
+from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_grids
 from graphslam.app.threads import one_blas_thread
+from graphslam.backend.sessions import DenseSession, attach, put
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.run.outputs import open_run
-from graphslam.app.run.run import GlobalMap, Run
+from graphslam.app.run.run import Run
 from graphslam.app.sessions.dense import is_dense
 from graphslam.app.sessions.merge_align import By, align_runs, of_session
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
@@ -28,6 +28,7 @@ from graphslam.core.geometry import Array
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.loops.sessions import Alignment
+from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 

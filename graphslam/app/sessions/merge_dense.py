@@ -11,15 +11,15 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from graphslam.app.run.metrics import Metrics
-from graphslam.app.run.plan_view import plan_path
 from graphslam.app.run.run import Run, metric_value
-from graphslam.app.sessions.dense import DenseSession, put, session_of
-from graphslam.app.sessions.dense_ties import SESSION, Attached, attach, attach_by_gps
+from graphslam.app.sessions.dense import session_of
+from graphslam.backend.sessions import SESSION, Attached, DenseSession, attach, attach_by_gps, put
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
+from graphslam.core.plan_view import plan_path
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.metrics import Metrics, base_metrics
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.session_ties import TieConfig
@@ -253,10 +253,7 @@ def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
         true.append(truth.transformed(T).interpolate(path.times[keep]))
         shift = times[-1][-1] + 1.0 - min(path.times[0], 0.0)
         if s.attached is not None:
-            e = g.log(g.between(s.T_world_base, T))
-            out.add(f"{s.name}_base_error", float(np.linalg.norm(e[g.position])), "m", "lower")
-            out.add(f"{s.name}_base_nees", float(e @ np.linalg.solve(s.covariance, e)))
-            out.add(f"{s.name}_base_nees_dof", g.dof)
+            base_metrics(out, s.name, s.T_world_base, T, s.covariance)
         if "path_rmse_aligned" in set(s.run.metrics["key"]):
             out.add(f"{s.name}_path_rmse_alone", s.run.metric("path_rmse_aligned"), "m", "lower")
     both = Trajectory(np.concatenate(times), np.concatenate(estimated))

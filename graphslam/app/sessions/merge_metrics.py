@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from graphslam.app.run.metrics import Metrics
 from graphslam.core.errors import DataError
-from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.metrics import Metrics, add_nees, rms
 from graphslam.evaluate.trajectory_error import associate
 from graphslam.solve.solution import Solution
 
@@ -84,11 +83,7 @@ def _score(
         error = (true_points[j] - points).ravel()
         P = solution.covariance.columns(columns)
         dof = len(error) - 3
-        nees = aligned_nees(error, P, gauge_directions(np.zeros((0, 3)), points))
-        out.add("nees_aligned_landmarks", nees)
-        out.add("nees_aligned_landmarks_dof", dof)
-        out.add("nees_aligned_landmarks_per_dof", nees / dof, "", "one")
-        out.add("ci_aligned_landmarks", nees / chi2_quantile(0.95, dof), "", "lower")
+        add_nees(out, "nees_aligned_landmarks", aligned_nees(error, P, gauge_directions(np.zeros((0, 3)), points)), dof)
     for s in sessions:
         truth, path = s.run.truth, s.run.truth_path
         if truth is None or path is None:
@@ -102,8 +97,8 @@ def _score(
         if len(a) == 0:
             continue
         where = se2_transform(fit.T_truth_estimate, s.map.trajectory.positions[b])
-        error = np.linalg.norm(where - se2_transform(frames.T_truth_estimate, path.positions[a]), axis=1)
-        out.add(f"{s.name}_path_rmse", float(np.sqrt(np.mean(error**2))), "m", "lower")
+        error = where - se2_transform(frames.T_truth_estimate, path.positions[a])
+        out.add(f"{s.name}_path_rmse", rms(error), "m", "lower")
         for key, name in (("landmark_rmse_aligned", "landmark_rmse_alone"), ("path_rmse_aligned", "path_rmse_alone")):
             if key in set(s.run.metrics["key"]):
                 out.add(f"{s.name}_{name}", s.run.metric(key), "m", "lower")

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.app.run.run import GlobalMap, Run, metric_value
+from graphslam.app.run.run import Run, metric_value
 from graphslam.core.geometry import Array
 from graphslam.core.markup import element, frame, join
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.places import Ints
 from graphslam.loops.sessions import Alignment
+from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.solution import Solution
 
 

@@ -133,28 +133,27 @@ def test_every_decision_with_its_reason(copy: Path) -> None:
 def test_hypotheses_and_runners_up(copy: Path) -> None:
     out = copy
     assert "Missing: " in Page(make_report(out).html).sections["hypotheses"]
-    facts = {"withdrawn": None, "submaps": 4, "entries": [[0, 3]], "loops": 1, "chi2": 7.5, "dof": 9, "entropy": 12.5}
-    add_events(
-        out,
-        [
-            {"event": "hypothesis", "hypothesis": 1, "support": 0.25, **facts, "contradicted": False},
-            {"event": "hypothesis", "hypothesis": 0, "support": 0.75, **facts, "contradicted": True},
-            {"event": "hypothesis-chosen", "hypothesis": 1, "why": "hypothesis 0 is contradicted", "left_out": 2},
-        ],
-    )
-    best = {"choice": "support ≥ 0.9", "matches": 3, "entropy": 11.5, "known_volume": 80.0, "objective": 5.5}
-    candidates = [best, {**best, "choice": "no match", "entropy": 13.5}]
-    (out / "clearest.json").write_text(json.dumps({"format": "graphslam.clearest/1", "candidates": candidates}))
+    clearest = {"format": "graphslam.clearest/1", "why": "hypothesis 0 is contradicted"}
+    facts = {"withdrawn": [0, 3], "submaps": 4, "entries": [[0, 3]], "loops": 1, "chi2": 7.5, "dof": 9, "entropy": 12.5}
+    topologies = [
+        {"verdict": "chosen", "choice": "hypothesis 1", "support": 0.25, **facts, "contradicted": False},
+        {"verdict": "runner-up", "choice": "hypothesis 0", "support": 0.75, **facts, "contradicted": True},
+    ]
+    (out / "clearest.json").write_text(json.dumps({**clearest, "candidates": topologies}))
     page = Page(make_report(out).html)
-    rows = page.table("hypotheses", "hypothesis", "chosen").records()
-    assert [(r["hypothesis"], r["chosen"], r["contradicted"]) for r in rows] == [
-        ("1", "chosen", "no"),
-        ("0", "runner-up", "yes"),
+    rows = page.table("hypotheses", "choice", "entry withdrawn").records()
+    assert [(r["choice"], r["verdict"], r["contradicted"]) for r in rows] == [
+        ("hypothesis 1", "chosen", "no"),
+        ("hypothesis 0", "runner-up", "yes"),
     ]
     assert "hypothesis 0 is contradicted" in page.sections["hypotheses"]
+    best = {"choice": "support ≥ 0.9", "matches": 3, "entropy": 11.5, "known_volume": 80.0, "objective": 5.5}
+    candidates = [best, {**best, "choice": "no match", "entropy": 13.5}]
+    (out / "clearest.json").write_text(json.dumps({**clearest, "candidates": candidates}))
+    page = Page(make_report(out).html)
     choices = page.table("hypotheses", "matches", "entropy [nat m³]").records()
     assert [r["entropy [nat m³]"] for r in choices] == ["11.5", "13.5"]
-    assert "hypothesis-chosen" in page.sections["events"]
+    assert "support" not in choices[0]
 
 
 def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.app.hypotheses.runs import solve_choice
 from graphslam.app.run import config as cfg
 from graphslam.app.run import pipeline
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.pipeline import again
 from graphslam.backend.config import BackEndConfig
+from graphslam.backend.hypotheses import solve_choice
 from graphslam.backend.streams import ImuPart, imus_of
 from graphslam.core.config import build
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError

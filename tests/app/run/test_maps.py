@@ -11,21 +11,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses.runs import choices_of_matches, clearest_of_run, solve_choice
+from graphslam.app.hypotheses import clearest_of_choices, clearest_of_topologies
 from graphslam.app.run import config as cfg
-from graphslam.app.run.maps import floor_bands, make_run_map, nodes_by_submap, sensor_reach
+from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import BackEndConfig
+from graphslam.backend.hypotheses import choices_of_matches, solve_choice
 from graphslam.core.config import build, read_toml
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.poses import SE3, level
 from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
+from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum
 from graphslam.maps.fuse import fuse
+from graphslam.maps.run_map import floor_bands, make_run_map, nodes_by_submap
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -81,7 +84,7 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     assert finished.folder is not None
     values = read_toml(finished.folder / "config.toml")
     config = build(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
-    from graphslam.app.run.pipeline import make_map
+    from graphslam.maps.global_map import make_map
 
     m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
     made = make_run_map(bare, m, reach=8.0)
@@ -148,17 +151,58 @@ def test_every_choice_of_matches_is_solved_before_it_is_ranked(finished: Run) ->
     choices = choices_of_matches(submaps, 0.5)
     assert choices["as the run"] == choices_of_matches(again.submaps, 0.5)["as the run"]
     assert len(set(choices.values())) == len(choices)
-    found = clearest_of_run(replace(again, submaps=submaps), made, progress=False)
-    assert len(found.rows) == len(choices)
-    rows = {r["choice"]: r for r in found.rows}
+    found = clearest_of_choices(replace(again, submaps=submaps), made, progress=False)
+    table = found.choice.rows()
+    assert len(table) == len(choices)
+    rows = {r["choice"]: r for r in table}
     last = (b.key, len(b.matches))
     bent = [name for name, chosen in choices.items() if last in chosen]
     assert bent
-    assert found.rows[0]["choice"] not in bent
+    assert table[0]["choice"] not in bent
     assert all(rows[name]["objective"] > rows["as the run"]["objective"] + 20 for name in bent)
     assert all(rows[name]["contradicted"] and "contradicted" in rows[name]["why"] for name in bent)
     # under its kernel a wrong match hardly counts; what is judged is the match without it
     assert all(rows[name]["chi2"] > 2 * rows[name]["objective"] for name in bent)
+
+
+def test_topologies_of_the_particles_become_graphs(finished: Run, tmp_path: Path) -> None:
+    """The log is read once more: the chain that the run handed over, and the same without its entries."""
+    assert finished.folder is not None
+    assert finished.log is not None
+    folder, log = tmp_path / "run", tmp_path / "log"
+    shutil.copytree(finished.folder, folder)
+    save_log(finished.log, log)
+    done = graphslam("map", folder, "--hypotheses", "3", "--log", log, "--json")
+    assert done.returncode == 0, done.stderr
+    value = json.loads(done.stdout)
+    rows = value["candidates"]
+    assert 1 < len(rows) <= 3
+    assert [r["verdict"] for r in rows] == ["chosen"] + ["runner-up"] * (len(rows) - 1)
+    assert rows[0]["why"] == value["chosen_because"]
+    (own,) = [r for r in rows if r["choice"] == "hypothesis 0"]
+    assert (own["withdrawn"], own["submaps"]) == (None, len(finished.submaps))
+    assert 0 < own["support"] <= 1
+    entered = {(m.target, s.key) for s in finished.submaps for m in s.matches}
+    withdrawn = {tuple(r["withdrawn"]) for r in rows if r["withdrawn"] is not None}
+    assert withdrawn
+    assert withdrawn <= entered
+    kept = json.loads((folder / "clearest.json").read_text())["candidates"]
+    for r in kept:
+        path, graph = (folder / f for f in r["files"])
+        assert read_tum(path, dim=3).times[-1] == finished.map.trajectory.times[-1]
+        assert "EDGE_SE3" in graph.read_text()
+    assert len({(folder / r["files"][0]).read_bytes() for r in kept}) == len(kept)
+    assert "hypothesis 0" in (folder / "report.html").read_text()
+
+    refused("map", folder, "--hypotheses", "2", "--minimum-entropy", "--log", log, saying="not both at once")
+    save_log(finished.log.slice(0.0, 20.0), tmp_path / "other")
+    refused("map", folder, "--hypotheses", "2", "--log", tmp_path / "other", saying="not that of the run")
+    foreign = replace(finished, folder=tmp_path / "foreign")
+    shutil.copytree(folder, tmp_path / "foreign")
+    config = tmp_path / "foreign" / "config.toml"
+    config.write_text(config.read_text().replace('frontend = "segslam"', 'frontend = "rbpf-grid"'))
+    with pytest.raises(ConfigError, match="'rbpf-grid' tells one topology"):
+        clearest_of_topologies(foreign, 2, log=finished.log)
 
 
 def test_runs_without_grids_are_as_before_and_say_so(tmp_path: Path) -> None:

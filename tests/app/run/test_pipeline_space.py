@@ -12,10 +12,10 @@ import pytest
 
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import open_run
-from graphslam.app.run.plan_view import plan_covariance, plan_pose
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import se2_between, se2_log
 from graphslam.core.log import SensorLog, Truth
+from graphslam.core.plan_view import plan_covariance, plan_pose
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Match, Submap

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from graphslam.app.compare import map_nees
-from graphslam.app.run.metrics import map_truth
 from graphslam.app.studies.combined_report import (
     GLOBAL,
     agreement,
@@ -25,6 +24,7 @@ from graphslam.app.studies.combined_slam import STUDY
 from graphslam.app.studies.combined_trial import TrialConfig, _Trial, run_trial
 from graphslam.app.studies.definition import StudyDefinition, find_study
 from graphslam.core.errors import UnknownNameError
+from graphslam.evaluate.metrics import map_truth
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.join.submap_solver import solve_submaps
 

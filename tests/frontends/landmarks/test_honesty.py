@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.run.metrics import Metrics, flag_counts, front_end_metrics
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.random import SeedTree
+from graphslam.evaluate.metrics import Metrics, flag_counts, front_end_metrics
 from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam.frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
 from graphslam.frontends.landmarks.honesty import flag, pool, variance_bounds

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.app.run.plan_view import plan_path
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
+from graphslam.core.plan_view import plan_path
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory

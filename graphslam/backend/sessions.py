@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
 
-from graphslam.app.sessions.dense import DenseSession, put
+from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.core.errors import DataError, SolverError
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.core.records import Gps
+from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
@@ -19,8 +23,122 @@ from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.graph_relative import GraphRelative
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.loops.session_ties import TieConfig, Ties, TwoSessions, start_of
+from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions, start_of
 from graphslam.solve.registry import Solver
+
+
+@dataclass(frozen=True)
+class InnerTie:
+    """A factor between two nodes of one run that are no neighbours: a re-entry or a loop."""
+
+    i: int
+    j: int
+    T_ij: Array
+    covariance: Array
+    robust: Robust
+
+
+@dataclass(frozen=True)
+class DenseSession:
+    """A run of dense submaps, ready to be put into a graph.
+
+    Parameters
+    ----------
+    name : str
+    submaps : list of Submap
+        Keys and clock of the common graph.
+    config : BackEndConfig
+    map : SessionMap
+    inner : list of InnerTie
+        Nodes counted from the session's first base.
+    shift : float
+        Seconds that were added to its clock.
+    fixes : Gps or None
+        On the common clock.
+    gps : GpsOptions
+    T_gps_base : (7,) or (3,) or None
+        First base in the GPS frame by the run's own graph.
+    """
+
+    name: str
+    submaps: list[Submap]
+    config: BackEndConfig
+    map: SessionMap
+    inner: list[InnerTie]
+    shift: float = 0.0
+    fixes: Gps | None = None
+    gps: GpsOptions = field(default_factory=GpsOptions)
+    T_gps_base: Array | None = None
+
+    @property
+    def chain(self) -> Array:
+        """Its nodes by its own exits and paths alone, in the frame of its first base ``(m + 1, 7|3)``."""
+        T = self.map.increments
+        g = group_of(T)
+        out = [g.identity]
+        for step in T:
+            out.append(g.compose(out[-1], step))
+        return np.stack(out)
+
+
+def ties_of_graph(graph: PoseGraph) -> list[InnerTie]:
+    """Factors of the graph of a run beside its chain."""
+    rows = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
+    return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
+
+
+def ties_of_network(net: PoseNetwork, kernel: Robust) -> list[InnerTie]:
+    """The same of the file of a graph, which holds no kernels."""
+    out, chained = [], set()
+    for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
+        if j == i + 1 and i not in chained:  # the chain itself is made again from the submaps
+            chained.add(i)
+            continue
+        out.append(InnerTie(i, j, T, _inverse(info), kernel))
+    return out
+
+
+def _inverse(information: Array) -> Array:
+    P = np.linalg.inv(information)
+    return 0.5 * (P + P.T)
+
+
+def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
+    """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    session : DenseSession
+    start : (7,) or (3,), optional
+        Where it is thought to begin; None for the first session, which begins at the origin.
+    use_gps : bool
+        With its fixes, if it has any.
+
+    Returns
+    -------
+    int
+        Node of its first base.
+    """
+    c = session.config
+    node = 0 if start is None else graph.start_session(start)
+    for s in session.submaps:
+        graph.add_submap(
+            s,
+            covariance_scale=c.covariance_scale,
+            spacing=c.node_spacing,
+            level_sigma=c.level_sigma if s.dim == 3 and c.level_sigma > 0 else None,
+        )
+    for t in session.inner:
+        graph.add_between(
+            node + t.i, node + t.j, t.T_ij, t.covariance, streams=[f"{session.name}/scan"], evidence="shared-scan",
+            robust=t.robust, group="match",
+        )  # fmt: skip
+    if use_gps and session.fixes is not None:
+        graph.add_gps(session.fixes, config=session.gps)
+        graph.finish_gps()
+    return node
+
 
 logger = logging.getLogger(__name__)
 SESSION = "session"

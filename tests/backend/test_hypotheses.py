@@ -6,12 +6,14 @@ import copy
 import json
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses.hypotheses import HypothesesConfig, Hypothesis, find_hypotheses, topologies, topology
 from graphslam.app.studies.segslam_trial import QUICK, GridTrial
+from graphslam.backend.config import BackEndConfig
+from graphslam.backend.hypotheses import Hypothesis, hypotheses_of, solve_hypotheses, topologies, topology
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
@@ -21,10 +23,17 @@ from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segmap import MATCH, NEW
 from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.frontends.segslam.submaps import sampled_chain, settled_chain
+from graphslam.maps.alternatives import Alternative, choose
 from graphslam.maps.pieces import DivisionConfig
 
 COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
-CONFIG = HypothesesConfig(spacing=1.5, division=DivisionConfig(reach=8.5))
+CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)
+DIVISION = DivisionConfig(reach=8.5)
+
+
+def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[Hypothesis], list[Alternative]]:
+    told, _ = hypotheses_of(result, most, drift=COURT, **options)
+    return told, solve_hypotheses(told, CONFIG, division=DIVISION)
 
 
 @pytest.fixture(scope="module")
@@ -69,69 +78,57 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
         assert p == max(same, key=lambda k: divided.weights[k])
 
 
-def test_the_clearest_graph_is_chosen_and_the_others_are_kept(trial: GridTrial, result: SegSlamResult) -> None:
-    found = find_hypotheses(result, COURT, CONFIG)
-    assert len(found.order) == 2  # the loop, and what would be without it
-    honest = [h for h in found.order if not h.contradicted]
-    assert found.best is min(honest, key=lambda h: h.clarity.entropy)
-    assert found.best_map.entropy() == pytest.approx(found.best.clarity.entropy)
-    closed, open_chain = found.order
+def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlamResult) -> None:
+    told, graphs = solved(result)
+    assert len(told) == len(graphs) == 2
+    choice = choose(graphs)
+    assert [j.alternative.name for j in choice.order] == ["hypothesis 0", "hypothesis 1"]
+    assert choice.best_map.entropy() == pytest.approx(choice.best.clarity.entropy)
+    closed, open_chain = told
     assert closed.withdrawn is None
-    (entry,) = [d for d in closed.ledger.current() if d.source == "front-end"]  # beside it ties along the segment
-    assert (entry.verdict, entry.submap_i, entry.submap_j) == ("accepted", *closed.entries[0])
-    assert closed.loops >= 1
     assert open_chain.withdrawn == closed.entries[0]
-    assert open_chain.loops == 0
-    assert closed.clarity.entropy < 0.97 * open_chain.clarity.entropy
+    assert [a.facts["loops"] > 0 for a in graphs] == [True, False]
+    assert choice.order[0].clarity.entropy < 0.97 * choice.order[1].clarity.entropy
 
-    def error(h: Hypothesis) -> float:
-        path = h.solution.trajectory()
+    def error(a: Alternative) -> float:
+        path = a.solution.trajectory()
         truth = Trajectory(trial.steps.times, trial.truth).interpolate(path.times)
         return float(ate(path, Trajectory(path.times, truth), alignment="se").statistics.rmse)
 
-    assert error(closed) < 0.5 * error(open_chain)
-
-
-def test_what_is_said_of_them(result: SegSlamResult) -> None:
-    found = find_hypotheses(result, COURT, CONFIG)
-    events = found.events()
-    assert json.loads(json.dumps(events)) == events
-    assert events[-1]["hypothesis"] == found.best.number
-    assert f"hypothesis {found.best.number}" in found.why()
-    assert list(found.table()["hypothesis"]) == [h.number for h in found.order]
-    one = find_hypotheses(result, COURT, replace(CONFIG, most=1))
-    assert len(one.order) == 1
-    assert "one topology" in one.why()
-    again = find_hypotheses(result, COURT, CONFIG)
-    np.testing.assert_array_equal(again.best.solution.poses, found.best.solution.poses)
+    assert error(graphs[0]) < 0.5 * error(graphs[1])
+    rows = choice.rows()
+    assert json.loads(json.dumps(rows)) == rows
+    assert [r["withdrawn"] for r in rows] == [None, list(closed.entries[0])]
+    again = solved(result)[1]
+    np.testing.assert_array_equal(again[0].solution.poses, graphs[0].solution.poses)
+    one, alone = solved(result, 1)
+    assert len(one) == 1
+    assert "only one" in choose(alone).why()
 
 
 def test_map_samples_become_graphs_too(trial: GridTrial, result: SegSlamResult) -> None:
     """Chains of segments of several particles, each different, all solved before they are compared."""
-    few = find_hypotheses(result, COURT, replace(CONFIG, withdraw=False))
-    found = find_hypotheses(result, COURT, replace(CONFIG, withdraw=False, samples=6))
-    sampled = [h for h in found.order if h.particle == -1]
+    told, left_out = hypotheses_of(result, 1, drift=COURT, samples=6)
+    assert left_out == 0
+    sampled = [h for h in told if h.particle == -1]
     assert 1 <= len(sampled) <= 6
-    assert len(found.order) == len(few.order) + len(sampled)
-    assert len({h.chain.tobytes() for h in found.order}) == len(found.order)
+    assert len(told) == 1 + len(sampled)
+    assert len({h.chain.tobytes() for h in told}) == len(told)
     segmap = result.segmap
     for h in sampled:
         bounds = [segmap[int(i)].interval for i in h.chain]
         assert all(a[1] == b[0] for a, b in pairwise(bounds))
         assert (bounds[0][0], bounds[-1][1]) == (0, max(b for _, b in bounds))
         # what a sample stands for is the share of the particles that tell the same
-        assert h.support == pytest.approx(few.order[0].support)
-        path = h.solution.trajectory()
-        assert path.times[-1] == few.best.solution.trajectory().times[-1]
-    assert found.best.clarity.entropy <= few.best.clarity.entropy
+        assert h.support == pytest.approx(told[0].support)
+    few = solve_hypotheses(told[:2], CONFIG, division=DIVISION)
+    assert few[0].solution.trajectory().times[-1] == few[1].solution.trajectory().times[-1]
     sample = result.sample(0)
     assert sorted(sample.segments.tolist()) == sorted(sampled_chain(segmap, sample).tolist())
     with pytest.raises(DataError, match="open"):
         sampled_chain(segmap, replace(sample, segments=np.array([*sample.segments[:-1], -1])))
 
 
-def test_impossible_settings() -> None:
+def test_at_least_one_is_asked_for(result: SegSlamResult) -> None:
     with pytest.raises(ConfigError, match="at least 1"):
-        HypothesesConfig(most=0)
-    with pytest.raises(ConfigError, match="probabilities"):
-        HypothesesConfig(contradiction=0.0)
+        hypotheses_of(result, 0, drift=COURT)

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses.alternatives import Alternative, chi2_of, choose, noise_scale, write_choice
-from graphslam.app.hypotheses.runs import LOOP, choices_of_matches, solve_choice
+from graphslam.app.hypotheses import Clearest, write_clearest
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.hypotheses import LOOP, choices_of_matches, solve_choice
 from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.noise import Robust
 from graphslam.loops.ledger import Decision, ledger_of_events
+from graphslam.maps.alternatives import Alternative, chi2_of, choose, noise_scale
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
@@ -108,7 +109,7 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
 
     (tmp_path / "alternatives").mkdir()
     (tmp_path / "alternatives" / "99.tum").write_text("of an earlier choice")
-    files = write_choice(tmp_path, choice, choice.rows(), left_out=3)
+    files = write_clearest(tmp_path, Clearest(choice, 3))
     assert all(p.is_file() for p in files)
     assert not (tmp_path / "alternatives" / "99.tum").exists()
     kept = json.loads((tmp_path / "clearest.json").read_text())

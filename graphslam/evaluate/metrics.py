@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.app.run.plan_view import plan_path, plan_pose
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.poses import group_of
+from graphslam.core.plan_view import plan_path, plan_pose
+from graphslam.core.poses import SE3, group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -276,16 +276,17 @@ def truth_metrics(
         out.add("path_rmse_aligned", whole.statistics.rmse, "m", "lower")
         out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
     P = P[np.ix_(ix, ix)]
-    _add_nees(out, "nees", joint_nees(error, covariance=P), len(error))
+    add_nees(out, "nees", joint_nees(error, covariance=P), len(error))
     gauge = gauge_directions(solution.poses[node], points)
     parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
     for name, part in parts.items():
         dof = len(error[part]) - 3
         if dof > 0:
-            _add_nees(out, f"nees_aligned{name}", aligned_nees(error[part], P[part, part], gauge[part]), dof)
+            add_nees(out, f"nees_aligned{name}", aligned_nees(error[part], P[part, part], gauge[part]), dof)
 
 
-def _add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
+def add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
+    """A NEES, its dimension, the two by each other, and the consistency index (eq. 20)."""
     out.add(key, nees)
     out.add(f"{key}_dof", dof)
     out.add(f"{key}_per_dof", nees / dof, "", "one")
@@ -343,3 +344,56 @@ def _contradiction(graph: PoseGraph) -> None:
             ways.ratio,
             high,
         )
+
+
+BLOCKS = {"position": slice(3, 6), "heading": slice(2, 3), "level": slice(0, 2)}
+"""Tangent components of the blocks that honesty is told by: position, heading, roll and pitch."""
+
+
+def truth_metrics_in_space(
+    out: Metrics, solution: Solution, truth: MapTruth, *, path: Trajectory | None = None
+) -> None:
+    """RMSE and NEES of the ends of the submaps with the first base fixed, and errors of the path after an alignment.
+
+    Errors are right tangents, ``Log(T_est⁻¹ T_true)``. The NEES of a block is the mean over the submaps of that of its
+    marginal; ``nees`` itself is that of all ends jointly.
+
+    Parameters
+    ----------
+    path : Trajectory, optional
+        True path at full rate.
+    """
+    i, j = match_ids(solution.submap_keys, truth.keys)
+    nodes = solution.exit_nodes[i]
+    e = SE3.log(SE3.between(solution.poses[nodes], truth.exit_poses[j]))
+    out.add("pose_rmse", rms(e[:, BLOCKS["position"]]), "m", "lower")
+    out.add("heading_rmse", np.rad2deg(rms(e[:, BLOCKS["heading"]])), "deg", "lower")
+    out.add("level_rmse", np.rad2deg(rms(e[:, BLOCKS["level"]])), "deg", "lower")
+    if path is not None and len(path) >= 3:
+        for name, alignment in (("path_rmse", "none"), ("path_rmse_aligned", "se")):
+            whole = ate(solution.trajectory(covariances=False), path, alignment=alignment)  # type: ignore[arg-type]
+            out.add(name, whole.statistics.rmse, "m", "lower")
+            out.add(name.replace("rmse", "max"), whole.statistics.maximum, "m", "lower")
+    P = solution.joint_marginal([f"x{n}" for n in nodes])
+    nees = float(e.ravel() @ np.linalg.solve(P, e.ravel()))
+    add_nees(out, "nees", nees, e.size)
+    k = np.arange(len(nodes))
+    marginals = P.reshape(len(k), 6, len(k), 6)[k, :, k, :]
+    for name, block in BLOCKS.items():
+        d = e[:, block]
+        each = np.einsum("ki,kij,kj->k", d, np.linalg.inv(marginals[:, block, block]), d)
+        out.add(f"anees_{name}_per_dof", float(np.mean(each)) / d.shape[1], "", "one")
+
+
+def rms(errors: np.ndarray) -> float:
+    """Root mean square of the lengths of errors ``(n, d)``."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def base_metrics(out: Metrics, name: str, T_estimate: Array, T_true: Array, covariance: Array) -> None:
+    """Error of the first base of a session in a common frame, and its NEES."""
+    g = group_of(T_estimate)
+    e = g.log(g.between(T_estimate, T_true))
+    out.add(f"{name}_base_error", float(np.linalg.norm(e[g.position])), "m", "lower")
+    out.add(f"{name}_base_nees", float(e @ np.linalg.solve(covariance, e)))
+    out.add(f"{name}_base_nees_dof", g.dof)

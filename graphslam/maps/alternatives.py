@@ -1,46 +1,39 @@
-"""Alternative graphs of one SegMap or run: each optimised, the clearest of those that nothing contradicts chosen.
+"""Alternative graphs of one log, each at its optimum: the clearest of those that nothing contradicts is chosen.
 
 SegSLAM's authors take the map sample of least entropy. Here each alternative is optimised first, for an unsolved sample
 is blurred by errors that its graph would have removed. The χ² of its graph comes before the entropy of its map: a map
-that is folded onto itself knows less, and has less entropy for that. Alternatives are topologies that particles tell
-(:mod:`graphslam.app.hypotheses.hypotheses`), or choices among the matches and loops of a finished run
-(:mod:`graphslam.app.hypotheses.runs`).
+that is folded onto itself knows less, and has less entropy for that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 from scipy import stats
 
-from graphslam.app.folders.output_files import OutputFiles
-from graphslam.backend.back_end import BackEnd
-from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.streams import ImuPart
 from graphslam.core.errors import DataError
-from graphslam.core.records import Gps
-from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.io.g2o import write_g2o
-from graphslam.io.tum import write_tum
 from graphslam.maps.entropy import Clarity
-from graphslam.maps.export import save_maps
 from graphslam.maps.fuse import FusedMap
 from graphslam.maps.minimum_entropy import Candidate, rank_by_entropy
 from graphslam.solve.solution import Solution
 
 TIES = ("match", "loop")
 """Classes of factors that close loops."""
+
+
 CONTRADICTION = 1e-4
 """A graph whose χ² is greater than an honest one's with this probability contradicts itself."""
+
+
 MANY = 5
 """With so many pairs of submaps tied the noise of the chain can be told from a wrong tie …"""
+
+
 KEPT = 0.75
 """… by the alternatives that keep this share of them: most are taken to be right."""
 
@@ -56,12 +49,15 @@ class Alternative:
         At its solution.
     solution : Solution
     candidate : Candidate
+    facts : mapping of str
+        What else is to be told of it, JSON-serialisable.
     """
 
     name: str
     graph: PoseGraph
     solution: Solution
     candidate: Candidate
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def ties(self) -> int:
@@ -159,41 +155,11 @@ class Choice:
                     "contradicted": j.contradicted,
                     "entropy": j.clarity.entropy,
                     "known_volume": j.clarity.volume,
+                    **j.alternative.facts,
                     "why": why,
                 }
             )
         return out
-
-
-def built(
-    submaps: Sequence[Submap],
-    config: BackEndConfig,
-    *,
-    fixes: Gps | None = None,
-    gps: GpsOptions | None = None,
-    imu: ImuPart | None = None,
-) -> BackEnd:
-    """A back end with a graph of submaps, not yet at its optimum.
-
-    Parameters
-    ----------
-    submaps : sequence of Submap
-    config : BackEndConfig
-    fixes : Gps, optional
-        Those that count.
-    gps : GpsOptions, optional
-    imu : ImuPart, optional
-        Of this graph alone.
-    """
-    back = BackEnd(config, "batch", imu=imu)
-    if fixes is not None:
-        back.add_gps(fixes, GpsOptions() if gps is None else gps)
-    for s in submaps:
-        if fixes is None:
-            back.append(s)
-        else:  # where GPS begins is told by the graph as it is by then
-            back.add(s)
-    return back
 
 
 def choose(
@@ -270,49 +236,6 @@ def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float
     if most < MANY:
         return 1.0
     return max(1.0, min(chi2 / dof for n, (chi2, dof) in zip(ties, fits) if n >= KEPT * most and dof > 0))
-
-
-def write_choice(
-    folder: Path,
-    choice: Choice,
-    rows: Sequence[Mapping[str, Any]],
-    *,
-    left_out: int = 0,
-    bands: Mapping[str, tuple[float, float]] | None = None,
-) -> list[Path]:
-    """Keep a choice in a run folder.
-
-    The chosen map and its path are ``clearest.ply``, ``clearest.tum`` and so on; of every alternative
-    ``alternatives/NN.tum`` has the path and ``NN.g2o`` the graph, in the order of ``clearest.json``.
-
-    Parameters
-    ----------
-    folder : Path
-    choice : Choice
-    rows : sequence of mapping
-        Of the alternatives, in the order of the choice: its own, and what else is known of them.
-    left_out : int
-        Alternatives that were not solved.
-    bands : mapping, optional
-        Heights of floor plans [m].
-    """
-    made = save_maps(choice.best_map.grid, folder, name="clearest", bands=bands)
-    kept = folder / "alternatives"
-    kept.mkdir(exist_ok=True)
-    for old in (*kept.glob("[0-9]*.tum"), *kept.glob("[0-9]*.g2o")):
-        old.unlink()
-    table = []
-    for k, (row, j) in enumerate(zip(rows, choice.order, strict=True)):
-        path = j.alternative.solution.trajectory(covariances=False)
-        if k == 0:
-            write_tum(folder / "clearest.tum", path)
-        files = [f"alternatives/{k:02d}.tum", f"alternatives/{k:02d}.g2o"]
-        write_tum(folder / files[0], path)
-        write_g2o(folder / files[1], to_network(j.alternative.graph))
-        table.append({**row, "files": files})
-    value = {"why": choice.why(), "scale": choice.scale, "left_out": left_out, "candidates": table}
-    OutputFiles(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})
-    return [*made, folder / "clearest.tum", folder / "clearest.json"]
 
 
 def _contradiction(j: Judged) -> str:

@@ -1,1 +1,0 @@
-"""Alternative graphs of one run, each solved; the clearest chosen."""

@@ -1,0 +1,83 @@
+"""The solved map of a run as plain arrays: path, nodes, landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.geometry import Array, rotation2, se2_transform
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.loops.places import Ints
+from graphslam.solve.solution import Solution
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The solved map, in the frame of the first base.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Full rate, ``T_world_base(t)`` with covariances.
+    node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3|7), (m + 1, d, d)
+        Bases of the submaps, their inner nodes, and the end of the last.
+    landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
+        Confirmed landmarks.
+    landmark_hits : (n,)
+        Sightings over all submaps.
+    T_gps_world : (3,) or (7,) or None
+        Map → GPS frame, where GPS was in the graph.
+    base_nodes : (k + 1,) int or None
+        Which nodes are bases of submaps or the end of the last; None: all.
+    """
+
+    trajectory: Trajectory
+    node_times: Array
+    node_poses: Array
+    node_covariances: Array
+    landmark_ids: Ints
+    landmarks: Array
+    landmark_covariances: Array
+    landmark_hits: Ints
+    T_gps_world: Array | None = None
+    base_nodes: Ints | None = None
+
+    def landmarks_in(self, T: Array) -> tuple[Array, Array]:
+        """Landmarks ``(n, 2)`` and their covariances ``(n, 2, 2)`` in another frame, ``T_frame_world`` ``(3,)``."""
+        R = rotation2(T[2])
+        return se2_transform(T, self.landmarks), R @ self.landmark_covariances @ R.T
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.trajectory.dim
+
+    @property
+    def base_poses(self) -> Array:
+        """Bases of the submaps and the end of the last ``(k + 1, 3|7)``."""
+        return self.node_poses if self.base_nodes is None else self.node_poses[self.base_nodes]
+
+    @property
+    def base_times(self) -> Array:
+        """When the body was there ``(k + 1,)`` [s]."""
+        return self.node_times if self.base_nodes is None else self.node_times[self.base_nodes]
+
+
+def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
+    """Trajectory at full rate, nodes, and the landmarks seen at least ``confirmed`` times."""
+    n = np.array([hits.get(int(i), 0) for i in solution.landmark_ids], dtype=np.int64)
+    keep = n >= confirmed
+    return GlobalMap(
+        trajectory=solution.trajectory(),
+        node_times=solution.node_times,
+        node_poses=solution.poses,
+        node_covariances=solution.node_covariances(),
+        landmark_ids=solution.landmark_ids[keep],
+        landmarks=solution.landmarks[keep],
+        landmark_covariances=solution.landmark_covariances()[keep],
+        landmark_hits=n[keep],
+        T_gps_world=solution.T_gps_world,
+        base_nodes=np.append(solution.base_nodes, solution.exit_nodes[-1]).astype(np.int64),
+    )

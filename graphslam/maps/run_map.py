@@ -1,0 +1,213 @@
+"""The fused map of a run: pieces led by the graph's own nodes, at their solved poses. No scan is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, level
+from graphslam.core.submap import Submap
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.export import storeys
+from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.global_map import GlobalMap
+from graphslam.maps.pieces import DivisionConfig, PieceId
+from graphslam.maps.submaps import DividedSubmaps, divide_submaps
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MapConfig:
+    """The fused map at the end of a run whose submaps have evidence grids."""
+
+    fuse: bool = True
+    """Make it."""
+    low: float = 0.3
+    """Floor plans begin this far above the path [m] …"""
+    high: float = 1.8
+    """… and end this far above it."""
+    threads: int = 1
+    """That put pieces where they are; the map is the same with any number."""
+
+    def __post_init__(self) -> None:
+        if not self.high > self.low:
+            raise ConfigError(f"map: floor plans from {self.low} to {self.high} m; wanted low < high")
+        if self.threads < 1:
+            raise ConfigError(f"map.threads = {self.threads}; wanted ≥ 1")
+
+
+REACH_MARGIN = 1.0
+"""Added to the range of the beams: a voxel farther from the path than that was seen by nobody [m]."""
+
+
+MOST_TILT = 0.1
+"""Bases that lean by more than this are not of a front end that knows where down is; its nodes are taken as they are
+[rad]."""
+
+
+@dataclass(frozen=True)
+class RunMap:
+    """The fused map of a run.
+
+    Parameters
+    ----------
+    fused : FusedMap
+        Pieces at the solved poses.
+    divided : DividedSubmaps
+        The pieces, and where the open chain of exits has them.
+    bands : mapping of str to (low, high)
+        Heights of the floor plans, one for each storey that the path keeps to [m]; empty in the plane.
+    open_entropy, open_volume : float
+        Of the same pieces along the open chain: the map that the front end alone would have given [nat m³, m³].
+    divide_s, fuse_s, move_s : float
+        Seconds to cut the submaps into pieces, to fuse these along the open chain, and to move them to the solved
+        poses.
+    """
+
+    fused: FusedMap
+    divided: DividedSubmaps
+    bands: Mapping[str, tuple[float, float]]
+    open_entropy: float
+    open_volume: float
+    divide_s: float
+    fuse_s: float
+    move_s: float
+
+    def facts(self) -> dict[str, Any]:
+        """What ``fused_map.json`` holds."""
+        f = self.fused
+        return {
+            "format": "graphslam.fused-map/1",
+            "dim": f.dim,
+            "voxel_size": f.voxel_size,
+            "pieces": len(f),
+            "entropy": f.entropy(),
+            "known_volume": f.known_volume(),
+            "entropy_open_chain": self.open_entropy,
+            "known_volume_open_chain": self.open_volume,
+            "level_nodes": self.divided.level_nodes,
+            "bands": {name: list(band) for name, band in self.bands.items()},
+            "bytes": f.nbytes,
+        }
+
+    def metrics(self) -> list[tuple[str, float, str, str]]:
+        """Key, value, unit and better direction of its figures, for ``metrics.json``."""
+        f = self.fused
+        unit = "m³" if f.dim == 3 else "m²"
+        seconds = (("divide", self.divide_s), ("fuse", self.fuse_s), ("move", self.move_s))
+        return [
+            ("map_entropy", f.entropy(), f"nat {unit}", "lower"),
+            ("map_known_volume", f.known_volume(), unit, "none"),
+            ("map_entropy_open_chain", self.open_entropy, f"nat {unit}", "none"),
+            ("map_known_volume_open_chain", self.open_volume, unit, "none"),
+            ("map_pieces", len(f), "", "none"),
+            ("map_megabytes", f.nbytes / 1e6, "MB", "lower"),
+            *((f"map_{name}_seconds", value, "s", "lower") for name, value in seconds),
+        ]
+
+
+def has_grids(submaps: Sequence[Submap]) -> bool:
+    """Has every submap an evidence grid?"""
+    return bool(submaps) and all(isinstance(s.grid, EvidenceGrid) for s in submaps)
+
+
+def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
+    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of the nodes of each submap, its base first, its exit left out.
+
+    Raises
+    ------
+    DataError
+        The map is not of these submaps.
+    """
+    bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
+    if len(bases) != len(submaps) + 1:
+        raise DataError("the solved nodes are not those of the submaps", got=len(bases) - 1, wanted=len(submaps))
+    return {s.key: (m.node_times[a:b], m.node_poses[a:b]) for s, a, b in zip(submaps, bases, bases[1:])}
+
+
+def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array]]) -> dict[PieceId, Array]:
+    """``T_world_node`` of every piece, from the graph's nodes; standing level where the pieces do."""
+    out: dict[PieceId, Array] = {}
+    for name in divided.pieces:
+        assert isinstance(name, tuple)
+        T = nodes[name[0]][1][name[1]]
+        out[name] = level(T) if divided.level_nodes else T
+    return out
+
+
+def make_run_map(
+    submaps: Sequence[Submap], m: GlobalMap, *, reach: float | None = None, config: MapConfig | None = None
+) -> RunMap:
+    """Fuse the grids of a run's submaps: along the open chain first, then moved to where the graph has them.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        With evidence grids and paths.
+    m : GlobalMap
+        Solved.
+    reach : float, optional
+        Of the sensor [m].
+    config : MapConfig, optional
+        Heights of the floor plans.
+
+    Raises
+    ------
+    MissingDataError
+        Submaps without grids.
+    DataError, GridError, GeometryError
+    """
+    config = MapConfig() if config is None else config
+    if not has_grids(submaps):
+        bare = [s.key for s in submaps if not isinstance(s.grid, EvidenceGrid)]
+        raise MissingDataError(
+            "submaps have no evidence grids to make a map of",
+            got=f"{len(bare)} of {len(submaps)} without",
+            wanted="a run of a front end with grids: segslam, rbpf-grid",
+        )
+    nodes = nodes_by_submap(submaps, m)
+    division = DivisionConfig() if reach is None else DivisionConfig(reach=reach + REACH_MARGIN)
+    begin = time.perf_counter()
+    divided = divide_submaps(
+        [_one_piece(s, nodes) for s in submaps],
+        every=None,
+        config=division,
+        level_nodes=m.dim == 3 and _levelled(m.base_poses),
+        nodes={key: times for key, (times, _) in nodes.items()},
+    )
+    divide_s, begin = time.perf_counter() - begin, time.perf_counter()
+    model = submaps[0].grid.model  # type: ignore[union-attr]
+    fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
+    fuse_s = time.perf_counter() - begin
+    open_entropy, open_volume = fused.entropy(), fused.known_volume()
+    begin = time.perf_counter()
+    fused.move(solved_poses(divided, nodes))
+    move_s = time.perf_counter() - begin
+    bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
+    return RunMap(fused, divided, bands, open_entropy, open_volume, divide_s, fuse_s, move_s)
+
+
+def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, float]]:
+    """Heights of the floor plan of every storey of a path ``(n, 3)`` [m]; of its middle where it keeps to none."""
+    heights = storeys(positions) or [float(np.median(positions[:, 2]))]
+    return {f"level{k}": (z + config.low, z + config.high) for k, z in enumerate(heights)}
+
+
+def _one_piece(s: Submap, nodes: Mapping[int, tuple[Array, Array]]) -> Submap:
+    """A submap with a path, where its nodes ask for one."""
+    if s.trajectory is None and len(nodes[s.key][0]) > 1:
+        raise DataError(f"submap {s.key} has nodes but no path", wanted="a trajectory")
+    return s
+
+
+def _levelled(bases: Array) -> bool:
+    """Do all bases ``(k, 7)`` stand about level?"""
+    group = group_of(bases)
+    lean = group.log(group.between(level(bases), bases))[:, :2]
+    return bool(np.all(np.linalg.norm(lean, axis=1) < MOST_TILT))
