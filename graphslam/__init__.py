@@ -1,7 +1,16 @@
 """graphslam: globally consistent maps with an uncertainty you can trust.
 
-The verbs (``load``, ``run``, ``compare``, ``simulate`` …) are looked up lazily, so that ``import graphslam`` costs
-nothing heavy and never imports gtsam, Open3D or matplotlib.
+The verbs (``load``, ``run``, ``compare``, ``simulate`` …), the types that a notebook makes or gets, ``plots``, and
+lists of what can be chosen (``front_ends()``, ``solvers()``, ``joiners()``, ``worlds()``). All are looked up lazily, so
+that ``import graphslam`` costs nothing heavy and never imports gtsam, Open3D or matplotlib.
+
+Examples
+--------
+>>> import graphslam as gs
+>>> log = gs.simulate("landmark-field", preset="quick", seed=1)
+>>> run = gs.run(log, frontend="rbpf-ekf", solver="isam2")
+>>> run.plot()
+>>> gs.compare(run, ["isam2", "eif-tree", "ekf"])
 """
 
 from __future__ import annotations
@@ -11,36 +20,39 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# verb -> module that holds it. None may bear the name of a subpackage: importing that would take its place.
+# name → module that holds it. None may bear the name of a subpackage: importing that would take its place.
 _VERBS = {
-    "load": "graphslam.app.verbs",
-    "run": "graphslam.app.verbs",
-    "compare": "graphslam.app.verbs",
-    "join_submaps": "graphslam.app.verbs",
-    "local_maps": "graphslam.app.verbs",
+    **dict.fromkeys(("load", "simulate", "run", "open_run", "local_maps", "first_particles"), "graphslam.app.verbs"),
+    **dict.fromkeys(("compare", "join_submaps", "solve_file"), "graphslam.app.verbs"),
+    **dict.fromkeys(("study", "open_study", "find_study"), "graphslam.app.verbs"),
     "merge": "graphslam.app.sessions.merge",
     "localise": "graphslam.app.sessions.localise",
     "export": "graphslam.app.export",
-    "solve_file": "graphslam.app.verbs",
-    "simulate": "graphslam.app.verbs",
-    "open_run": "graphslam.app.verbs",
-    "study": "graphslam.app.verbs",
-    "open_study": "graphslam.app.verbs",
+    "find_loops": "graphslam.loops.find_loops",
 }
-# types a notebook makes itself
+_LISTS = dict.fromkeys(("front_ends", "solvers", "joiners", "worlds"), "graphslam.app.verbs")
 _TYPES = {
-    "EvidenceGrid": "graphslam.evidence.grid",
-    "GridPool": "graphslam.evidence.pool",
-    "BeamModel": "graphslam.evidence.beams",
+    "SensorLog": "graphslam.core.log",
+    **dict.fromkeys(("LaserScans", "LandmarkObservations", "Odometry", "Gps"), "graphslam.core.records"),
+    **dict.fromkeys(("SteeringControls", "VelocityControls"), "graphslam.core.records"),
+    "RangeScans": "graphslam.core.range_scans",
+    "PointClouds": "graphslam.core.point_clouds",
+    "Imu": "graphslam.core.imu",
+    "Submap": "graphslam.core.submap",
+    "Trajectory": "graphslam.core.trajectory",
+    "PoseGraph": "graphslam.graph.pose_graph",
+    "Run": "graphslam.app.run.run",
 }
-_NAMES = {**_VERBS, **_TYPES}
+_NAMES = {**_VERBS, **_LISTS, **_TYPES}
 
-__all__ = ["__version__", *_NAMES]
+__all__ = ["__version__", "plots", *_NAMES]
 
 
 def __getattr__(name: str) -> Any:
     if name in _NAMES:
         return getattr(importlib.import_module(_NAMES[name]), name)
+    if name == "plots":
+        return importlib.import_module("graphslam.plots")
     raise AttributeError(f"module 'graphslam' has no attribute {name!r}")
 
 

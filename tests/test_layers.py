@@ -23,12 +23,12 @@ STOREY = {
     "graphslam.join": 5,
     "graphslam.loops": 5,
     "graphslam.maps": 6,
-    "graphslam.evaluate": 6,
+    "graphslam.evaluate": 7,
     "graphslam.io": 6,
     "graphslam.sim": 6,
-    "graphslam.plots": 7,
-    "graphslam.backend": 7,
-    "graphslam.app": 8,
+    "graphslam.plots": 8,
+    "graphslam.backend": 8,
+    "graphslam.app": 9,
 }
 # third-party packages and the only places that may import them
 CONFINED = {
@@ -130,7 +130,7 @@ def test_a_circle_is_seen_also_inside_functions(tmp_path: Path, monkeypatch: pyt
     assert found == {"a": {"b"}, "b": {"a"}, "c": set(), "d": {"c"}}
 
 
-# A study is an experiment: what it computes belongs to no other part, and nothing else imports it.
+# A study is an experiment: what it computes is its result, and belongs to no other part.
 STUDIES = ROOT / "graphslam" / "app" / "studies"
 NUMERICS = {"linalg", "einsum", "lstsq", "fft"}
 

@@ -12,8 +12,8 @@ import pytest
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
-from graphslam.app.notebook import NotebookStop, load_or_stop
 from graphslam.core.errors import UnknownNameError
+from graphslam.io.notebook import NotebookStop, load_or_stop
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -47,6 +47,12 @@ def execute(path: Path, where: Path, **environment: str) -> Any:
 
 def outputs(book: Any) -> list[Any]:
     return [o for c in book.cells if c.cell_type == "code" for o in c.outputs]
+
+
+@every_notebook
+def test_a_notebook_needs_nothing_of_the_application_but_its_public_face(path: Path) -> None:
+    code = "\n".join(c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code")
+    assert "graphslam.app" not in code
 
 
 def test_there_are_notebooks() -> None:

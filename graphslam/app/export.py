@@ -119,6 +119,10 @@ def export(
     -------
     Path
         The file.
+
+    Examples
+    --------
+    >>> gs.export("runs/vp", (-33.8886, 151.1892), format="geojson")
     """
     if format not in WRITERS:
         raise UnknownNameError("format", format, WRITERS)

@@ -147,8 +147,7 @@ def clearest_of_topologies(
     digest = log_digest(source)
     if said.get("log", digest) != digest:
         raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
-    front = make_front_end(said["frontend"], values["frontend"])
-    assert isinstance(front, SegSlam)
+    front: Any = make_front_end(SegSlam.name, values["frontend"])
     config, streams = _graph_options(run)
     reach = sensor_reach(values)
     with tqdm(desc="particles", unit="step", disable=not progress) as bar:

@@ -9,41 +9,98 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app import compare as comparing
+from graphslam.app.run.front_ends import front_end_names
+from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import open_run as open_run
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.pipeline import run as run
 from graphslam.app.run.run import Run
+from graphslam.app.studies.definition import find_study as find_study
 from graphslam.app.studies.study import open_study as open_study
 from graphslam.app.studies.study import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.threads import one_blas_thread
+from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
-from graphslam.join.registry import join
+from graphslam.join import registry as joining
+from graphslam.solve import registry
 
 __all__ = [
-    "compare",
-    "join_submaps",
-    "load",
-    "local_maps",
-    "open_run",
-    "open_study",
-    "run",
-    "simulate",
-    "solve_file",
-    "study",
+    *("compare", "find_study", "first_particles", "front_ends", "join_submaps", "joiners", "load", "local_maps"),
+    *("open_run", "open_study", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
 ]
 
 
+def front_ends() -> list[str]:
+    """Names of the installed front ends, for ``frontend=`` of :func:`run`.
+
+    Examples
+    --------
+    >>> "segslam" in gs.front_ends()
+    True
+    """
+    return front_end_names()
+
+
+def solvers() -> list[str]:
+    """Names of the solvers of a graph, for ``solver=`` of :func:`run`.
+
+    Examples
+    --------
+    >>> "isam2" in gs.solvers()
+    True
+    """
+    return sorted(registry.SOLVERS)
+
+
+def joiners() -> list[str]:
+    """Names of the ways to join submaps, for :func:`join_submaps` and :func:`compare`.
+
+    Examples
+    --------
+    >>> "eif-tree" in gs.joiners()
+    True
+    """
+    return sorted({**joining.JOINERS, **joining.SOLVERS})
+
+
+def worlds() -> list[str]:
+    """Names of the simulated worlds, for :func:`simulate`.
+
+    Examples
+    --------
+    >>> "garage" in gs.worlds()
+    True
+    """
+    return sorted({**WORLDS, **MESH_WORLDS})
+
+
 def load(source: str | Path, **options: Any) -> SensorLog:
-    """A sensor log by card name, or from a folder; ``options`` are for its reader.
+    """A sensor log by card name, or from a folder.
+
+    Parameters
+    ----------
+    source : str or path
+        Name of a card (``graphslam data list``), or a folder in a layout that is known.
+    **options
+        For its reader.
+
+    Returns
+    -------
+    SensorLog
 
     Raises
     ------
     UnknownNameError, MissingDataError, FormatError
+
+    Examples
+    --------
+    >>> log = gs.load("victoria-park")
+    >>> log.slice(0.0, 60.0)
     """
     return load_log_source(source, **options)
 
@@ -66,6 +123,15 @@ def compare(
         Instead of the source's own.
     **options
         See :func:`graphslam.app.compare.compare`.
+
+    Returns
+    -------
+    DataFrame
+        One row a method.
+
+    Examples
+    --------
+    >>> gs.compare(run, ["isam2", "eif-tree", "ekf"])
     """
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
@@ -74,15 +140,46 @@ def compare(
 
 
 def join_submaps(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
-    """Join submaps by one method; see :func:`graphslam.join.registry.join`."""
+    """Join submaps into one map by one method.
+
+    Parameters
+    ----------
+    source : Run, run folder, submap store, card of submaps, or sequence of Submap
+    method : str
+        One of :func:`joiners`.
+    **options
+        See :func:`graphslam.join.registry.join`.
+
+    Returns
+    -------
+    SubmapEstimate
+        Poses ``(m + 1, 3)``, landmarks ``(n, 2)`` and their joint information, in the frame of the first base.
+
+    Examples
+    --------
+    >>> joined = gs.join_submaps(run, "eif-tree")
+    >>> joined.poses[-1]
+    """
     s = submap_source(source)
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
-        return join(s.submaps, method, **options)
+        return joining.join(s.submaps, method, **options)
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
-    """Solve a pose-graph file; see :func:`graphslam.app.solve_file.solve_file`."""
+    """Solve a pose-graph file.
+
+    Parameters
+    ----------
+    path : path
+    solver : str
+    **options
+        See :func:`graphslam.app.solve_file.solve_file`.
+
+    Examples
+    --------
+    >>> gs.solve_file("sphere.g2o", "lm")["objective"]
+    """
     from graphslam.app import solve_file as solving
 
     return solving.solve_file(path, solver, **options)

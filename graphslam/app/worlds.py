@@ -120,6 +120,10 @@ def simulate(
     Raises
     ------
     UnknownNameError, ConfigError
+
+    Examples
+    --------
+    >>> log = gs.simulate("garage", seed=1, layout="B")
     """
     if world in WORLDS:
         if layout is not None or world_seed is not None:

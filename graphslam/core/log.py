@@ -59,6 +59,12 @@ class SensorLog:
         Records read per stream, and records dropped per "stream: reason".
     meta : mapping
         What else a report should print (source, noise figures, seed …); JSON-serialisable.
+
+    Examples
+    --------
+    >>> log = gs.simulate("landmark-field", preset="quick")
+    >>> log["landmarks"].times[:3]
+    >>> log.slice(0.0, 10.0)
     """
 
     name: str

@@ -187,6 +187,11 @@ class Submap:
         Streams whose information is already inside.
     report : mapping
         What the front end says of this map: why it ended, honesty figures, counts. JSON-serialisable.
+
+    Examples
+    --------
+    >>> submap = gs.local_maps(log)[0]
+    >>> submap.exit_pose, submap.landmarks.ids
     """
 
     key: int

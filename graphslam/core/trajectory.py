@@ -28,6 +28,11 @@ class Trajectory:
     poses : (n, 3) or (n, 7)
     covariances : (n, d, d) or None
         Right tangent, GTSAM order; d = 3 or 6.
+
+    Examples
+    --------
+    >>> path = run.map.trajectory
+    >>> path.interpolate(path.times[:1] + 0.05)
     """
 
     times: Array

@@ -87,6 +87,12 @@ def find_loops(
     ------
     DataError
         The submaps are not those of the graph, one has no grid, or the graph is no chain.
+
+    Examples
+    --------
+    >>> graph = gs.PoseGraph(3)
+    >>> found = gs.find_loops(graph, solver, submaps)
+    >>> found.ledger.table()
     """
     c = FindConfig() if config is None else config
     if [s.key for s in submaps] != [s.key for s in graph.submaps]:

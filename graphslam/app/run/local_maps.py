@@ -52,6 +52,10 @@ def local_maps(
     ------
     GraphSlamError
         Or one of its children.
+
+    Examples
+    --------
+    >>> submaps = gs.local_maps(log, "rbpf-ekf", seed=1)
     """
     log = load_log_source(source)
     made = _front_end(log, frontend, options)
@@ -80,6 +84,10 @@ def first_particles(
         The front end has no particles to show.
     GraphSlamError
         Or another of its children.
+
+    Examples
+    --------
+    >>> submap, particles = gs.first_particles(log, options={"particles": 50})
     """
     log = load_log_source(source)
     made = _front_end(log, frontend, options)

@@ -223,6 +223,11 @@ def open_run(path: str | Path) -> Run:
         Not a finished run.
     FormatError
         A file is damaged, or not of one state with the others.
+
+    Examples
+    --------
+    >>> run = gs.open_run("runs/vp")
+    >>> run.plot()
     """
     return consistent(path, lambda root: _open(Path(path), root))
 

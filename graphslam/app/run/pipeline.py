@@ -113,6 +113,11 @@ def run(
     ------
     GraphSlamError
         Or one of its children; says what, where, got, wanted.
+
+    Examples
+    --------
+    >>> run = gs.run("victoria-park", frontend="rbpf-ekf", out="runs/vp", config={"gps": {"use": "every-second"}})
+    >>> run.metric("gps_withheld_rmse")
     """
     with one_blas_thread():
         return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, observers)

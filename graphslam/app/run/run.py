@@ -66,6 +66,12 @@ class Run:
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
         Fused evidence grid of submaps that have grids. For a run read back from disk: ``remake_map.map_of_folder``.
+
+    Examples
+    --------
+    >>> run = gs.open_run("runs/vp")
+    >>> run.verdict
+    >>> run.map.landmarks
     """
 
     name: str

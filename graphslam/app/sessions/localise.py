@@ -102,6 +102,11 @@ def localise(
     ------
     DataError
         A run or submaps that cannot be used. That a place is not found is an answer, not an error.
+
+    Examples
+    --------
+    >>> found = gs.localise("runs/hall", log.slice(100.0, 130.0))
+    >>> found.T_map_base if not found.why else found.why
     """
     opened = run if isinstance(run, Run) else open_run(run)
     if not is_dense(opened):

@@ -80,6 +80,11 @@ def merge(
         ``out`` holds something already, or is being written by another process.
     DataError
         Runs that share fewer than two landmarks, or whose landmarks do not say how they lie; names the run.
+
+    Examples
+    --------
+    >>> merged = gs.merge(["runs/robot1", "runs/robot2"])
+    >>> merged.plot()
     """
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:

@@ -65,6 +65,10 @@ def find_study(name: str) -> StudyDefinition:
         Nothing is registered under that name.
     ConfigError
         ``module:object`` cannot be imported, or is no study.
+
+    Examples
+    --------
+    >>> gs.find_study("segslam-garage").worlds(quick=False)
     """
     target = STUDIES.get(name, name)
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", target):

@@ -15,7 +15,6 @@ from time import perf_counter
 
 import numpy as np
 
-from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
@@ -25,6 +24,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain

@@ -39,6 +39,7 @@ from graphslam.app.studies.segslam_trial import (
     family_of,
 )
 from graphslam.app.studies.worlds_study import draw_runs
+from graphslam.core.errors import UnknownNameError
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
 from graphslam.plots.segslam_study import Curve, plot_by_particles
@@ -64,6 +65,26 @@ QUICK_WORLDS = {
 
 class SegSlamGarage(GridStudy):
     """See the module."""
+
+    def settings(self, world: str) -> GridTrialConfig:
+        """World, robot and filters of a trial.
+
+        Raises
+        ------
+        UnknownNameError
+        """
+        known = {**WORLDS, **QUICK_WORLDS}
+        if world not in known:
+            raise UnknownNameError("world", world, known)
+        return known[world]
+
+    def error_curves(self, table: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]:
+        """See :func:`error_curves`."""
+        return error_curves(table, world)
+
+    def time_curves(self, table: pd.DataFrame, timings: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]:
+        """See :func:`time_curves`."""
+        return time_curves(table, timings, world)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
         """``errors`` (Table II), ``ratios`` of means, ``times`` (Table III), ``nees``, ``exits``, ``matches``,

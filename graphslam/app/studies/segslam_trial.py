@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import mesh_world
@@ -23,6 +22,7 @@ from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
@@ -86,7 +86,7 @@ class GridTrialConfig:
     samples: int = 1
     """Map samples, or particles of a filter, whose entropy is taken at most."""
     placements: int = 1
-    """Ways in which the grid of each stands (see :func:`~graphslam.app.studies.segslam_judge.clarity`)."""
+    """Ways in which the grid of each stands (see :func:`~graphslam.evaluate.segslam_judge.clarity`)."""
     crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
     """The robot."""
     steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))

@@ -190,6 +190,11 @@ def study(
         The folder holds another study.
     KeyboardInterrupt
         After what is done has been written.
+
+    Examples
+    --------
+    >>> study = gs.study("combined-slam", 50, workers=2)
+    >>> study.report()
     """
     definition = find_study(name)
     known = tuple(definition.worlds(quick))
@@ -282,6 +287,10 @@ def open_study(folder: str | Path, definition: StudyDefinition | str | None = No
         Not the folder of a study.
     UnknownNameError
         A study that is not registered.
+
+    Examples
+    --------
+    >>> study = gs.open_study("study-combined-slam")
     """
     opened = StudyFolder(folder)
     if definition is None:

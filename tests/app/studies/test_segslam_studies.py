@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from graphslam.app.run.front_ends import recommended
-from graphslam.app.studies import segslam_judge as judge
 from graphslam.app.studies import segslam_trial
 from graphslam.app.studies.definition import StudyDefinition, find_study, fingerprint
 from graphslam.app.studies.segslam_building import STUDY as BUILDING
@@ -22,6 +21,7 @@ from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, level
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate import segslam_judge as judge
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
