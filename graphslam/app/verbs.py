@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app import compare as comparing
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import front_end_names
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
@@ -20,7 +21,6 @@ from graphslam.app.studies.definition import find_study as find_study
 from graphslam.app.studies.study import open_study as open_study
 from graphslam.app.studies.study import study as study
 from graphslam.app.submap_sources import submap_source
-from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.log import SensorLog

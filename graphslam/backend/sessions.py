@@ -20,7 +20,7 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.graph_relative import GraphRelative
+from graphslam.loops.graph_loops import GraphRelative
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions, start_of

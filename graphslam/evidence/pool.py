@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
-from graphslam.evidence.aligned import aligned_empty, aligned_zeros
 from graphslam.evidence.first_use import announce_compilation
 from graphslam.evidence.layout import BRICK_VOXELS, CHILDREN, DEFAULT_LEVELS, MAX_LEVELS, UNKNOWN, half_edge
-from graphslam.evidence.scratch import Scratch
+from graphslam.evidence.scratch import Scratch, aligned_empty, aligned_zeros
 from graphslam.evidence.tree_kernels import (
     BRICKS_FREE,
     BRICKS_USED,

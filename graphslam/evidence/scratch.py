@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from graphslam.evidence.aligned import aligned_zeros
+import numpy as np
+import numpy.typing as npt
+
 from graphslam.evidence.layout import BRICK_VOXELS
 
 WINDOW = 64**3
@@ -55,3 +57,23 @@ class Scratch:
 
     def __len__(self) -> int:
         return len(self.slot_key)
+
+
+LINE = 64  # bytes
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Zeros; what was never touched takes no memory yet."""
+    return _aligned(np.zeros, shape, np.dtype(dtype))
+
+
+def aligned_empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Values of no meaning; what was never touched takes no memory yet."""
+    return _aligned(np.empty, shape, np.dtype(dtype))
+
+
+def _aligned(make: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    room = make(size + LINE, np.uint8)
+    start = -room.ctypes.data % LINE
+    return room[start : start + size].view(dtype).reshape(shape)

@@ -22,9 +22,9 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.pipeline import load_log_source, run
 from graphslam.app.run.run import Run
-from graphslam.app.threads import one_blas_thread
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 

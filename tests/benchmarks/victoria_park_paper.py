@@ -41,9 +41,9 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
-from graphslam.plots.gps_maps import plot_gps_maps
 from graphslam.plots.save import save
 from graphslam.plots.study_time import plot_cumulative_time
+from tests.reference.gps_maps import plot_gps_maps
 
 Ints = npt.NDArray[np.int64]
 CONFIRMED = 6  # sightings over all submaps, as in the preset

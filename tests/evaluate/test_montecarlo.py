@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.threads import hold_one_thread
+from graphslam.app.machine import hold_one_thread
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.evaluate.executors import Job, execute
 from graphslam.evaluate.montecarlo import (

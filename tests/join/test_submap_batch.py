@@ -17,9 +17,8 @@ from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.order import join_sequential
 from graphslam.join.polish import polish
-from graphslam.join.submap_batch import solve_submaps
 from graphslam.join.submap_blocks import SubmapProblem
-from graphslam.join.submap_solver import minimise
+from graphslam.join.submap_solver import minimise, solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 

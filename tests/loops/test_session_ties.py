@@ -12,7 +12,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.relative import relative_poses
-from graphslam.loops.graph_relative import GraphRelative
+from graphslam.loops.graph_loops import GraphRelative
 from graphslam.loops.measure import Loop
 from graphslam.loops.session_ties import SessionMap, TieConfig, TwoSessions, start_of
 from tests.reference.box_submaps import straight_path

@@ -12,7 +12,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_transform
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.gps_maps import plot_gps_maps
+from tests.reference.gps_maps import plot_gps_maps
 
 
 @pytest.fixture(autouse=True)

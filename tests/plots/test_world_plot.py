@@ -8,10 +8,10 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from graphslam.core.errors import ConfigError
-from graphslam.plots.world import plot_world
 from graphslam.sim.garage import garage
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.world import World
+from tests.reference.plot_world import plot_world
 
 
 def drawn(ax: plt.Axes) -> np.ndarray:

@@ -17,14 +17,11 @@ import graphslam
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from graphslam.app.cli import data as cli_data
-from graphslam.app.cli import export as cli_export
 from graphslam.app.cli import join as cli_join
-from graphslam.app.cli import localise as cli_localise
-from graphslam.app.cli import loops as cli_loops
 from graphslam.app.cli import map as cli_map
-from graphslam.app.cli import merge as cli_merge
-from graphslam.app.cli import report as cli_report
+from graphslam.app.cli import results as cli_results
 from graphslam.app.cli import run as cli_run
+from graphslam.app.cli import sessions as cli_sessions
 from graphslam.app.cli import study as cli_study
 from graphslam.app.cli import tools as cli_tools
 from graphslam.app.cli.terminal import log_to_stderr
@@ -56,11 +53,8 @@ def _options(
 cli_run.register(app)
 cli_join.register(app)
 cli_map.register(app)
-cli_merge.register(app)
-cli_loops.register(app)
-cli_report.register(app)
-cli_localise.register(app)
-cli_export.register(app)
+cli_sessions.register(app)
+cli_results.register(app)
 cli_study.register(app)
 cli_tools.register(app)
 app.add_typer(cli_data.app, name="data")

@@ -70,7 +70,7 @@ def run(
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
     text = _summary(result, out)
     if saved:
-        from graphslam.app.sessions.continue_run import continue_runs
+        from graphslam.app.sessions.merge import continue_runs
 
         joined = continue_runs(saved, result, out=out / "continued")
         value["continued"] = joined.report

@@ -11,8 +11,17 @@ from graphslam.app.report.figures import figures
 from graphslam.app.report.folder import Kind, read_folder
 from graphslam.app.report.loops import hypotheses, loops
 from graphslam.app.report.markup import note, page
-from graphslam.app.report.sections import events, evidence, graph, metrics, problems, records, times, what_was_run
-from graphslam.app.report.verdict import verdict_lines
+from graphslam.app.report.sections import (
+    events,
+    evidence,
+    graph,
+    metrics,
+    problems,
+    records,
+    times,
+    verdict_lines,
+    what_was_run,
+)
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
 from graphslam.core.markup import element, join

@@ -8,10 +8,10 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.pipeline import load_log_source
-from graphslam.app.threads import one_blas_thread
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
@@ -76,7 +76,10 @@ def first_particles(
 ) -> tuple[Submap, ParticleSet]:
     """The first submap of a log with the particles it was made of, as they stood at its last scan.
 
-    Parameters as in :func:`local_maps`; slice the log to begin elsewhere.
+    Parameters
+    ----------
+    source, frontend, seed, options
+        As in :func:`local_maps`; slice the log to begin elsewhere.
 
     Raises
     ------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import filecmp
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,9 @@ from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import is_time
+from graphslam.evaluate.without_truth import ClassConsistency
 from graphslam.graph.network import to_network
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
@@ -217,6 +220,10 @@ def _identified(home: Path, root: Path) -> list[Submap]:
 def open_run(path: str | Path) -> Run:
     """Read a finished run folder, all of it of one state.
 
+    Parameters
+    ----------
+    path : path
+
     Raises
     ------
     RunFolderError
@@ -283,3 +290,22 @@ def _check_submaps(home: Path, root: Path) -> None:
 
 def _path(file: Path, dim: int) -> Trajectory | None:
     return read_tum(file, dim=dim) if file.is_file() else None
+
+
+def graph_facts(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
+    """JSON-serialisable figures of a graph at its optimum.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    classes : mapping of str to ClassConsistency
+        Of this graph (:func:`graphslam.evaluate.without_truth.class_consistency`).
+    """
+    return {
+        "dim": graph.dim,
+        "nodes": len(graph.values.poses),
+        "landmarks": len(graph.values.landmarks),
+        "submaps": len(graph.submaps),
+        "factors": len(graph.records),
+        "classes": [c.as_row() for c in classes.values()],
+    }

@@ -14,22 +14,20 @@ import numpy as np
 
 from graphslam.app.folders.generations import consistent
 from graphslam.app.folders.lock import locked
+from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_back
-from graphslam.app.run.graph_facts import graph_facts
 from graphslam.app.run.maps import sensor_reach
-from graphslam.app.run.outputs import write_outputs
+from graphslam.app.run.outputs import graph_facts, write_outputs
 from graphslam.app.run.run import Run
 from graphslam.app.run.stream_use import stream_use
 from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
-from graphslam.app.threads import one_blas_thread
-from graphslam.app.versions import versions
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.streams import ImuPart, imus_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.folders.generations import outputs
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_grids
-from graphslam.app.threads import one_blas_thread
 from graphslam.backend.sessions import DenseSession, attach, put
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array

@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.dense import is_dense
@@ -20,7 +21,6 @@ from graphslam.app.sessions.merge_align import By, align_runs, of_session
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
 from graphslam.app.sessions.merge_metrics import merge_metrics
 from graphslam.app.sessions.merged_map import MergedMap, Session
-from graphslam.app.threads import one_blas_thread
 from graphslam.association.identity import doubtful_identities
 from graphslam.association.merging import mahalanobis_merges
 from graphslam.core.errors import ConfigError
@@ -255,3 +255,16 @@ def _with_landmarks(m: GlobalMap, solution: Solution, P: Array, hits: Ints, keep
         landmark_covariances=P[keep],
         landmark_hits=hits[keep],
     )
+
+
+def continue_runs(saved: Sequence[Run | str | Path], run: Run, *, out: str | Path | None = None) -> Any:
+    """Put a new run into the graph of saved ones, tied where it was localised in them; the first one's base is fixed.
+
+    What was there before is replaced: the run itself may have been resumed.
+
+    Raises
+    ------
+    DataError
+        It is not found in any of them. The run itself stays as it is.
+    """
+    return merge([*saved, run], out=out, anew=True)

@@ -12,8 +12,7 @@ from graphslam.app.folders.generations import Generation, is_empty, new_generati
 from graphslam.app.folders.lock import locked, make_folder
 from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
-from graphslam.app.run.graph_facts import graph_facts
-from graphslam.app.run.outputs import landmarks_csv
+from graphslam.app.run.outputs import graph_facts, landmarks_csv
 from graphslam.app.sessions.merge_dense import MergedSubmaps
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end
-from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_between, se2_inverse, se2_transform

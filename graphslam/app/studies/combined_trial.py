@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.studies.scoring import Judge, Watch, clock, timed, watch_snapshots
-from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import simulate
 from graphslam.core.config import merge
 from graphslam.core.errors import GraphSlamError
@@ -33,9 +33,8 @@ from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
-from graphslam.join.submap_batch import solve_submaps
 from graphslam.join.submap_isam2 import solve_submaps_isam2
-from graphslam.join.submap_solver import SubmapEstimate
+from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.solve.network.full_batch import full_batch
 
 

@@ -59,6 +59,10 @@ class StudyDefinition(Protocol):
 def find_study(name: str) -> StudyDefinition:
     """The study registered as ``name``, or a user's own as ``module:object``.
 
+    Parameters
+    ----------
+    name : str
+
     Raises
     ------
     UnknownNameError

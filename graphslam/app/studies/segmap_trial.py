@@ -15,9 +15,9 @@ from time import perf_counter
 
 import numpy as np
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 from graphslam.app.studies.worlds_study import WorldsStudy
-from graphslam.app.threads import one_blas_thread
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.random import SeedTree

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.studies.worlds_study import WorldsStudy
-from graphslam.app.threads import one_blas_thread
 from graphslam.app.worlds import mesh_world
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import Array

@@ -13,11 +13,10 @@ import pandas as pd
 from tqdm import tqdm
 
 from graphslam.app.folders.generations import new_generation
+from graphslam.app.machine import hold_one_thread, one_blas_thread, versions
 from graphslam.app.studies import STUDIES
 from graphslam.app.studies.definition import StudyDefinition, find_study, fingerprint, source_digest
 from graphslam.app.studies.folder import StudyFolder
-from graphslam.app.threads import hold_one_thread, one_blas_thread
-from graphslam.app.versions import versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import heeded_interrupts
 from graphslam.core.markup import element, frame, join, table

@@ -1,4 +1,4 @@
-"""One BLAS thread for everything the application does.
+"""What of the machine a result may depend on: threads of linear algebra, and versions of what computes.
 
 The matrices are small and many: threads of a linear-algebra library wait for each other and cost up to ten times more
 than they give. The order of their sums would also depend on the machine, and the same seed must give the same bytes.
@@ -7,7 +7,9 @@ than they give. The order of their sums would also depend on the machine, and th
 from __future__ import annotations
 
 import os
+import platform
 import sys
+from importlib.metadata import PackageNotFoundError, version
 
 from threadpoolctl import threadpool_limits
 
@@ -29,3 +31,17 @@ def hold_one_thread() -> None:
     else:
         os.environ["NUMBA_NUM_THREADS"] = "1"
     threadpool_limits(limits=1)
+
+
+PACKAGES = ("graphslam-submaps", "gtsam", "numpy", "scipy", "numba", "matplotlib", "pandas")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computed the run."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
