@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,10 +14,10 @@ import numpy.typing as npt
 from graphslam.association.identity import doubtful_identities
 from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
-from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.streams import ImuPart, recentred
 from graphslam.core.errors import DataError
-from graphslam.core.records import Gps
+from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import NO_KERNEL, Robust
@@ -90,6 +90,7 @@ class BackEnd:
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
         self._waiting: list[tuple[Gps, GpsOptions]] = []
+        self._later: list[Callable[[PoseGraph], object]] = []  # until the first submap says which dimension it is
         kind = self.config.match_robust
         self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
         self._association = AssociationConfig(
@@ -108,6 +109,14 @@ class BackEnd:
         if have > want:
             gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
         self.graph.add_gps(gps, config=config)
+
+    def add_compass(self, name: str, compass: Compass, config: CompassOptions) -> None:
+        """Give the graph the headings of a compass; they wait for the submaps that hold them."""
+        self._later.append(lambda graph: graph.add_compass(compass, stream=name, config=config))
+
+    def add_beacons(self, name: str, ranges: LandmarkObservations, config: BeaconOptions) -> None:
+        """Give the graph distances to beacons; they wait for the submaps that hold them."""
+        self._later.append(lambda graph: graph.add_beacons(ranges, stream=name, config=config))
 
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""
@@ -147,6 +156,9 @@ class BackEnd:
         waiting, self._waiting = self._waiting, []
         for gps, config in waiting:
             self.add_gps(gps, config)
+        later, self._later = self._later, []
+        for add in later:
+            add(self.graph)
         return associated
 
     def _add_matches(self, submap: Submap) -> None:
@@ -187,6 +199,7 @@ class BackEnd:
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
         self.graph.finish_gps()
+        self.graph.finish_readings()
         if self.imu is not None:
             self.imu.tie(self.graph)
         recentred(self.graph, self.solver)

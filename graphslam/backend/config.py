@@ -10,6 +10,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import Robust
+from graphslam.graph.readings import BeaconConfig, CompassConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +30,22 @@ class ImuOptions(ImuConfig):
 
     use: str = "none"
     """``"none"``, ``"auto"`` (every IMU of the log that no submap used), or the name of a stream."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CompassOptions(CompassConfig):
+    """Which compasses enter the graph, and how."""
+
+    use: str = "none"
+    """``"none"``, ``"auto"`` (every compass of the log), or the name of a stream."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class BeaconOptions(BeaconConfig):
+    """Which distances to beacons enter the graph, and how."""
+
+    use: str = "none"
+    """``"none"``, or the name of a stream of sightings with known identities that the front end does not use."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.backend.config import GpsOptions, ImuOptions
+from graphslam.backend.config import BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.core.errors import MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Gps
+from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver
@@ -51,6 +51,48 @@ def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
 def imus_of(log: SensorLog) -> dict[str, Imu]:
     """The IMUs of a log by name."""
     return {name: s for name, s in log.streams.items() if isinstance(s, Imu)}
+
+
+def compasses_of(log: SensorLog, config: CompassOptions) -> dict[str, Compass]:
+    """The compasses of a log that are to be used, by name.
+
+    Raises
+    ------
+    MissingDataError
+        ``compass.use`` names a stream that the log does not have.
+    """
+    found = {name: s for name, s in log.streams.items() if isinstance(s, Compass)}
+    if config.use == "none":
+        return {}
+    if config.use == "auto":
+        return found
+    if config.use not in found:
+        raise MissingDataError(
+            "compass.use names no compass of the log",
+            got=config.use,
+            wanted=f"none, auto, {', '.join(found) or '(it has none)'}",
+        )
+    return {config.use: found[config.use]}
+
+
+def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObservations]:
+    """The stream of distances to beacons that is to be used, by name.
+
+    Raises
+    ------
+    MissingDataError
+        ``beacons.use`` names no stream of sightings.
+    """
+    if config.use == "none":
+        return {}
+    found = {name: s for name, s in log.streams.items() if isinstance(s, LandmarkObservations)}
+    if config.use not in found:
+        raise MissingDataError(
+            "beacons.use names no stream of sightings of the log",
+            got=config.use,
+            wanted=f"none, {', '.join(found) or '(it has none)'}",
+        )
+    return {config.use: found[config.use]}
 
 
 class ImuPart:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphslam.core.config import spelled
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.records import Compass, LandmarkObservations
@@ -49,11 +50,17 @@ class CompassConfig:
     """
 
     sigma: float | None = None
+    """Standard deviation of a reading [rad] in place of the stream's own."""
     every: float = 1.0
+    """At most one reading in so many seconds: what disturbs a compass lasts [s]."""
     declination: float | None = None
+    """Magnetic declination [rad], positive where magnetic north is east of true north; ties the compass to GPS."""
     declination_sigma: float = 0.01
+    """Its standard deviation [rad]."""
     hard_iron: float | None = None
-    robust: Robust = NO_KERNEL
+    """Standard deviation of the deviation by iron on the robot [rad], which is then estimated; none: there is none."""
+    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    """Robust kernel on each reading, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
         for name in ("sigma", "declination_sigma", "hard_iron"):
@@ -86,10 +93,21 @@ class BeaconConfig:
     """
 
     sigma: float | None = None
+    """Standard deviation of a distance [m] in place of the stream's own."""
     every: float = 0.0
+    """At most one distance to each beacon in so many seconds [s]."""
     least: int = 6
+    """Distances to a beacon before it gets a place."""
     spread: float = 0.1
-    robust: Robust = NO_KERNEL
+    """Least ratio of the smallest to the largest extent of the places from which a beacon was heard."""
+    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    """Robust kernel on each distance, and its width in standard deviations."""
+
+    def __post_init__(self) -> None:
+        if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma > 0):
+            raise ConfigError(f"beacons.sigma must be positive, got {self.sigma}")
+        if not (np.isfinite(self.every) and self.every >= 0 and 0 < self.spread < 1 and self.least >= 3):
+            raise ConfigError(f"beacons.every ≥ 0, 0 < beacons.spread < 1 and beacons.least ≥ 3 are wanted, got {self}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +120,7 @@ class Reading:
     sigma: float
     source: int
     beacon: int = -1
+    stream: str = ""
 
 
 @dataclass(slots=True, eq=False)
@@ -174,7 +193,7 @@ class Readings:
         for (t, value, sigma, beacon), name in zip(rows, names):
             fid = g.next_factor()
             g.ledger.spend(fid, f"{what} at {t:.3f} s", [name], (t, t))
-            out.append(Reading(t, fid, value, sigma, source, beacon))
+            out.append(Reading(t, fid, value, sigma, source, beacon, stream))
         return out
 
     def _queue(self, readings: Iterable[Reading], stream: str, left_out: int) -> list[int]:
@@ -200,8 +219,12 @@ class Readings:
         if s.trajectory is None:
             self._drop(mine, "submap has no trajectory")
             return
-        outside = []
+        outside, spent = [], []
         for r in mine:
+            # distances are entered by beacon, since several come at one instant: the stream itself is the front end's
+            if r.beacon >= 0 and self.graph.ledger.conflict(r.stream, (r.time, r.time)) is not None:
+                spent.append(r)
+                continue
             try:
                 at = s.nearest(np.array([r.time]))
                 T, P = s.local(np.array([r.time]), at)
@@ -210,6 +233,7 @@ class Readings:
                 continue
             (self._tie_range if r.beacon >= 0 else self._tie_heading)(r, s.nodes[int(at[0])], T, P)
         self._drop(outside, "outside the submap's trajectory")
+        self._drop(spent, "its submap has spent the stream already")
 
     def finish(self) -> None:
         """No more submaps will come: what still waits is dropped, and counted."""

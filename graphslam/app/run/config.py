@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
-from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
+from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.maps.run_map import MapConfig
 
 
@@ -28,6 +28,10 @@ class RunConfig:
     """GPS factors and what is withheld."""
     imu: ImuOptions = dataclasses.field(default_factory=ImuOptions)
     """IMU factors, and the axes of IMUs."""
+    compass: CompassOptions = dataclasses.field(default_factory=CompassOptions)
+    """Headings of compasses."""
+    beacons: BeaconOptions = dataclasses.field(default_factory=BeaconOptions)
+    """Distances to beacons."""
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
     """The fused map."""
 

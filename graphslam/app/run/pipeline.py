@@ -29,7 +29,7 @@ from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.backend.streams import ImuPart, imus_of, split, used_fixes
+from graphslam.backend.streams import ImuPart, beacons_of, compasses_of, imus_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.findings import verdict_json
@@ -222,6 +222,10 @@ def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str, observers: S
     gps = gps_stream(log)
     if gps is not None and settings.gps.use != "none":
         back.add_gps(split(gps, settings.gps)[0], settings.gps)
+    for name, compass in compasses_of(log, settings.compass).items():
+        back.add_compass(name, compass, settings.compass)
+    for name, ranges in beacons_of(log, settings.beacons).items():
+        back.add_beacons(name, ranges, settings.beacons)
     return back
 
 
@@ -279,6 +283,8 @@ def effective_config(
         "backend": as_dict(settings.backend),
         "gps": as_dict(settings.gps),
         "imu": as_dict(settings.imu),
+        "compass": as_dict(settings.compass),
+        "beacons": as_dict(settings.beacons),
         "map": as_dict(settings.map),
     }
 
@@ -359,7 +365,9 @@ def _judge(
     figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
     reports = [s.report for s in submaps]
     seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
-    report["verdict"] = verdict_json([*observed(streams, taken.noticed, submaps), *seen, *verdict(figures)])
+    report["verdict"] = verdict_json(
+        [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *verdict(figures)]
+    )
     return Run(
         name=log.name,
         submaps=identified,

@@ -11,11 +11,11 @@ import numpy as np
 from graphslam.app.run.config import RunConfig
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Gps
+from graphslam.core.records import Compass, Gps
 from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.pose_graph import PoseGraph
 
-Role = Literal["input", "gps", "imu", "unused"]
+Role = Literal["input", "gps", "imu", "compass", "beacons", "unused"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +25,8 @@ class StreamUse:
     Parameters
     ----------
     name : str
-    role : {"input", "gps", "imu", "unused"}
-        What it was there for: ``input`` of the front end; GPS or IMU of the graph; or nothing in this run.
+    role : {"input", "gps", "imu", "compass", "beacons", "unused"}
+        What it was there for: ``input`` of the front end; something that the graph was given; or nothing in this run.
     offered : int
         Records that the log holds.
     used : int
@@ -71,7 +71,7 @@ def stream_use(
     """
     spans: dict[str, list[tuple[float, float]]] = {}
     for e in graph.ledger.entries():
-        spans.setdefault(e.stream, []).append((e.t_start, e.t_end))
+        spans.setdefault(e.stream.partition("/")[0], []).append((e.t_start, e.t_end))  # stream/beacon
     left_out = {e["stream"]: str(e["why"]) for e in graph.events if e.get("event") == "imu-not-used"}
     out = []
     for name, stream in log.streams.items():
@@ -103,6 +103,14 @@ def stream_use(
         elif isinstance(stream, Imu):
             asked = settings.imu.use == name or settings.imu.use == "auto"
             role, why = "imu", left_out.get(name, "") if asked else "imu.use is none"
+        elif isinstance(stream, Compass):
+            asked = settings.compass.use in (name, "auto")
+            role, why = "compass", "" if asked else "compass.use is none"
+        elif settings.beacons.use == name:
+            asked, role = True, "beacons"
+        if asked and role in ("compass", "beacons") and 0 < used < len(times):
+            every = (settings.compass if role == "compass" else settings.beacons).every
+            why = f"one in {every:g} s is used, and none outside the path" if every else ""
         if used < len(times) and not why:
             reasons = [f"{n} {k}" for k, n in lost.items()]
             outside = len(times) - used

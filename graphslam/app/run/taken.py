@@ -21,13 +21,21 @@ from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Gps, LandmarkObservations, Odometry, SteeringControls, VelocityControls, check_times
+from graphslam.core.records import (
+    Compass,
+    Gps,
+    LandmarkObservations,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+    check_times,
+)
 from graphslam.evaluate.stream_checks import Noticed
 from graphslam.io.log_store import INDEX_NAME, load_log, save_log
 
 TAKEN_FORMAT = "graphslam.taken/1"
 INPUTS = "inputs"
-KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls, VelocityControls)
+KEPT = (Compass, Gps, Imu, LandmarkObservations, Odometry, SteeringControls, VelocityControls)
 
 
 @dataclass(frozen=True, slots=True)

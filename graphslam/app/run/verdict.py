@@ -8,6 +8,7 @@ run itself saw (:func:`observed`) is read from ``run.json``.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -93,7 +94,10 @@ _STATED = frozenset(
 
 
 def observed(
-    streams: Sequence[StreamUse], noticed: Sequence[Noticed] = (), submaps: Sequence[Submap] = ()
+    streams: Sequence[StreamUse],
+    noticed: Sequence[Noticed] = (),
+    submaps: Sequence[Submap] = (),
+    events: Sequence[Mapping[str, Any]] = (),
 ) -> list[Finding]:
     """Lines on what became of every stream, what was noticed in it, and what the front end says.
 
@@ -104,6 +108,8 @@ def observed(
         Of the raw streams; what is bad in one that was not used is only worth a look.
     submaps : sequence of Submap
         Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
+    events : sequence of mapping
+        Of the graph; ``outlier``, ``beacon-not-placed`` and ``readings-dropped`` become lines.
     """
     counts = "; ".join(s.in_words() for s in streams)
     out = [Finding("", "streams", f"Records used of those offered: {counts}.")] if streams else []
@@ -119,8 +125,26 @@ def observed(
     for n in noticed:
         level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
         out.append(replace(n.finding, level=level))
+    out += _of_events(events)
     for submap in submaps:
         out += [f for row in submap.report.get("findings", ()) if (f := Finding.from_row(row))]
+    return out
+
+
+def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """What the graph left out by its own judgement."""
+    out = []
+    taken = Counter(str(e["group"]) for e in events if e.get("event") == "outlier")
+    if taken:
+        counts = ", ".join(f"{n} of class {group}" for group, n in sorted(taken.items()))
+        text = (
+            f"Graduated non-convexity took out {taken.total()} factors as outliers: {counts}. Each is named in events."
+        )
+        out.append(Finding("look", "outliers", text))
+    for e in events:
+        if e.get("event") == "beacon-not-placed":
+            text = f"Beacon {e['beacon']} has no place after {e['distances']} distances: {e['why']}."
+            out.append(Finding("look", "beacon-not-placed", text))
     return out
 
 
