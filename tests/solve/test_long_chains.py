@@ -119,3 +119,26 @@ def test_no_gap_is_told_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatc
     assert solution.decrement > 0
     assert report_of(solution)["gap"] is None
     assert "above a minimum" in repr(solution)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_noise_from_a_ten_thousandth_to_one_in_one_chain(rng: np.random.Generator, dim: int) -> None:
+    """Factors 10⁸ apart in information, and a loop over most of them: nothing is removed, one optimum."""
+    graph = PoseGraph(dim)
+    solver, G = Isam2Solver(graph), SE2 if dim == 2 else SE3
+    step = np.array([1.0, 0.0, 0.01]) if dim == 2 else SE3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))
+    for k in range(2000):
+        sigma = 10.0 ** rng.uniform(-4, 0)
+        exit_pose = G.compose(step, G.exp(0.1 * sigma * rng.standard_normal(G.dof)))
+        graph.add_submap(dense_submap(k, exit_pose, sigma**2 * np.eye(G.dof)))
+        if k % 40 == 0:
+            solver.update()
+    solver.update()
+    same_as_batch(graph, solver)
+    poses = graph.values.poses
+    apart = G.compose(G.between(poses[100], poses[1900]), G.exp(0.05 * rng.standard_normal(G.dof)))
+    graph.add_between(100, 1900, apart, 1e-4 * np.eye(G.dof), evidence="shared-scan")
+    solver.update()
+    solver.solve_to_optimum()
+    assert solver.solution().converged
+    assert not [e for e in graph.events if e["event"] == "removed"]
