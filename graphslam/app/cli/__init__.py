@@ -32,6 +32,7 @@ app = typer.Typer(
     help="Globally consistent maps with an uncertainty you can trust.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # or else [m] in a help text is taken for markup and disappears
     add_completion=False,
 )
 
@@ -44,7 +45,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    verbose: bool = typer.Option(False, "--verbose", "-v", help="Say on stderr what is being done."),
+    verbose: bool = typer.Option(False, "--verbose", "-v", help="Print progress messages on stderr."),
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     log_to_stderr(verbose)

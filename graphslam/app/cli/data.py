@@ -8,12 +8,14 @@ from graphslam.app.cli.run import JSON
 from graphslam.app.cli.terminal import emit, log_to_stderr, table
 from graphslam.core.errors import DataError, MissingDataError
 
-app = typer.Typer(help="Recorded data sets: what there is, where it is, whether it is whole.", no_args_is_help=True)
+app = typer.Typer(
+    help="Recorded data sets: list, describe, download and check them.", no_args_is_help=True, rich_markup_mode=None
+)
 
 
 @app.command("list")
 def list_data(as_json: bool = JSON) -> None:
-    """Every card, and whether its files are on this machine."""
+    """List all cards, and whether their files are on this machine."""
     from graphslam.io.cards import list_cards
     from graphslam.io.catalog import locate
 
@@ -40,7 +42,7 @@ def list_data(as_json: bool = JSON) -> None:
 
 @app.command()
 def info(name: str, as_json: bool = JSON) -> None:
-    """One card: contents, source, citation, terms, traps."""
+    """Show one card: contents, source, citation, licence terms and known problems."""
     from graphslam.io.cards import card
 
     c = card(name)
@@ -67,7 +69,7 @@ def info(name: str, as_json: bool = JSON) -> None:
 
 @app.command()
 def fetch(name: str, as_json: bool = JSON) -> None:
-    """Find a data set or download it, with checksums; says what it is doing and under which terms."""
+    """Find a data set on this machine, or download it and check its checksums."""
     from graphslam.io.fetch import fetch as fetch_files
 
     log_to_stderr(True)
@@ -77,7 +79,7 @@ def fetch(name: str, as_json: bool = JSON) -> None:
 
 @app.command()
 def check(name: str, as_json: bool = JSON) -> None:
-    """Compare every file with its checksum; exit 1 where one is missing or differs."""
+    """Compare all files with their checksums; exit with 1 if one is missing or differs."""
     from graphslam.io.catalog import check as check_files
 
     found = check_files(name)

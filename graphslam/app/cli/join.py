@@ -23,18 +23,26 @@ def register(app: typer.Typer) -> None:
 
 
 def join(
-    source: str = typer.Argument(..., help="Submap store, run folder, or a card of submaps."),
-    method: str = typer.Option("eif-tree", help="eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."),
-    polish: bool = typer.Option(False, "--polish", help="Gauss-Newton from the joined map to the optimum."),
-    associate: str = typer.Option("given", help="given ids, or recognise landmarks: nearest or joint."),
-    scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),
-    workers: int | None = typer.Option(None, help="Processes that share the joins of eif-tree."),
-    cluster: str | None = typer.Option(None, help="Address of a Dask scheduler to send the joins of eif-tree to."),
-    out: Path | None = typer.Option(None, help="Folder for joined.npz and nodes.tum."),
+    source: str = typer.Argument(..., help="Folder of submaps, folder of a run, or name of a card of submaps."),
+    method: str = typer.Option(
+        "eif-tree", help="Name of the method: eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."
+    ),
+    polish: bool = typer.Option(
+        False, "--polish", help="Continue from the joined map to the least-squares optimum by Gauss-Newton."
+    ),
+    associate: str = typer.Option(
+        "given", help="How landmarks are associated: given (by their ids), nearest or joint."
+    ),
+    scale: float | None = typer.Option(
+        None, help="Factor on the covariances of the submaps. Default: that of the run."
+    ),
+    workers: int | None = typer.Option(None, help="Number of processes that share the joins of eif-tree."),
+    cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the joins of eif-tree."),
+    out: Path | None = typer.Option(None, help="Folder for the results joined.npz and nodes.tum."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Join submaps into one map by one method."""
+    """Join submaps into one map with one method."""
     from graphslam.app.compare import join_json
     from graphslam.app.submap_sources import submap_source
     from graphslam.io.joined_map import write_joined
@@ -61,17 +69,23 @@ def join(
 
 
 def compare(
-    source: str = typer.Argument(..., help="Submap store, run folder, or a card of submaps."),
-    methods: str | None = typer.Option(None, help="Comma-separated; default: all but eif-online."),
-    polish: bool = typer.Option(True, help="Take every method on to the least-squares optimum."),
-    associate: str = typer.Option("given", help="given ids, or recognise landmarks: nearest or joint."),
-    scale: float | None = typer.Option(None, help="Factor on the submap covariances; default: the run's own."),
-    memory: bool = typer.Option(True, help="Measure peak memory in a process per method."),
-    figure: Path | None = typer.Option(None, help="PNG of objectives side by side."),
+    source: str = typer.Argument(..., help="Folder of submaps, folder of a run, or name of a card of submaps."),
+    methods: str | None = typer.Option(
+        None, help="Names of methods, separated by commas. Default: all except eif-online."
+    ),
+    polish: bool = typer.Option(True, help="Continue from the result of every method to the least-squares optimum."),
+    associate: str = typer.Option(
+        "given", help="How landmarks are associated: given (by their ids), nearest or joint."
+    ),
+    scale: float | None = typer.Option(
+        None, help="Factor on the covariances of the submaps. Default: that of the run."
+    ),
+    memory: bool = typer.Option(True, help="Measure the peak memory of every method in a process of its own."),
+    figure: Path | None = typer.Option(None, help="PNG file for a figure that compares the objectives."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Every method on the same submaps: objective, gap, time, memory, non-zeros, NEES and CI where truth is known."""
+    """Compare methods on the same submaps: objective, gap, time, memory, and NEES and CI where the truth is known."""
     from graphslam.app import compare as comparing
     from graphslam.app.submap_sources import submap_source
 

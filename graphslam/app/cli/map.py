@@ -22,8 +22,8 @@ def register(app: typer.Typer) -> None:
 
 
 def make_map(
-    run: Path = typer.Argument(..., help="Folder of a finished run of a front end with evidence grids."),
-    grid: bool = typer.Option(False, "--grid", help="Write the evidence grid itself too: map.grid.npz."),
+    run: Path = typer.Argument(..., help="Folder of a finished run whose submaps hold evidence grids."),
+    grid: bool = typer.Option(False, "--grid", help="Write also the evidence grid, map.grid.npz."),
     minimum_entropy: bool = typer.Option(
         False,
         "--minimum-entropy",
@@ -36,13 +36,19 @@ def make_map(
         help="Solve so many topologies that the particles of a SegSLAM run told, for which its log is read once more; "
         "the clearest map and the others are kept in the same way.",
     ),
-    log: str | None = typer.Option(None, help="With --hypotheses: card or folder of the run's log, if it was moved."),
-    low: float | None = typer.Option(None, help="Floor plans begin this far above the path [m]; default the run's."),
-    high: float | None = typer.Option(None, help="Floor plans end this far above the path [m]; default the run's."),
+    log: str | None = typer.Option(
+        None, help="With --hypotheses: card or folder of the log of the run, if it was moved."
+    ),
+    low: float | None = typer.Option(
+        None, help="Lower bound of the floor plans above the path [m]. Default: that of the run."
+    ),
+    high: float | None = typer.Option(
+        None, help="Upper bound of the floor plans above the path [m]. Default: that of the run."
+    ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """The fused map of a run, made again from its folder; no scan is read unless hypotheses are asked for."""
+    """Make the fused map of a run again from its folder, with other choices if asked."""
     from graphslam.app.run.remake_map import remake_map
 
     made = remake_map(

@@ -21,14 +21,14 @@ def register(app: typer.Typer) -> None:
 
 def loops(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
-    history: bool = typer.Option(False, help="Every decision, not only those in force."),
-    every: bool = typer.Option(False, "--all", help="Also what the registration refused."),
-    undo: int | None = typer.Option(None, help="Take this loop out, solve again, and write the run anew."),
-    redo: int | None = typer.Option(None, help="Take in again a loop that was undone."),
+    history: bool = typer.Option(False, help="Show all decisions, also those that a later one replaced."),
+    every: bool = typer.Option(False, "--all", help="Show also the candidates that the registration rejected."),
+    undo: int | None = typer.Option(None, help="Remove the loop with this number, solve again, and update the run."),
+    redo: int | None = typer.Option(None, help="Add the loop with this number again after it was undone."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Loops of a run: where each came from, its gates, χ², weight and effect, accepted or not, and why."""
+    """List the loops of a run: source, gates, χ², weight, effect, and why each was accepted or not."""
     from graphslam.app.run.files import loops_of_run
     from graphslam.app.run.loops import redo_loop, undo_loop
     from graphslam.core.errors import ConfigError
@@ -54,13 +54,13 @@ def loops(
 
 
 def report(
-    run: Path = typer.Argument(..., help="Folder that run, demo or merge wrote, finished or not."),
-    out: Path | None = typer.Option(None, help="File of the page; default report.html in the folder."),
-    show: bool = typer.Option(False, "--open", help="Show it in the browser."),
+    run: Path = typer.Argument(..., help="Folder that run, demo or merge wrote; it may be unfinished."),
+    out: Path | None = typer.Option(None, help="HTML file to write. Default: report.html in the folder."),
+    show: bool = typer.Option(False, "--open", help="Open the page in the browser."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """One self-contained HTML page of a run: verdict, figures, metrics, graph, loops and why, evidence, events."""
+    """Write one self-contained HTML page of a run: verdict, figures, metrics, graph, loops, ledger and events."""
     from graphslam.app.report.report import report_and_file
 
     made, file = report_and_file(run, out)
@@ -77,20 +77,20 @@ def report(
 
 
 def export(
-    run: Path = typer.Argument(..., help="Run folder."),
-    format: str = typer.Option("kml", help="kml (Google Earth) or geojson (GIS)."),
+    run: Path = typer.Argument(..., help="Folder of a finished run."),
+    format: str = typer.Option("kml", help="Format of the file: kml for Google Earth, or geojson for GIS programs."),
     datum: str = typer.Option(
-        ..., help="LAT,LON of the origin of the GPS frame (of the first base without GPS), degrees WGS 84."
+        ..., help="Origin of the GPS frame as LAT,LON in degrees (WGS 84); without GPS, of the first pose."
     ),
     heading: float | None = typer.Option(
-        None, help="Without GPS: where the first base looks, degrees clockwise from north."
+        None, help="Without GPS: heading of the first pose in degrees, clockwise from north."
     ),
-    confidence: float = typer.Option(0.95, help="Of the landmarks' ellipses."),
-    out: Path | None = typer.Option(None, help="File; default map.FORMAT in the run folder."),
+    confidence: float = typer.Option(0.95, help="Confidence of the landmark ellipses, between 0 and 1."),
+    out: Path | None = typer.Option(None, help="File to write. Default: map.FORMAT in the folder of the run."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Path, landmarks with ellipses and GPS of a run on the globe."""
+    """Export path, landmarks with ellipses, and GPS fixes of a run in geographic coordinates."""
     from graphslam.app.export import export as export_run
     from graphslam.app.export import parse_datum
 

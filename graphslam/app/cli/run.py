@@ -25,9 +25,12 @@ def _limit(size: str | None) -> str | None:
 
 
 MAX_SIZE = typer.Option(
-    None, "--max-size", callback=_limit, help="Most that is read of one file, decompressed; 2G unless told, e.g. 8G."
+    None,
+    "--max-size",
+    callback=_limit,
+    help="Largest decompressed size of one input file, for example 8G. Default: 2G.",
 )
-JSON = typer.Option(False, "--json", help="One JSON object on stdout, nothing else there.")
+JSON = typer.Option(False, "--json", help="Print one JSON object on stdout, and nothing else.")
 
 
 def register(app: typer.Typer) -> None:
@@ -38,21 +41,23 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    source: str = typer.Argument(..., help="A data-set card, or a folder with a log."),
-    frontend: str = typer.Option("rbpf-ekf", help="Front end that makes the submaps."),
-    solver: str = typer.Option("isam2", help="isam2 or batch."),
-    config: Path | None = typer.Option(None, help="TOML file with options over the source's preset."),
-    setting: list[str] = typer.Option([], "--set", help="One option, a.b=value; may be repeated."),
-    seed: int = typer.Option(0, help="Root of the seed tree."),
-    out: Path = typer.Option(..., help="Run folder."),
-    resume: bool = typer.Option(False, "--resume", help="Go on after the last finished submap."),
+    source: str = typer.Argument(..., help="Name of a data-set card, or a folder that holds a log."),
+    frontend: str = typer.Option("rbpf-ekf", help="Name of the front end that turns the log into submaps."),
+    solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch or gnc."),
+    config: Path | None = typer.Option(
+        None, help="TOML file with options; they replace those of the preset of the source."
+    ),
+    setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
+    seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
+    out: Path = typer.Option(..., help="Folder for the results of the run."),
+    resume: bool = typer.Option(False, "--resume", help="Continue an interrupted run after its last finished submap."),
     saved: list[Path] = typer.Option(
-        [], "--continue", help="Run folder whose graph this session joins, in OUT/continued; may be repeated."
+        [], "--continue", help="Folder of an earlier run; both become one graph in OUT/continued. May be repeated."
     ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Raw log → submaps → graph → map, with everything that was measured on the way."""
+    """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on how far to trust it."""
     from graphslam.app.run.pipeline import run as run_pipeline
 
     options = _options(config, setting)
@@ -127,12 +132,14 @@ def join_note(result: Any) -> list[str]:
 
 
 def demo(
-    out: Path = typer.Option(Path("demo-run"), help="Run folder; a demo that is there already is gone on with."),
-    seed: int = typer.Option(0, help="Of every sensor error, of what stands about, and of the filter."),
-    preset: str = typer.Option("garage", help="Size of the world: garage or quick."),
+    out: Path = typer.Option(
+        Path("demo-run"), help="Folder for the results. If it holds an unfinished demo, that demo is continued."
+    ),
+    seed: int = typer.Option(0, help="Seed for sensor noise, clutter and the filter."),
+    preset: str = typer.Option("garage", help="World of the demo: garage, or quick for a small one."),
     as_json: bool = JSON,
 ) -> None:
-    """A robot in a simulated garage of two levels → SegSLAM → one graph → the map that follows it."""
+    """Simulate a robot in a garage with two levels, map it with SegSLAM, and solve one factor graph."""
     from graphslam.app.demo import run_demo
 
     result = run_demo(out, seed=seed, preset=preset, progress=not as_json)
@@ -149,17 +156,19 @@ def demo(
 
 
 def simulate(
-    world: str = typer.Argument(..., help="landmark-field, garage, mine, building or court"),
-    out: Path = typer.Option(..., help="Folder for the log, truth included."),
-    seed: int = typer.Option(0, help="Of every error, and of what can be moved in the world."),
-    layout: str | None = typer.Option(None, help="Of the garage: A, B or C."),
+    world: str = typer.Argument(..., help="Name of the world: landmark-field, garage, mine, building or court."),
+    out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
+    seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),
+    layout: str | None = typer.Option(None, help="Layout of the garage: A, B or C."),
     preset: str | None = typer.Option(
         None, help="Landmark field: A, B, C, demo or quick. Other worlds: light, full or two-scanners."
     ),
-    setting: list[str] = typer.Option([], "--set", help="A figure of the world or robot, name=value; repeatable."),
+    setting: list[str] = typer.Option(
+        [], "--set", help="Set one parameter of the world or the robot, as name=value. May be repeated."
+    ),
     as_json: bool = JSON,
 ) -> None:
-    """A recorded log of a simulated world, with its truth and every noise figure stated."""
+    """Simulate a robot in a world and write its log, with the truth and all noise parameters."""
     from graphslam.app.worlds import simulate as make
     from graphslam.app.worlds import write_simulated
 

@@ -18,18 +18,23 @@ def register(app: typer.Typer) -> None:
 
 
 def merge(
-    runs: list[Path] = typer.Argument(..., help="Run folders, at least two; the first one's base is the origin."),
-    by: str = typer.Option(
-        "auto", help="Landmarks: identity, constellation (their pattern). Dense submaps: places, gps. Or auto."
+    runs: list[Path] = typer.Argument(
+        ..., help="Folders of at least two runs. The first pose of the first run is the origin."
     ),
-    solver: str = typer.Option("batch", help="isam2 or batch."),
-    identity_gate: float = typer.Option(25.0, help="Split off sightings beyond this χ² (2 dof); 0 = never."),
-    tolerance: float = typer.Option(0.5, help="Landmarks of two maps this near after alignment agree [m]."),
+    by: str = typer.Option(
+        "auto",
+        help="How runs are aligned. Landmarks: identity or constellation. Dense submaps: places or gps. Or auto.",
+    ),
+    solver: str = typer.Option("batch", help="Name of the solver: isam2, lm, batch or gnc."),
+    identity_gate: float = typer.Option(
+        25.0, help="Sightings with a larger χ² (2 degrees of freedom) become separate landmarks. 0: never."
+    ),
+    tolerance: float = typer.Option(0.5, help="Largest distance of matching landmarks after alignment [m]."),
     out: Path = typer.Option(..., help="Folder for the merged map."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Merge runs of several robots or days into one map, solved as one problem, by the landmarks they share."""
+    """Merge runs of several robots or days into one map, which is solved as one problem."""
     from graphslam.app.sessions.merge import merge as merge_runs
     from graphslam.app.sessions.merge_align import By
 
@@ -41,15 +46,17 @@ def merge(
 
 
 def localise(
-    run: Path = typer.Argument(..., help="Run folder of dense submaps: the map."),
-    source: str = typer.Argument(..., help="What is to be found: another run folder, a log folder, or a card."),
-    submap: list[int] = typer.Option([], help="Of a run folder, only the submap of this key; may be repeated."),
-    begin: float | None = typer.Option(None, help="Of a log, from this time on [s]."),
-    end: float | None = typer.Option(None, help="Of a log, up to this time [s]."),
+    run: Path = typer.Argument(..., help="Folder of a run with dense submaps: the map."),
+    source: str = typer.Argument(
+        ..., help="What to localise: folder of another run, folder of a log, or name of a card."
+    ),
+    submap: list[int] = typer.Option([], help="Localise only the submap with this key. May be repeated."),
+    begin: float | None = typer.Option(None, help="Use a log from this time on [s]."),
+    end: float | None = typer.Option(None, help="Use a log up to this time [s]."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Find submaps, or a stretch of a log, in a saved map: pose with covariance, every candidate, and why not."""
+    """Localise submaps, or a part of a log, in a saved map: poses with covariances, and all candidates."""
     from graphslam.app.sessions.localise import localise as find
     from graphslam.app.sessions.localise import source_of
 

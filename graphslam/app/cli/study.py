@@ -18,18 +18,19 @@ def register(app: typer.Typer) -> None:
 
 def study(
     name: str = typer.Argument(
-        ..., help="combined-slam, association-ambiguity, segslam-garage (-mine, -building), or your own, module:object."
+        ...,
+        help="combined-slam, association-ambiguity, segslam-garage (-mine, -building), or your own as module:object.",
     ),
-    trials: int | None = typer.Option(None, help="Trials of each world; default the study's own."),
-    workers: int | None = typer.Option(None, help="Processes; default none, the trials run in this one."),
-    cluster: str | None = typer.Option(None, help="Address of a Dask scheduler, instead of processes."),
-    out: Path = typer.Option(..., help="Folder of the study; one that is there already is gone on with."),
-    quick: bool = typer.Option(False, "--quick", help="The study's small version."),
-    worlds: str = typer.Option("", help="Some of the study's worlds, separated by commas."),
-    seed: int = typer.Option(0, help="Root of the seed tree."),
+    trials: int | None = typer.Option(None, help="Number of trials in each world. Default: that of the study."),
+    workers: int | None = typer.Option(None, help="Number of processes. Default: the trials run in this process."),
+    cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the trials."),
+    out: Path = typer.Option(..., help="Folder of the study. If it holds an unfinished study, that one is continued."),
+    quick: bool = typer.Option(False, "--quick", help="Run the small version of the study."),
+    worlds: str = typer.Option("", help="Names of worlds of the study, separated by commas. Default: all."),
+    seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
     as_json: bool = JSON,
 ) -> None:
-    """Monte-Carlo study: every algorithm on the same data, one tidy table, a report and figures. Resumes by itself."""
+    """Run a Monte-Carlo study: all algorithms on the same data, one table, a report, figures. It resumes itself."""
     from graphslam.app.studies.study import study as run_study
 
     result = run_study(

@@ -20,23 +20,28 @@ def register(app: typer.Typer) -> None:
 
 
 def solve(
-    file: str = typer.Argument(..., help="A .g2o, .graph or .txt file (also .xz, .gz, .bz2), or card/file."),
-    solver: str = typer.Option("lm", help="lm, isam2, gnc or pcg."),
+    file: str = typer.Argument(..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or CARD/FILE."),
+    solver: str = typer.Option("lm", help="Name of the solver: lm, isam2, gnc or pcg."),
     repair: bool = typer.Option(
-        False, "--repair", help="Project indefinite information matrices instead of refusing them."
+        False,
+        "--repair",
+        help="Replace indefinite information matrices by the nearest valid ones instead of refusing the file.",
     ),
     create_missing: bool = typer.Option(
-        False, "--create-missing", help="Make vertices that only edges name instead of refusing the file."
+        False, "--create-missing", help="Add vertices that only edges mention instead of refusing the file."
     ),
-    out: Path | None = typer.Option(None, help="g2o file for the solution."),
+    out: Path | None = typer.Option(None, help="g2o file to write the solution to."),
     starts: str | None = typer.Option(
-        None, help="all, or names such as chordal,tree. By default one start, and the others if there is doubt."
+        None,
+        help="Start values: all, or names such as chordal,tree. Default: one, and others only in case of doubt.",
     ),
-    certify: bool = typer.Option(False, "--certify", help="Say whether the answer is the global optimum."),
+    certify: bool = typer.Option(
+        False, "--certify", help="Check whether the solution is certified as the global optimum."
+    ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Solve a pose-graph file from its best start, and say honestly whether it is at its optimum."""
+    """Solve a pose-graph file, and say whether the solution is at its optimum."""
     from graphslam.app.solve_file import solve_file
     from graphslam.io.catalog import load
 
@@ -56,16 +61,16 @@ def solve(
 
 
 def evaluate(
-    estimate: Path = typer.Argument(..., help="TUM file."),
-    reference: Path = typer.Argument(..., help="TUM file."),
-    align: str = typer.Option("se", help="none, origin, se or sim."),
-    delta: float = typer.Option(10.0, help="Distance [m] (or time [s]) of the relative error."),
-    delta_unit: str = typer.Option("m", help="m or s."),
-    max_diff: float = typer.Option(0.01, help="Stamps further apart are no pair [s]."),
+    estimate: Path = typer.Argument(..., help="Estimated path, a TUM file."),
+    reference: Path = typer.Argument(..., help="Reference path, a TUM file."),
+    align: str = typer.Option("se", help="Alignment before the error is measured: none, origin, se or sim."),
+    delta: float = typer.Option(10.0, help="Distance [m] or time [s] over which the relative error is measured."),
+    delta_unit: str = typer.Option("m", help="Unit of --delta: m or s."),
+    max_diff: float = typer.Option(0.01, help="Largest time difference of poses that are compared [s]."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Absolute and relative trajectory error (ATE, RPE)."""
+    """Measure the absolute and the relative trajectory error (ATE, RPE) of a path."""
     from graphslam.evaluate.trajectory_error import Alignment, ate, rpe
     from graphslam.io.tum import read_tum
 
@@ -86,7 +91,7 @@ def evaluate(
 
 
 def doctor(as_json: bool = JSON) -> None:
-    """Versions, missing system libraries, and what to install."""
+    """Check the installation: versions, missing system libraries, and what to install."""
     from graphslam.app.doctor import examine
 
     findings = examine()
