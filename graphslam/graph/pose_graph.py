@@ -273,6 +273,15 @@ class PoseGraph(ImuVerbs):
         """
         return self.readings.add_beacons(ranges, stream, config, None if lever is None else np.asarray(lever))
 
+    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
+        """See :meth:`~graphslam.graph.graph_record.GraphRecord.remove`; headings and distances go with a submap."""
+        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
+        if owner is not None and factor_id in self.records:
+            self.readings.leave(owner.nodes[:-1])
+        super().remove(factor_id, reason=reason)
+        if any(self.structure.count(word) for word in ("compass", "deviation", "beacon")):
+            self.readings.compact()
+
     def finish_readings(self) -> None:
         """No more submaps will come: headings and distances that still wait are dropped, and counted."""
         self.readings.finish()

@@ -10,6 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -143,6 +144,7 @@ class Readings:
         self.graph = graph
         self.compasses: list[CompassConfig] = []
         self.ranging: list[tuple[BeaconConfig, Array]] = []
+        self.zeros: dict[int, int] = {}  # compass -> row
         self.deviations: dict[int, int] = {}  # compass -> row
         self.beacons: dict[int, _Beacon] = {}
         self.waiting: list[Reading] = []
@@ -253,6 +255,56 @@ class Readings:
                 self.graph.note("beacon-not-placed", beacon=number, distances=len(b.heard), why=why)
                 b.heard = []
 
+    # ---------------------------------------------------------------- taking out
+
+    def leave(self, nodes: Iterable[int]) -> None:
+        """Take out what hangs on nodes that go."""
+        inside = set(nodes)
+        for fid, r in list(self.graph.records.items()):
+            if isinstance(r, (CompassRecord, BeaconRangeRecord)) and r.node in inside:
+                self._take_out(fid)
+
+    def compact(self) -> None:
+        """Variables that no reading holds any more go, and what was said of them; the others move up."""
+        g = self.graph
+        readings = [r for r in g.records.values() if isinstance(r, CompassRecord)]
+        if not g.structure.count("datum"):
+            self._take_out(*(f for f, r in g.records.items() if isinstance(r, DeclinationRecord)))
+        heard = Counter(r.beacon for r in g.records.values() if isinstance(r, BeaconRangeRecord))
+        held = {k for k, n in heard.items() if n >= g.dim}  # fewer distances do not hold a place
+        self._take_out(*(f for f, r in g.records.items() if isinstance(r, BeaconRangeRecord) and r.beacon not in held))
+        rows = self._keep("compass", {r.compass for r in readings})
+        self.zeros = {k: rows[v] for k, v in self.zeros.items() if v in rows}
+        iron = self._keep("deviation", {r.deviation for r in readings if r.deviation is not None})
+        self.deviations = {k: iron[v] for k, v in self.deviations.items() if v in iron}
+        posts = self._keep("beacon", held)
+        for b in self.beacons.values():
+            b.row = None if b.row is None else posts.get(b.row)
+
+    def _keep(self, word: str, rows: set[int]) -> dict[int, int]:
+        """Keep these rows of a kind of variable; old row → new row."""
+        g = self.graph
+        new = {old: k for k, old in enumerate(sorted(rows))}
+        if len(new) == g.structure.count(word):
+            return new
+        for fid, r in list(g.records.items()):
+            old = getattr(r, word) if isinstance(r, _HOLDERS[word]) else None
+            if old is None:
+                continue
+            if old not in new:
+                self._take_out(fid)
+            elif new[old] != old:
+                g.insert(replace(r, **{word: new[old]}))  # type: ignore[type-var]
+        g.values[word] = g.values[word][sorted(rows)]
+        g.revision += 1
+        return new
+
+    def _take_out(self, *factor_ids: int) -> None:
+        for fid in list(factor_ids):
+            del self.graph.records[fid]
+            self.graph.ledger.refund(fid)
+            self.graph.revision += 1
+
     def _drop(self, readings: Iterable[Reading], why: str) -> None:
         count: Counter[str] = Counter()
         for r in readings:
@@ -266,9 +318,9 @@ class Readings:
         plane = g.dim == 2
         axis = g.structure.group.transform(T, np.eye(g.dim)[:1])[0] - T[0, : g.dim]
         lost = 0.0 if P is None else float(P[0, 2, 2])
-        while g.structure.count("compass") <= r.source:
+        if r.source not in self.zeros:
             psi = g.pose(node)[2] + np.arctan2(axis[1], axis[0]) if plane else _level_heading(g.pose(node), axis)
-            g.structure.append("compass", np.array([wrap_angle(r.value - psi)]))
+            self.zeros[r.source] = g.structure.append("compass", np.array([wrap_angle(r.value - psi)]))
             g.revision += 1
         if cfg.hard_iron is not None and r.source not in self.deviations:
             row = self.deviations[r.source] = g.structure.append("deviation", np.zeros(2))
@@ -276,17 +328,19 @@ class Readings:
             g.ledger.spend(prior.factor_id, prior.label(), ["-"], (r.time, r.time), "prior")
             g.insert(prior)
         sigma, iron = float(np.hypot(r.sigma, np.sqrt(lost))), self.deviations.get(r.source)
-        g.insert(CompassRecord(r.factor_id, node, r.time, axis, r.value, sigma, r.source, iron, cfg.robust))
+        zero = self.zeros[r.source]
+        g.insert(CompassRecord(r.factor_id, node, r.time, axis, r.value, sigma, zero, iron, cfg.robust))
         self._declare(r.source, cfg)
 
     def _declare(self, compass: int, cfg: CompassConfig) -> None:
         """Tie the zero of a compass to the GPS frame, once both are there."""
         g = self.graph
-        if cfg.declination is None or not g.structure.count("datum") or g.structure.count("compass") <= compass:
+        if cfg.declination is None or not g.structure.count("datum") or compass not in self.zeros:
             return
-        if any(isinstance(r, DeclinationRecord) and r.compass == compass for r in g.records.values()):
+        zero = self.zeros[compass]
+        if any(isinstance(r, DeclinationRecord) and r.compass == zero for r in g.records.values()):
             return
-        record = DeclinationRecord(g.next_factor(), compass, cfg.declination, cfg.declination_sigma)
+        record = DeclinationRecord(g.next_factor(), zero, cfg.declination, cfg.declination_sigma)
         g.ledger.spend(record.factor_id, record.label(), ["-"], (0.0, 0.0), "prior")
         g.insert(record)
 
@@ -323,6 +377,14 @@ class Readings:
             g.insert(replace(r, beacon=b.row))
         g.note("beacon", beacon=number, variable=f"beacon{b.row}", distances=len(b.heard), position=place.tolist())
         b.heard = []
+
+
+_HOLDERS: dict[str, tuple[type[Any], ...]] = {
+    "compass": (CompassRecord, DeclinationRecord),
+    "deviation": (CompassRecord, DeviationPriorRecord),
+    "beacon": (BeaconRangeRecord,),
+}
+"""Kinds of factors that hold variables of a kind, in a field of that name."""
 
 
 def _thinned(times: Array, every: float) -> list[int]:

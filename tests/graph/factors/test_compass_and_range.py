@@ -280,6 +280,40 @@ def test_readings_are_spent_once_thinned_and_dropped_by_name(rng):
         )
 
 
+@pytest.mark.parametrize("solver", [Isam2Solver, BatchSolver])
+def test_what_is_removed_takes_its_variables_with_it(rng, solver):
+    """A submap takes its readings along; a beacon or a compass that nothing holds any more is no variable."""
+    graph = everything(rng, 2)
+    made = solver(graph)
+    made.update()
+    made.solve_to_optimum()
+    beacon = {r.beacon for r in graph.records.values() if isinstance(r, BeaconRangeRecord)}
+    assert beacon == {0, 1, 2}
+    second = [f for f, r in graph.records.items() if isinstance(r, BeaconRangeRecord) and r.beacon == 1]
+    places = graph.values["beacon"].copy()
+    for fid in second:
+        if fid in graph.records:
+            graph.remove(fid, reason="an outlier")
+    assert graph.structure.count("beacon") == 2
+    np.testing.assert_array_equal(graph.values["beacon"], places[[0, 2]])
+    made.update()
+    made.solve_to_optimum()
+    assert made.solution().converged
+    last = graph.submaps[-1]
+    inside = [r for r in graph.records.values() if isinstance(r, CompassRecord) and r.node in last.nodes[:-1]]
+    assert inside
+    graph.remove(last.factor_id)
+    assert not [r for r in inside if r.factor_id in graph.records]
+    for fid in [f for f, r in graph.records.items() if isinstance(r, CompassRecord)]:
+        graph.remove(fid)
+    assert graph.structure.count("compass") == graph.structure.count("deviation") == 0
+    assert not [r for r in graph.records.values() if isinstance(r, (DeclinationRecord, DeviationPriorRecord))]
+    made.update()
+    made.solve_to_optimum()
+    assert made.solution().converged
+    assert graph.objective().dof == sum(r.rows for r in graph.records.values()) - graph.flat().layout.size
+
+
 def test_an_unknown_kind_of_factor_is_refused_at_once():
     class Odd:
         factor_id, group, rows = 0, "odd", 1
