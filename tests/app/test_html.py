@@ -183,7 +183,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
         {"c": ClassConsistency(**CLASS)}, None, None
     ),
     "graphslam.app.studies.study.Study": a_study,
-    "graphslam.app.sessions.merge.MergedMap": a_merge,
+    "graphslam.app.sessions.merged_map.MergedMap": a_merge,
     "graphslam.app.run.run.Run": a_run,
 }
 # texts of these stand in the code, not in a file: their HTML has no place for a foreign one

@@ -32,7 +32,7 @@ from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
 from graphslam.join.submap_solver import solve_submaps
-from tests.reference.simulated_local_maps import simulate_local_maps
+from graphslam.sim.local_maps import simulate_local_maps
 
 NEAREST = Association(rule="nearest")
 

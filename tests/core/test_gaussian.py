@@ -9,14 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from graphslam.core.errors import CovarianceError
+from graphslam.core.errors import CovarianceError, FormatError
 from graphslam.core.gaussian import (
     Gaussian,
     Information,
     check_covariance,
     chi2_mean_bounds,
     chi2_quantile,
+    ellipse_rings,
     equal_tail_gate,
+    first_no_covariance,
+    inverses,
+    largest_sigmas,
     moment_match,
 )
 
@@ -257,3 +261,39 @@ def test_chi2_bounds_hold_the_stated_share_of_means(rng: np.random.Generator) ->
 def test_chi2_quantile_is_scipys() -> None:
     assert chi2_quantile(0.95, 2) == pytest.approx(-2 * np.log(0.05))
     assert chi2_quantile(0.5, 7) == pytest.approx(stats.chi2.median(7))
+
+
+def random_covariances(rng: np.random.Generator, n: int, d: int) -> np.ndarray:
+    A = rng.standard_normal((n, d, d))
+    return A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(d)
+
+
+def test_inverses_name_the_first_matrix_that_has_none(rng):
+    P = random_covariances(rng, 5, 3)
+    np.testing.assert_allclose(inverses(P, "file") @ P, np.broadcast_to(np.eye(3), P.shape), atol=1e-9)
+    for k, bad in ((1, -np.eye(3)), (3, np.zeros((3, 3))), (4, np.full((3, 3), np.nan)), (2, 1e-320 * np.eye(3))):
+        spoilt = P.copy()
+        spoilt[k] = bad
+        with pytest.raises(FormatError, match=rf"file: 1 covariances are not positive definite, first: number {k}"):
+            inverses(spoilt, "file")
+
+
+def test_rings_lie_at_the_quantile_and_run_counter_clockwise(rng):
+    centres, P = rng.normal(0, 5, (4, 2)), random_covariances(rng, 4, 2)
+    rings = ellipse_rings(centres, P, 0.9, 24)
+    assert rings.shape == (4, 25, 2)
+    np.testing.assert_array_equal(rings[:, 0], rings[:, -1])
+    d = rings - centres[:, None]
+    np.testing.assert_allclose(np.einsum("kni,kij,knj->kn", d, np.linalg.inv(P), d), stats.chi2.ppf(0.9, 2), rtol=1e-9)
+    area = 0.5 * np.sum(d[:, :-1, 0] * d[:, 1:, 1] - d[:, :-1, 1] * d[:, 1:, 0], axis=1)
+    full = np.pi * stats.chi2.ppf(0.9, 2) * np.sqrt(np.linalg.det(P))  # 24 corners leave out a hundredth
+    np.testing.assert_allclose(area, full, rtol=0.02)
+    assert len(np.unique(np.round(rings[0, :-1], 9), axis=0)) == 24
+
+
+def test_largest_sigmas_are_those_of_the_longest_axes(rng):
+    P = random_covariances(rng, 6, 3)
+    np.testing.assert_allclose(largest_sigmas(P), np.sqrt(np.linalg.eigvalsh(P)[:, -1]), rtol=1e-9)
+    assert first_no_covariance(P) is None
+    P[2] = -P[2]
+    assert first_no_covariance(P) == 2
