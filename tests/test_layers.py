@@ -71,6 +71,7 @@ def test_module_imports_only_own_package_or_below(path: Path) -> None:
         assert not [i for i in imports(path) if i.startswith("graphslam")]
         return
     for name in imports(path):
+        assert not name.startswith("tests"), f"{module} imports {name}, which no wheel holds"
         target = package_of(name)
         if target in STOREY and target != own:
             assert STOREY[target] < STOREY[own], (

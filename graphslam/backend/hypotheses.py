@@ -27,7 +27,7 @@ from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.segslam.config import HandoverConfig
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segmap import SegMap
-from graphslam.frontends.segslam.segment import KINDS
+from graphslam.frontends.segslam.segment import KINDS, MATCH
 from graphslam.frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.loops.candidates import TIE
 from graphslam.loops.find_loops import FindConfig, find_loops
@@ -41,7 +41,6 @@ from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
-from tests.reference.loop_chain import MATCH
 
 
 def built(

@@ -307,6 +307,7 @@ store.truncate(len(done))
 print("ready", flush=True)
 for s in submaps[len(done):]:
     store.append(s)
+    print("stored", flush=True)
 """
 
 
@@ -320,18 +321,17 @@ def test_killed_writers_resume_to_the_same_bytes(tmp_path: Path, rng: np.random.
         return writer
 
     whole, killed = tmp_path / "whole" / "submaps", tmp_path / "killed" / "submaps"
-    started = time.perf_counter()
-    assert run(whole).wait() == 0
-    duration = time.perf_counter() - started
-    partial = 0
+    assert run(whole).communicate()[0].count("stored") == 40
     for _ in range(3):
         writer = run(killed)
-        time.sleep(rng.uniform(0.0, 0.1) * duration)
+        assert writer.stdout is not None
+        for _ in range(rng.integers(1, 13)):  # the kill falls somewhere in the writing of the next submap
+            assert writer.stdout.readline() == "stored\n"
+        time.sleep(rng.uniform(0.0, 0.005))
         writer.send_signal(signal.SIGKILL)
         writer.wait()
-        partial += 0 < len(SubmapStore(killed).complete_prefix()) < 40
-    assert partial >= 1  # at least one kill fell in the middle
-    assert run(killed).wait() == 0
+        assert 0 < len(SubmapStore(killed).complete_prefix()) <= 40
+    run(killed).communicate()
     assert {p.name for p in killed.iterdir()} == {p.name for p in whole.iterdir()}
     for file in whole.iterdir():
         assert file.read_bytes() == (killed / file.name).read_bytes()
