@@ -8,24 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from graphslam.core.dense import CloudMap, DensePayload
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.markup import element, join, pairs
 from graphslam.core.reading import usable
 from graphslam.core.trajectory import Trajectory
-
-
-class DensePayload(Protocol):
-    """An evidence grid, seen from here: core knows no grid."""
-
-    def save(self, path: Any) -> None: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,8 +175,10 @@ class Submap:
     landmarks : LandmarkMap or None
     trajectory : Trajectory or None
         ``T_start_body(t)``.
-    grid, cloud : payload or None
+    grid : EvidenceGrid or None
         In the base frame.
+    cloud : CloudMap or None
+        In the base frame; an array ``(m, dim)`` is taken as points of which nothing else is known.
     matches : tuple of Match
     uses : frozenset of str
         Streams whose information is already inside.
@@ -201,7 +198,7 @@ class Submap:
     landmarks: LandmarkMap | None = None
     trajectory: Trajectory | None = None
     grid: DensePayload | None = None
-    cloud: Array | None = None
+    cloud: CloudMap | None = None
     matches: tuple[Match, ...] = ()
     uses: frozenset[str] = frozenset()
     report: Mapping[str, Any] = field(default_factory=dict)
@@ -214,6 +211,13 @@ class Submap:
             "exit_covariance",
             check_covariance(self.exit_covariance, what=f"exit covariance of submap {self.key}", dim=d),
         )
+        if self.cloud is not None:
+            cloud = self.cloud if isinstance(self.cloud, CloudMap) else CloudMap(points=self.cloud)
+            if cloud.dim != self.dim:
+                raise GeometryError(
+                    f"the cloud of submap {self.key} is {cloud.dim}-D", got=cloud.points.shape, wanted=f"{self.dim}-D"
+                )
+            object.__setattr__(self, "cloud", cloud)
         t0, t1 = self.interval
         if not t1 > t0:
             raise GeometryError(f"interval of submap {self.key} is empty", got=self.interval, wanted="t_end > t_start")

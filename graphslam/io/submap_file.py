@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from graphslam.core.dense import CloudMap
 from graphslam.core.errors import DataError, FormatError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
@@ -56,7 +57,10 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         if submap.trajectory.covariances is not None:
             arrays["trajectory_covariances"] = submap.trajectory.covariances
     if submap.cloud is not None:
-        arrays["cloud"] = submap.cloud
+        c = submap.cloud
+        arrays["cloud"], arrays["cloud_cell"] = c.points, np.float64(c.cell)
+        if c.origins is not None:
+            arrays["cloud_origins"], arrays["cloud_scan"] = c.origins, c.scan
     if submap.matches:
         arrays["match_targets"] = np.array([q.target for q in submap.matches], dtype=np.int64)
         arrays["match_poses"] = np.array([q.T_target_here for q in submap.matches])
@@ -94,7 +98,7 @@ def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
             "report": check_json(parse_json(str(a.get("report", "{}")), f"{where}, report"), {str: object}, where),
             "trajectory": _trajectory(a, where),
             "matches": _matches(a, where),
-            "cloud": a.get("cloud"),
+            "cloud": _cloud(a),
         }
         key, span = int(a["key"]), (float(interval[0]), float(interval[1]))
         if bool(a.get("has_landmarks", True)):
@@ -132,6 +136,9 @@ _FIELDS = {
     "trajectory_poses": floats("n", "p", optional=True),
     "trajectory_covariances": floats("n", "d", "d", optional=True),
     "cloud": floats("k", "e", optional=True),
+    "cloud_cell": floats(optional=True),
+    "cloud_origins": floats("w", "e", optional=True),
+    "cloud_scan": ints("k", optional=True),
     "match_targets": ints("r", optional=True),
     "match_poses": floats("r", "p", optional=True),
     "match_covariances": floats("r", "d", "d", optional=True),
@@ -178,6 +185,13 @@ def _trajectory(a: Arrays, where: str) -> Trajectory | None:
     if len(a.get("trajectory_times", ())) == 0:
         return None
     return Trajectory(a["trajectory_times"], _need(a, "trajectory_poses", where), a.get("trajectory_covariances"))
+
+
+def _cloud(a: Arrays) -> CloudMap | None:
+    if "cloud" not in a:
+        return None
+    cell = {"cell": float(a["cloud_cell"])} if "cloud_cell" in a else {}
+    return CloudMap(points=a["cloud"], origins=a.get("cloud_origins"), scan=a.get("cloud_scan"), **cell)
 
 
 def _matches(a: Arrays, where: str) -> tuple[Match, ...]:

@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.core.atomic import part_path, read_json, read_npz, sweep_parts, write_json, write_npz
+from graphslam.core.dense import DensePayload
 from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.npz import check_arrays, floats, ints
 from graphslam.core.reading import inside, safe_name
-from graphslam.core.submap import DensePayload, Submap
+from graphslam.core.submap import Submap
 from graphslam.io.submap_file import SUBMAP_FORMAT, submap_arrays, submap_from_arrays
 
 logger = logging.getLogger(__name__)

@@ -73,7 +73,7 @@ def find_loops(
     solver : GraphSolver
         Of that graph.
     submaps : sequence of Submap
-        Those of the graph in their order, with grids.
+        Those of the graph in their order, with dense maps.
     config : FindConfig, optional
     progress : bool
         Show a bar.
@@ -86,7 +86,7 @@ def find_loops(
     Raises
     ------
     DataError
-        The submaps are not those of the graph, one has no grid, or the graph is no chain.
+        The submaps are not those of the graph, one has no map, or the graph is no chain.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def find_loops(
     if c.appearance is not None and len(submaps) > 1:
         p = ours.places
         parts = [
-            describe(measurer.prepared(k).grid, p.T_base_node[p.of_submap(k)], c.descriptors)
+            describe(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
             for k in range(len(submaps))
         ]
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from tqdm import tqdm
 
-from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
+from graphslam.evidence.views import view_of
 from graphslam.loops.candidates import FRONT_END, TIE, Candidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import MapGrid, PreparedMap, match_pair
+from graphslam.registration.submap_pairs import PreparedMap, match_pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ class LoopMeasurer:
     Parameters
     ----------
     submaps : sequence of Submap
-        With grids.
+        With dense maps.
     places : Places
     config : PairConfig, optional
     """
@@ -78,10 +78,7 @@ class LoopMeasurer:
             It has none.
         """
         if k not in self._maps:
-            grid = self.submaps[k].grid
-            if grid is None:
-                raise DataError(f"submap {self.submaps[k].key} has no grid to be matched", wanted="an evidence grid")
-            self._maps[k] = PreparedMap(cast(MapGrid, grid), self.config)
+            self._maps[k] = PreparedMap(view_of(self.submaps[k]), self.config)
         return self._maps[k]
 
     def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import combinations
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +25,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
+from graphslam.evidence.views import has_view, view_of
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import Candidate, thinned
@@ -33,7 +33,6 @@ from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import Ints, Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.place_descriptor import DescriptorConfig, Descriptors, describe, join
-from graphslam.registration.submap_pairs import MapGrid
 
 Mask = npt.NDArray[np.bool_]
 _APART = 1000.0  # sessions lie so far apart along the common way [m]: no two of their places are one stretch
@@ -75,14 +74,14 @@ class SessionMap:
     Parameters
     ----------
     submaps : sequence of Submap
-        Dense, with paths and grids.
+        Dense, with paths and maps.
     spacing : float
         Of the nodes [m]; node k is the k-th that a graph would have which begins with these submaps at this spacing.
 
     Raises
     ------
     DataError
-        No submaps, or one without a path or a grid.
+        No submaps, or one without a path or a map.
     """
 
     def __init__(self, submaps: Sequence[Submap], spacing: float = 3.0) -> None:
@@ -92,8 +91,8 @@ class SessionMap:
         nodes, which, poses, way, times, steps, covariances = [], [], [], [], [], [], []
         node, begin = 0, 0.0
         for k, s in enumerate(self.submaps):
-            if s.landmarks is not None or s.grid is None or s.trajectory is None or not len(s.trajectory):
-                raise DataError(f"submap {s.key} cannot be placed", wanted="a dense submap with a path and a grid")
+            if s.landmarks is not None or not has_view(s) or s.trajectory is None or not len(s.trajectory):
+                raise DataError(f"submap {s.key} cannot be placed", wanted="a dense submap with a path and a map")
             cut = cut_submap(s, spacing)
             n = len(cut.increments)
             path = s.trajectory
@@ -123,7 +122,7 @@ class SessionMap:
         config, out = DescriptorConfig(), []
         for k, s in enumerate(self.submaps):
             T = self.places.T_base_node[self.places.of_submap(k)]
-            out.append(describe(cast(MapGrid, s.grid), T, config))
+            out.append(describe(view_of(s), T, config))
         return join(out)
 
 

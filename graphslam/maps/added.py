@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.errors import DataError, GridError
+from graphslam.core.errors import GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
+from graphslam.evidence.views import view_of
 from graphslam.maps.added_kernels import subtract_bricks
 
 COPIED = 0.9
@@ -101,7 +102,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     Parameters
     ----------
     submaps : sequence of Submap
-        A chain, with evidence grids.
+        A chain, with dense maps.
 
     Returns
     -------
@@ -112,7 +113,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     Raises
     ------
     DataError
-        A submap without an evidence grid.
+        A submap without a map.
     """
     whole = {s.key: grid_of(s) for s in submaps}
     grids, entered = dict(whole), {}
@@ -137,14 +138,12 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
 
 
 def grid_of(submap: Submap) -> EvidenceGrid:
-    """The evidence grid of a submap.
+    """The evidence of a submap's dense map.
 
     Raises
     ------
     DataError
         It has none.
     """
-    grid = submap.grid
-    if not isinstance(grid, EvidenceGrid):
-        raise DataError(f"submap {submap.key} has no evidence grid", got=type(grid).__name__, wanted="EvidenceGrid")
+    grid: EvidenceGrid = view_of(submap).evidence()
     return grid

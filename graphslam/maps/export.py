@@ -36,10 +36,20 @@ def save_ply(grid: EvidenceGrid, path: str | os.PathLike[str]) -> Path:
     if target.suffix != ".ply":
         raise FormatError("unknown ending of a cloud", where=str(path), got=target.suffix, wanted=".ply")
     points, log_odds = grid.occupied_cloud(with_log_odds=True)
-    rows = np.zeros((len(points), 4), "<f4")
-    rows[:, : grid.dim] = points
-    rows[:, 3] = log_odds
-    head = "".join(f"property float {name}\n" for name in ("x", "y", "z", "log_odds"))
+    return _write_ply(target, points, log_odds=log_odds)
+
+
+def save_points(points: Array, path: str | os.PathLike[str]) -> Path:
+    """Write points ``(n, 2 | 3)`` as binary PLY, float32 ``x``, ``y``, ``z``; those of a plane at height 0."""
+    return _write_ply(Path(path), points)
+
+
+def _write_ply(target: Path, points: Array, **columns: Array) -> Path:
+    rows = np.zeros((len(points), 3 + len(columns)), "<f4")
+    rows[:, : points.shape[1]] = points
+    for k, values in enumerate(columns.values()):
+        rows[:, 3 + k] = values
+    head = "".join(f"property float {name}\n" for name in ("x", "y", "z", *columns))
     with atomic_open(target) as stream:
         stream.write(f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{head}end_header\n".encode())
         stream.write(rows.tobytes())

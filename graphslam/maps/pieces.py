@@ -35,6 +35,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
+from graphslam.evidence.views import view_of
 from graphslam.maps.piece_kernels import count_owned, deal_out, known_extents, own_voxels
 
 Ints = npt.NDArray[np.int64]
@@ -328,7 +329,7 @@ def pieces_of_submap(
     Parameters
     ----------
     submap : Submap
-        With an evidence grid.
+        With a dense map.
     node_times : (m,), optional
         Without, the submap is one piece led by its base.
     T_base_nodes : (m, 7) or (m, 3), optional
@@ -339,11 +340,9 @@ def pieces_of_submap(
     Raises
     ------
     DataError
-        No evidence grid, no path where it is needed, or names that differ in number from the nodes.
+        No map, no path where it is needed, or names that differ in number from the nodes.
     """
-    grid = submap.grid
-    if not isinstance(grid, EvidenceGrid):
-        raise DataError(f"submap {submap.key} has no evidence grid", got=type(grid).__name__, wanted="EvidenceGrid")
+    grid = view_of(submap).evidence()
     if node_times is None:
         pieces = [whole(grid)]
     elif submap.trajectory is None:

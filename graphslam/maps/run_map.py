@@ -15,6 +15,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.views import has_view, view_of
+from graphslam.maps.clouds import fused_points
 from graphslam.maps.export import storeys
 from graphslam.maps.fuse import FusedMap, fuse
 from graphslam.maps.global_map import GlobalMap
@@ -24,7 +26,7 @@ from graphslam.maps.submaps import DividedSubmaps, divide_submaps
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class MapConfig:
-    """The fused map at the end of a run whose submaps have evidence grids."""
+    """The fused map at the end of a run of dense submaps."""
 
     fuse: bool = True
     """Make it."""
@@ -68,6 +70,10 @@ class RunMap:
     divide_s, fuse_s, move_s : float
         Seconds to cut the submaps into pieces, to fuse these along the open chain, and to move them to the solved
         poses.
+    points : (n, dim) or None
+        Of the submaps' clouds at the solved poses [m]; None where they have none.
+    knows_space : bool
+        False where some submap cannot tell free space: entropies and volumes are then of surfaces alone.
     """
 
     fused: FusedMap
@@ -78,10 +84,13 @@ class RunMap:
     divide_s: float
     fuse_s: float
     move_s: float
+    points: Array | None = None
+    knows_space: bool = True
 
     def facts(self) -> dict[str, Any]:
         """What ``fused_map.json`` holds."""
         f = self.fused
+        clouds = {} if self.points is None else {"points": len(self.points), "free_space_known": self.knows_space}
         return {
             "format": "graphslam.fused-map/1",
             "dim": f.dim,
@@ -94,6 +103,7 @@ class RunMap:
             "level_nodes": self.divided.level_nodes,
             "bands": {name: list(band) for name, band in self.bands.items()},
             "bytes": f.nbytes,
+            **clouds,
         }
 
     def metrics(self) -> list[tuple[str, float, str, str]]:
@@ -112,9 +122,9 @@ class RunMap:
         ]
 
 
-def has_grids(submaps: Sequence[Submap]) -> bool:
-    """Has every submap an evidence grid?"""
-    return bool(submaps) and all(isinstance(s.grid, EvidenceGrid) for s in submaps)
+def has_maps(submaps: Sequence[Submap]) -> bool:
+    """Has every submap a dense map, an evidence grid or a cloud?"""
+    return bool(submaps) and all(has_view(s) for s in submaps)
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
@@ -144,12 +154,12 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
 def make_run_map(
     submaps: Sequence[Submap], m: GlobalMap, *, reach: float | None = None, config: MapConfig | None = None
 ) -> RunMap:
-    """Fuse the grids of a run's submaps: along the open chain first, then moved to where the graph has them.
+    """Fuse the maps of a run's submaps: along the open chain first, then moved to where the graph has them.
 
     Parameters
     ----------
     submaps : sequence of Submap
-        With evidence grids and paths.
+        With dense maps and paths.
     m : GlobalMap
         Solved.
     reach : float, optional
@@ -160,37 +170,41 @@ def make_run_map(
     Raises
     ------
     MissingDataError
-        Submaps without grids.
+        Submaps without maps.
     DataError, GridError, GeometryError
     """
     config = MapConfig() if config is None else config
-    if not has_grids(submaps):
-        bare = [s.key for s in submaps if not isinstance(s.grid, EvidenceGrid)]
+    if not has_maps(submaps):
+        bare = [s.key for s in submaps if not has_view(s)]
         raise MissingDataError(
-            "submaps have no evidence grids to make a map of",
+            "submaps have no evidence grids or clouds to make a map of",
             got=f"{len(bare)} of {len(submaps)} without",
-            wanted="a run of a front end with grids: segslam, rbpf-grid",
+            wanted="a run of a front end with dense maps: segslam, rbpf-grid",
         )
     nodes = nodes_by_submap(submaps, m)
     division = DivisionConfig() if reach is None else DivisionConfig(reach=reach + REACH_MARGIN)
+    level_nodes = m.dim == 3 and _levelled(m.base_poses)
     begin = time.perf_counter()
     divided = divide_submaps(
         [_one_piece(s, nodes) for s in submaps],
         every=None,
         config=division,
-        level_nodes=m.dim == 3 and _levelled(m.base_poses),
+        level_nodes=level_nodes,
         nodes={key: times for key, (times, _) in nodes.items()},
     )
     divide_s, begin = time.perf_counter() - begin, time.perf_counter()
-    model = submaps[0].grid.model  # type: ignore[union-attr]
+    grid = submaps[0].grid
+    model = grid.model if isinstance(grid, EvidenceGrid) else None
     fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
     fuse_s = time.perf_counter() - begin
     open_entropy, open_volume = fused.entropy(), fused.known_volume()
     begin = time.perf_counter()
     fused.move(solved_poses(divided, nodes))
+    points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
+    knows_space = all(view_of(s).knows_space for s in submaps)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
-    return RunMap(fused, divided, bands, open_entropy, open_volume, divide_s, fuse_s, move_s)
+    return RunMap(fused, divided, bands, open_entropy, open_volume, divide_s, fuse_s, move_s, points, knows_space)
 
 
 def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, float]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE2, SE3, level
+from graphslam.core.poses import SE2, SE3, group_of, level
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
@@ -77,7 +77,7 @@ def divide_submaps(
     level_nodes: bool = True,
     nodes: Mapping[int, Array] | None = None,
 ) -> DividedSubmaps:
-    """Pieces of a chain of submaps with evidence grids, and where the chain has them.
+    """Pieces of a chain of submaps with dense maps, and where the chain has them.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def divide_submaps(
     Raises
     ------
     DataError
-        No submaps, or one without an evidence grid or, where it is divided, without a path.
+        No submaps, or one without a map or, where it is divided, without a path.
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
@@ -118,17 +118,13 @@ def divide_submaps(
             times, local = np.array([s.interval[0]]), group.identity[None]
             pieces = pieces_of_submap(s)
         else:
-            if s.trajectory is None:
-                raise DataError(f"submap {s.key} has no path to divide it along", wanted="a trajectory")
+            path = _path(s)
             if given is None:
                 assert every is not None
-                given = node_times_every(s.trajectory, every)
-            # a path may begin a rounding error after its submap
-            times = np.clip(given, s.trajectory.times[0], s.trajectory.times[-1])
-            local = s.trajectory.interpolate(times)
-            local = level(local) if level_nodes else local
-            if nodes is not None:
-                local[0] = group.identity
+                given = node_times_every(path, every)
+            times, local = _clipped(path, given), local_nodes(s, given, level_nodes)
+            if nodes is None:  # the first is the body, not the base
+                local[0] = _poses(path, times[:1], level_nodes)[0]
             pieces = pieces_of_submap(s, times, T_base_nodes=local, config=config)
         for name, piece in pieces.items():
             k = name[1]  # type: ignore[index]
@@ -136,3 +132,33 @@ def divide_submaps(
             out.poses[name] = group.compose(base, local[k])
         base = group.compose(base, s.exit_pose)
     return out
+
+
+def local_nodes(s: Submap, times: Array, level_nodes: bool) -> Array:
+    """``T_base_node (m, 3|7)`` of a graph's nodes in a submap, of which the first is its base.
+
+    Raises
+    ------
+    DataError
+        A submap without a path.
+    """
+    path = _path(s)
+    out = _poses(path, _clipped(path, times), level_nodes)
+    out[0] = group_of(out).identity
+    return out
+
+
+def _path(s: Submap) -> Trajectory:
+    if s.trajectory is None:
+        raise DataError(f"submap {s.key} has no path to divide it along", wanted="a trajectory")
+    return s.trajectory
+
+
+def _clipped(path: Trajectory, times: Array) -> Array:
+    """A path may begin a rounding error after its submap."""
+    return np.clip(times, path.times[0], path.times[-1])
+
+
+def _poses(path: Trajectory, times: Array, level_nodes: bool) -> Array:
+    poses = path.interpolate(times)
+    return level(poses) if level_nodes else poses

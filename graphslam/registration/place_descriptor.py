@@ -20,10 +20,10 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from graphslam.core.dense import MapView
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of, level
-from graphslam.registration.submap_pairs import MapGrid
 
 Ints = npt.NDArray[np.int64]
 
@@ -87,22 +87,22 @@ class Descriptors:
         return np.asarray(self.values.sum(axis=2) / np.maximum(some, 1e-9) * np.sqrt(some / self.known.shape[2]))
 
 
-def describe(grid: MapGrid, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
+def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
     """Descriptors of places of one map.
 
     Parameters
     ----------
-    grid : MapGrid
+    view : MapView
     T_base_place : (n, 7) or (n, 3)
-        In the grid's frame. Roll and pitch are left out: only the heading turns the sectors.
+        In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
     config : DescriptorConfig, optional
     """
     c = DescriptorConfig() if config is None else config
     T = level(np.asarray(T_base_place, dtype=np.float64))
     g = group_of(T)
-    if T.ndim != 2 or g.dim != grid.dim:
-        raise GeometryError("places do not fit the map", got=T.shape, wanted=f"(n, {7 if grid.dim == 3 else 3})")
-    occupied = np.asarray(grid.occupied_cloud(), dtype=np.float64)
+    if T.ndim != 2 or g.dim != view.dim:
+        raise GeometryError("places do not fit the map", got=T.shape, wanted=f"(n, {7 if view.dim == 3 else 3})")
+    occupied = view.points()
     tree = cKDTree(occupied[:, :2]) if len(occupied) else None
     shape = (len(T), c.rings, c.sectors)
     layers = max(round((c.high - c.low) / c.layer), 1) if g.dim == 3 else 1
@@ -116,7 +116,7 @@ def describe(grid: MapGrid, T_base_place: ArrayLike, config: DescriptorConfig | 
         asked[..., 2] = 0.5 * (c.low + c.high)
     flat = asked.reshape(-1, g.dim)
     for k, pose in enumerate(T):
-        inside = grid.known_at(g.transform(np.broadcast_to(pose, (len(flat), g.size)), flat))
+        inside = view.known_at(g.transform(np.broadcast_to(pose, (len(flat), g.size)), flat))
         known[k] = np.asarray(inside, dtype=np.float64).reshape(shape[1:])
         near = [] if tree is None else tree.query_ball_point(pose[:2], c.radius)
         if len(near):

@@ -20,10 +20,10 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.points import check_pose, transform
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.degeneracy import calibrated_covariance, feigned_information, translational_degeneracy
 from graphslam.registration.planar import Aligned, align_planar
-from graphslam.registration.points import check_pose, transform
 from graphslam.registration.target import Target
 
 _LEAST_NOISE = 1e-4  # clouds that are copies of each other show none

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
-from graphslam.registration.points import check_pose, finite_points, spread, thin, transform
+from graphslam.core.points import check_pose, finite_points, spread, thin, transform
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima, score_block
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
-from graphslam.registration.points import finite_points
+from graphslam.core.points import finite_points
 from graphslam.registration.search_kernels import splat
 
 MOST_CELLS = 200_000_000

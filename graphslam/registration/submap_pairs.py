@@ -12,53 +12,42 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
+from graphslam.core.dense import MapView
 from graphslam.core.errors import GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.points import check_pose, spread
 from graphslam.core.poses import Group, group_of
 from graphslam.registration.gates import match_fails, second_modes
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.points import check_pose, spread
 from graphslam.registration.register import Registration, distinct, register_starts
 from graphslam.registration.search import SearchConfig, correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
 
-class MapGrid(Protocol):
-    """What is asked of a submap's grid; an evidence grid has it."""
-
-    @property
-    def dim(self) -> int: ...
-    def occupied_cloud(self) -> Any: ...
-    def binned_cloud(self, level: int) -> Any: ...
-    def known_at(self, points: Any) -> npt.NDArray[np.bool_]: ...
-    def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]: ...
-
-
 class PreparedMap:
-    """A submap's grid made ready to be matched; everything is made when it is first asked for.
+    """A submap's dense map made ready to be matched; everything is made when it is first asked for.
 
     Parameters
     ----------
-    grid : MapGrid
+    view : MapView
         In the frame of the submap's base.
     config : PairConfig
     """
 
-    def __init__(self, grid: MapGrid, config: PairConfig) -> None:
-        self.grid, self.config = grid, config
+    def __init__(self, view: MapView, config: PairConfig) -> None:
+        self.view, self.config = view, config
 
     @cached_property
     def points(self) -> Array:
-        """Occupied voxels gathered in cells ``(m, dim)`` [m]."""
-        return np.asarray(self.grid.binned_cloud(self.config.cloud_level).points)
+        """Points on surfaces, gathered in cells ``(m, dim)`` [m]."""
+        return self.view.points(self.config.cloud_level)
 
     @cached_property
     def target(self) -> Target:
@@ -69,7 +58,7 @@ class PreparedMap:
     def fields(self) -> tuple[SearchField, SearchField]:
         """Fine and coarse."""
         c = self.config
-        occupied, cell = self.grid.occupied_cloud(), c.grid / 4.0
+        occupied, cell = self.view.points(), c.grid / 4.0
         return (
             SearchField(occupied, cell=cell, sigma=c.field_sigma),
             SearchField(occupied, cell=2.0 * cell, sigma=2.0 * c.field_sigma),
@@ -186,8 +175,8 @@ def match_pair(
     """
     c = target.config if config is None else config
     g = group_of(T_target_place)
-    if g.dim != target.grid.dim or g.dim != source.grid.dim:
-        raise GeometryError("pair of submaps: dimensions differ", got=(source.grid.dim, target.grid.dim), wanted=g.dim)
+    if g.dim != target.view.dim or g.dim != source.view.dim:
+        raise GeometryError("pair of submaps: dimensions differ", got=(source.view.dim, target.view.dim), wanted=g.dim)
     T = check_pose(T_target_place, g.dim, what="prediction of a pair of submaps")
     P = check_covariance(covariance, what="covariance of a pair of submaps", dim=g.dof)
     points = source.around(T_base_place)
@@ -206,7 +195,8 @@ def match_pair(
     # a body may be tilted: what tilts against the prediction is refused later
     rules = replace(c.registration, gates=replace(c.registration.gates, tilt=math.pi))
     cloud = Target(points)
-    results = register_starts(cloud, target.target, starts, rules, known=target.grid.known_at)
+    known = target.view.known_at if target.view.knows_space else None  # without, all of the place must fit
+    results = register_starts(cloud, target.target, starts, rules, known=known)
     results = [_upright_in_known(r, cloud, target, c) for r in results]
     place = np.asarray(T_base_place, dtype=np.float64)
     return _judge(results, points, source, place, target, T, P, c, tuple(half))
@@ -304,7 +294,7 @@ def contradiction(
     g = group_of(T_target_place)
 
     def share(held: PreparedMap, p: Array) -> float:
-        values = np.asarray(held.grid.log_odds_at(p), dtype=np.float64)
+        values = np.asarray(held.view.log_odds_at(p), dtype=np.float64)
         known = ~np.isnan(values)
         if not np.any(known):
             return 0.0
@@ -320,14 +310,14 @@ def contradiction(
 
 def _upright_in_known(r: Registration, cloud: Target, target: PreparedMap, c: PairConfig) -> Registration:
     """With the fitness of upright surfaces over those in known space: the place may reach out of the map."""
-    if cloud.dim == 2:
+    if cloud.dim == 2 or not target.view.knows_space:
         return r
     T, rules = r.T_target_source, c.registration
     normals, _ = cloud.normals(np.arange(len(cloud)))
     up = axes_of(T, group_of(T))[2]  # the target's vertical in the frame of the place
     steep = (np.abs(normals @ up) < math.sqrt(0.5)) & np.any(normals != 0.0, axis=1)
     moved = group_of(T).transform(np.broadcast_to(T, (len(cloud), 7)), cloud.points)
-    steep &= target.grid.known_at(moved)
+    steep &= target.view.known_at(moved)
     if np.sum(steep) < rules.least_points:
         return replace(r, fitness_upright=math.nan)
     near = target.target.tree.query(moved[steep], distance_upper_bound=rules.near)[0] < rules.near

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
-from graphslam.registration.points import finite_points, thin
+from graphslam.core.points import finite_points, thin
 
 FLATNESS = 1e-3
 """Variance across a surface over that along it, of the covariance that stands for a point (Segal 2009)."""

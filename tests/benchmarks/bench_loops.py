@@ -27,6 +27,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
+from graphslam.evidence.views import view_of
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
@@ -136,8 +137,7 @@ def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: in
 def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> None:
     """Recall of descriptors at 1, 5, 10, 20, and precision of candidates."""
     begin = time.perf_counter()
-    grids = [s.grid for s in submaps]
-    D = join([describe(g, places.T_base_node[places.of_submap(k)]) for k, g in enumerate(grids)])  # type: ignore[arg-type]
+    D = join([describe(view_of(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)])
     apart = np.linalg.norm(truth[:, None, :3] - truth[None, :, :3], axis=2)
     hits, visits = np.zeros(4), 0
     for j in range(len(places)):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from graphslam.core.dense import CloudMap
 from graphslam.core.errors import CovarianceError, DataError, FormatError, GeometryError, MissingDataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Match, Submap
@@ -32,7 +33,9 @@ def rich(rng: np.random.Generator, s: Submap) -> Submap:
         interval=(s.key + 0.1, s.key + 0.9 + 1e-9),
         landmarks=replace(s.landmarks, sightings=np.array([[3, 0], [4, 1], [9, 0]])),
         trajectory=Trajectory(np.arange(n) + s.key, rng.normal(size=(n, 3)), np.tile(np.diag([1.0, 2, 3]), (n, 1, 1))),
-        cloud=rng.normal(size=(7, 2)),
+        cloud=CloudMap(
+            points=rng.normal(size=(7, 2)), origins=np.eye(2), scan=np.array([0, 1, 1, 0, 1, 0, 0]), cell=0.3
+        ),
         matches=(
             Match(target=0, T_target_here=np.array([1.0, 2, 3]), covariance=np.eye(3), fitness=0.5, support=0.25),
             Match(target=1, T_target_here=np.zeros(3), covariance=2 * np.eye(3), fitness=0.1, support=0.5),
@@ -67,7 +70,8 @@ def assert_same(a: Submap, b: Submap) -> None:
         np.testing.assert_array_equal(p.covariance, q.covariance)
         assert (p.fitness, p.support) == (q.fitness, q.support)
     if a.cloud is not None:
-        np.testing.assert_array_equal(a.cloud, b.cloud)
+        for name in ("points", "origins", "scan", "cell"):
+            np.testing.assert_array_equal(getattr(a.cloud, name), getattr(b.cloud, name))
 
 
 @pytest.fixture

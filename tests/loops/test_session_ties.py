@@ -125,9 +125,9 @@ def test_agreement_decides_and_two_places_are_not_guessed_between(two: TwoSessio
 
 def test_what_cannot_be_placed_is_refused(two: TwoSessions, drives: tuple) -> None:
     s = drives[0].submaps[0]
-    with pytest.raises(DataError, match="path and a grid"):
+    with pytest.raises(DataError, match="path and a map"):
         SessionMap([replace(s, grid=None)])
-    with pytest.raises(DataError, match="path and a grid"):
+    with pytest.raises(DataError, match="path and a map"):
         SessionMap([replace(s, trajectory=None)])
     with pytest.raises(DataError, match="at least one"):
         SessionMap([])

@@ -80,7 +80,7 @@ def test_submaps_that_cannot_be_divided_are_refused(run: tuple[Steps, list[Subma
         divide_submaps([])
     with pytest.raises(DataError, match="no path"):
         divide_submaps([replace(submaps[0], trajectory=None)])
-    with pytest.raises(DataError, match="no evidence grid"):
+    with pytest.raises(DataError, match="has no map"):
         divide_submaps([replace(submaps[0], grid=None)])
 
 

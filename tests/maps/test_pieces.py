@@ -189,7 +189,7 @@ def test_impossible_divisions_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(ConfigError):
         node_times_every(path, 0.0)
     bare = Submap(key=0, interval=(0.0, 1.0), exit_pose=np.zeros(3), exit_covariance=np.eye(3))
-    with pytest.raises(DataError, match="no evidence grid"):
+    with pytest.raises(DataError, match="has no map"):
         pieces_of_submap(bare)
     pathless = Submap(key=0, interval=(0.0, 1.0), exit_pose=np.zeros(3), exit_covariance=np.eye(3), grid=grid)
     assert set(pieces_of_submap(pathless)) == {(0, 0)}

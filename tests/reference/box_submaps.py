@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core import se3
+from graphslam.core.dense import CloudMap
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
 from tests.reference.box_world import BoxWorld, around, heading
@@ -23,6 +24,19 @@ def mapped(world: BoxWorld, path: Array, rng: np.random.Generator, *, believed: 
     for true, at in zip(path, se3.se3_between(np.broadcast_to(where[0], where.shape), where)):
         grid.insert_scan(world.scan(true, around(rng, 1200, -0.7, 0.7), 0.025, 20.0, rng), pose=at)
     return grid
+
+
+def clouded(
+    world: BoxWorld, path: Array, rng: np.random.Generator, *, believed: Array | None = None, origins: bool = True
+) -> CloudMap:
+    """The same scans as a cloud, with or without the places from which they were taken."""
+    where = path if believed is None else believed
+    at = se3.se3_between(np.broadcast_to(where[0], where.shape), where)
+    scans = [world.scan(T, around(rng, 1200, -0.7, 0.7), 0.025, 20.0, rng) for T in path]
+    points = np.concatenate([se3.se3_transform(T, p) for T, p in zip(at, scans)])
+    if not origins:
+        return CloudMap(points=points)
+    return CloudMap(points=points, origins=at[:, :3], scan=np.repeat(np.arange(len(at)), [len(p) for p in scans]))
 
 
 def drifted(path: Array, rng: np.random.Generator, along: float = 0.01, turn: float = 1e-3) -> Array:

@@ -10,7 +10,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from tests.reference.box_submaps import mapped
+from tests.reference.box_submaps import clouded, mapped
 from tests.reference.box_world import BoxWorld
 
 STEP_SIGMA = np.array([3e-4, 3e-4, 2e-3, 0.01, 0.01, 0.003])
@@ -33,9 +33,15 @@ class HallDrive:
 
 
 def hall_drive(
-    world: BoxWorld, way: Array, rng: np.random.Generator, *, per_submap: int = 27, start: float = 0.0
+    world: BoxWorld,
+    way: Array,
+    rng: np.random.Generator,
+    *,
+    per_submap: int = 27,
+    start: float = 0.0,
+    clouds: bool = False,
 ) -> HallDrive:
-    """A drive along true poses ``way (n, 7)``, one a second, in submaps of so many steps."""
+    """A drive along true poses ``way (n, 7)``, one a second, in submaps of so many steps, with grids or clouds."""
     times = start + np.arange(len(way), dtype=float)
     submaps = []
     for k, a in enumerate(range(0, len(way) - 1, per_submap)):
@@ -46,11 +52,12 @@ def hall_drive(
             A = se3.se3_adjoint(se3.se3_inverse(measured))
             local.append(se3.se3_compose(local[-1], measured))
             P.append(A @ P[-1] @ A.T + np.diag(STEP_SIGMA**2))
-        seen = mapped(world, way[a : b + 1], rng, believed=np.stack(local))
+        make, kind = (clouded, "cloud") if clouds else (mapped, "grid")
+        seen = {kind: make(world, way[a : b + 1], rng, believed=np.stack(local))}
         submaps.append(
             Submap(
                 key=k, interval=(times[a], times[b]), exit_pose=local[-1], exit_covariance=P[-1],
-                trajectory=Trajectory(times[a : b + 1], np.stack(local), np.stack(P)), grid=seen,
+                trajectory=Trajectory(times[a : b + 1], np.stack(local), np.stack(P)), **seen,
                 uses=frozenset({"scanner", "wheels"}), report={"ended": "test", "scans": b - a},
             )
         )  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.poses import heading_of
+from graphslam.evidence.views import GridView
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import DescriptorConfig, Descriptors, describe, join, similarity
@@ -69,7 +70,7 @@ def drive() -> tuple[Places, Descriptors]:
     there, back = straight_path(6.0, 54.0, 8.0), straight_path(52.0, 8.0, 8.6, yaw=np.pi)
     grids = mapped(world, there, rng), mapped(world, back, rng)
     T = np.array([heading(x, 0, 0, 0) for x in np.arange(2.0, 42.0, 3.0)])
-    D = [describe(g, T) for g in grids]
+    D = [describe(GridView(g), T) for g in grids]
     n = len(T)
     places = Places(
         np.arange(2 * n), np.repeat([0, 1], n), np.concatenate([T, T]),
@@ -81,7 +82,7 @@ def drive() -> tuple[Places, Descriptors]:
 def test_a_place_looks_the_same_whichever_way_one_stands() -> None:
     grid = mapped(hall(cars=24), straight_path(10.0, 40.0, 8.0), np.random.default_rng(0))
     T = np.stack([heading(15.0, 0.5, 0.0, 0.0), heading(15.0, 0.5, 0.0, math.radians(40.0), 0.1)])
-    D = describe(grid, T)
+    D = describe(GridView(grid), T)
     r, turn = similarity(D, 1, D, np.array([0]))
     assert r[0] > 0.97
     assert turn[0] == pytest.approx(math.radians(40.0), abs=math.radians(2.6))
@@ -127,7 +128,7 @@ def test_what_is_impossible_is_refused(drive: tuple[Places, Descriptors]) -> Non
         appearance_candidates(places, join([D, D]))
     grid = mapped(hall(), straight_path(10.0, 12.0, 8.0), np.random.default_rng(0))
     with pytest.raises(GeometryError):
-        describe(grid, np.zeros((2, 3)))
+        describe(GridView(grid), np.zeros((2, 3)))
     for bad in ({"radius": 0.0}, {"low": 2.0}, {"rings": 0}, {"known": 1.5}):
         with pytest.raises(ConfigError):
             DescriptorConfig(**bad)

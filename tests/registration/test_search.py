@@ -11,7 +11,7 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.registration.points import spread, thin, transform
+from graphslam.core.points import spread, thin, transform
 from graphslam.registration.search import SearchConfig, correlative_search, make_lattice, offset_pose, score_lattice
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima

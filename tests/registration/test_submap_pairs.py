@@ -13,6 +13,7 @@ from graphslam.core.errors import ConfigError, CovarianceError, GeometryError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.views import GridView
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.submap_pairs import (
     PairMatch,
@@ -35,8 +36,8 @@ def pair() -> tuple[PreparedMap, PreparedMap, Array, Array]:
     world, rng = hall(cars=60), np.random.default_rng(5)
     there, back = straight_path(14.0, 44.0, 8.0), straight_path(40.0, 18.0, 10.0, yaw=np.pi)
     return (
-        PreparedMap(mapped(world, there, rng), CONFIG),
-        PreparedMap(mapped(world, back, rng), CONFIG),
+        PreparedMap(GridView(mapped(world, there, rng)), CONFIG),
+        PreparedMap(GridView(mapped(world, back, rng)), CONFIG),
         there[0],
         back[0],
     )
@@ -99,7 +100,7 @@ def test_one_pillar_further_is_refused(pair: tuple) -> None:
 def test_another_hall_is_refused(pair: tuple) -> None:
     target, _, *_ = pair
     other = hall(period=7.0, width=15.0, cars=3)
-    source = PreparedMap(mapped(other, straight_path(10.0, 30.0, 7.0), np.random.default_rng(2)), CONFIG)
+    source = PreparedMap(GridView(mapped(other, straight_path(10.0, 30.0, 7.0), np.random.default_rng(2))), CONFIG)
     m = match_pair(source, PLACE, target, heading(10.0, 0.0, 0.0, 0.0), np.diag([0.02, 0.02, 0.1, 3, 3, 0.3]) ** 2)
     assert not m.accepted
 
@@ -108,7 +109,10 @@ def test_a_corridor_holds_all_but_one_direction() -> None:
     """Kept, and as uncertain along it as before; or refused, as one likes."""
     world, rng = corridor(), np.random.default_rng(3)
     there, back = straight_path(-12.0, 12.0, 0.0), straight_path(8.0, -8.0, 0.3, yaw=np.pi)
-    target, source = PreparedMap(mapped(world, there, rng), CONFIG), PreparedMap(mapped(world, back, rng), CONFIG)
+    target, source = (
+        PreparedMap(GridView(mapped(world, there, rng)), CONFIG),
+        PreparedMap(GridView(mapped(world, back, rng)), CONFIG),
+    )
     place = heading(8.0, 0.0, 0.0, 0.0)
     T = se3.se3_compose(se3.se3_between(there[0], back[0]), place)
     P = np.diag([0.01, 0.01, 0.05, 1.0, 0.5, 0.2]) ** 2
@@ -135,8 +139,8 @@ def test_covariance_is_honest_for_maps_that_are_bent_inside() -> None:
         rng = np.random.default_rng(100 + seed)
         there, back = straight_path(14.0, 40.0, 8.0, step=2.0), straight_path(38.0, 18.0, 10.0, yaw=np.pi, step=2.0)
         seen = drifted(there, rng), drifted(back, rng)
-        target = PreparedMap(mapped(world, there, rng, believed=seen[0]), CONFIG)
-        source = PreparedMap(mapped(world, back, rng, believed=seen[1]), CONFIG)
+        target = PreparedMap(GridView(mapped(world, there, rng, believed=seen[0])), CONFIG)
+        source = PreparedMap(GridView(mapped(world, back, rng, believed=seen[1])), CONFIG)
         k = 6
         place = se3.se3_between(seen[1][0], seen[1][k])
         # what is true near the place: seen from the pose of the target's path that is nearest
@@ -167,7 +171,7 @@ def test_in_the_plane() -> None:
         return grid
 
     there, back = straight_path(14.0, 44.0, 8.0, 0.5), straight_path(40.0, 18.0, 10.0, 0.5, yaw=np.pi)
-    target, source = PreparedMap(flat(there), CONFIG), PreparedMap(flat(back), CONFIG)
+    target, source = PreparedMap(GridView(flat(there)), CONFIG), PreparedMap(GridView(flat(back)), CONFIG)
     place = np.array([8.0, 0.0, 0.0])
     T = np.array([40.0 - 8.0 - 14.0, 2.0, np.pi])
     m = match_pair(source, place, target, T + np.array([1.5, -1.0, 0.1]), np.diag([1.0, 1.0, 0.1]) ** 2)
@@ -186,7 +190,7 @@ def test_contradiction_is_what_one_has_occupied_and_the_other_free(pair: tuple) 
     wrong = contradiction(source, PLACE, target, shifted, points)
     assert right < 0.02
     assert wrong > 0.03 > right
-    empty = PreparedMap(EvidenceGrid(0.2), CONFIG)
+    empty = PreparedMap(GridView(EvidenceGrid(0.2)), CONFIG)
     assert contradiction(empty, PLACE, empty, T, np.zeros((0, 3))) == 0.0
 
 
@@ -215,7 +219,7 @@ def test_chi2_against_the_prediction_is_that_of_samples() -> None:
 
 def test_what_is_impossible_is_refused_by_name(pair: tuple) -> None:
     target, source, *_ = pair
-    empty = PreparedMap(EvidenceGrid(0.2), CONFIG)
+    empty = PreparedMap(GridView(EvidenceGrid(0.2)), CONFIG)
     for m in (match_pair(empty, PLACE, target, PLACE, LOOSE), match_pair(source, PLACE, empty, PLACE, LOOSE)):
         assert not m.accepted
         assert m.why.startswith("nothing")

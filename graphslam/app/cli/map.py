@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def make_map(
-    run: Path = typer.Argument(..., help="Folder of a finished run whose submaps hold evidence grids."),
+    run: Path = typer.Argument(..., help="Folder of a finished run of dense submaps (evidence grids or clouds)."),
     grid: bool = typer.Option(False, "--grid", help="Write also the evidence grid, map.grid.npz."),
     minimum_entropy: bool = typer.Option(
         False,

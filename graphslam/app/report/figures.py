@@ -52,7 +52,9 @@ def figures(folder: ReportFolder) -> Markup:
     elif "map.png" not in made:
         parts.append(missing("the map (figures/map.png)."))
     if folder.kind == "run" and not any(n.startswith("fused") for n in made):
-        said = folder.report.get("map_left_out", "the submaps have no evidence grids, or the map was not asked for.")
+        said = folder.report.get(
+            "map_left_out", "the submaps have no evidence grids or clouds, or the map was not asked for."
+        )
         parts.append(missing("a fused map: ", said))
     return section("figures", "Figures", *parts)
 

@@ -1,6 +1,6 @@
 """The fused map of a run: pieces led by the graph's own nodes, at their solved poses; files, pictures, figures.
 
-No scan is read: front ends that work with evidence grids store one with each submap, so that a map can be made again
+No scan is read: front ends store a grid or a cloud with each submap, so that a map can be made again
 from a run folder alone (``graphslam map``).
 """
 
@@ -12,15 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.maps.export import save_maps
+from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
 
 logger = logging.getLogger(__name__)
 
 
 def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None = None) -> list[Path]:
-    """Write ``map.ply``, ``map.bt``, floor plans and ``fused_map.json``, of that generation; returns the files."""
+    """Write ``map.ply``, ``map.bt``, ``cloud.ply`` (of clouds), floor plans, ``fused_map.json``; returns the files."""
     made = save_maps(run_map.fused.grid, folder.path, bands=run_map.bands)
+    if run_map.points is not None:
+        made.append(save_points(run_map.points, folder.path / "cloud.ply"))
     folder.write_json("fused_map.json", {**run_map.facts(), "generation": generation})
     return [*made, folder.path / "fused_map.json"]
 

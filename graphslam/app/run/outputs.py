@@ -59,8 +59,8 @@ OF_THE_CLOCK = ("seconds", RESUMED)
 SAME_BYTES = (
     *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "map*.pgm"),
-    *("map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
+    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
+    *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
 )
 """Files of a run folder that are the same bytes after a kill and a resume, after undoing and redoing a loop, and in two

@@ -64,7 +64,7 @@ from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
 from graphslam.maps.global_map import GlobalMap, make_map
-from graphslam.maps.run_map import RunMap, has_grids, make_run_map
+from graphslam.maps.run_map import RunMap, has_maps, make_run_map
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -392,8 +392,8 @@ def _judge(
 def _fused_map(
     submaps: list[Submap], m: GlobalMap, config: cfg.MapConfig, effective: Mapping[str, Any]
 ) -> tuple[RunMap | None, str]:
-    """The fused map of submaps with grids; or None, and why where there could have been one."""
-    if not (config.fuse and has_grids(submaps)):
+    """The fused map of dense submaps; or None, and why where there could have been one."""
+    if not (config.fuse and has_maps(submaps)):
         return None, ""
     try:
         return make_run_map(submaps, m, reach=sensor_reach(effective), config=config), ""

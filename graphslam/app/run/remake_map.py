@@ -18,7 +18,7 @@ from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps
-from graphslam.maps.run_map import MapConfig, RunMap, make_run_map
+from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def remake_map(
     RunFolderError
         Not a finished run, or another process is writing into it.
     MissingDataError
-        A run without evidence grids; no log to find hypotheses in.
+        A run without dense maps; no log to find hypotheses in.
     ConfigError
         Both kinds of alternatives at once, or hypotheses of another front end.
     FormatError, DataError
@@ -96,7 +96,7 @@ def remake_map(
                 made.fused.grid.save(new.path / "map.grid.npz")
                 files.append(new.path / "map.grid.npz")
             figures = draw_run_map(made, run.map.trajectory, new.figures, name=run.name, truth=run.truth_path)
-            old = ["map.ply", "map.bt", "map*.pgm", "map*.yaml", "map.grid.npz", "figures/fused*.png"]
+            old = ["map.ply", "map.bt", "cloud.ply", "map*.pgm", "map*.yaml", "map.grid.npz", "figures/fused*.png"]
             if found is not None:
                 files += write_clearest(new.path, found, bands=made.bands)
                 old += ["clearest*", "alternatives/*"]
@@ -107,7 +107,7 @@ def remake_map(
 
 
 def map_of_folder(path: str | Path, *, low: float | None = None, high: float | None = None) -> tuple[Run, RunMap]:
-    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their grids.
+    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their maps.
 
     Parameters
     ----------
@@ -120,18 +120,18 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     RunFolderError
         Not a finished run.
     MissingDataError
-        A run of a front end without grids, or one that left them out.
+        A run of a front end without dense maps, or one that left them out.
     FormatError, DataError
     """
     run = open_run(path)
     root = Path(path)
-    if not any((root / "submaps").glob("*.grid.npz")):
-        raise MissingDataError(
-            f"{root}: the run has no evidence grids to make a map of",
-            got=f"front end {run.report.get('frontend')}",
-            wanted="a run of a front end with grids: segslam, rbpf-grid",
-        )
     submaps = read_submaps(root, load_grid=load_npz)
+    if not has_maps(submaps):
+        raise MissingDataError(
+            f"{root}: the run has no evidence grids or clouds to make a map of",
+            got=f"front end {run.report.get('frontend')}",
+            wanted="a run of a front end with dense maps: segslam, rbpf-grid",
+        )
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
     config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")

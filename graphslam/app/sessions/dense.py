@@ -19,6 +19,7 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.formats import load_npz
+from graphslam.evidence.views import has_view
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
@@ -33,20 +34,20 @@ def is_dense(run: Run) -> bool:
     return bool(run.submaps) and all(s.landmarks is None for s in run.submaps)
 
 
-def with_grids(run: Run) -> list[Submap]:
-    """The submaps of a run with their grids, read from its folder where they are not there.
+def with_maps(run: Run) -> list[Submap]:
+    """The submaps of a run with their dense maps, read from its folder where they are not there.
 
     Raises
     ------
     DataError
-        A submap whose grid is nowhere.
+        A submap whose map is nowhere.
     """
     submaps = list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
         submaps = read_submaps(run.folder, load_grid=load_npz)
-    without = [s.key for s in submaps if s.grid is None]
+    without = [s.key for s in submaps if not has_view(s)]
     if without:
-        raise DataError(f"submaps {without} have no grid", where=run.name, wanted="evidence grids beside the submaps")
+        raise DataError(f"submaps {without} have no map", where=run.name, wanted="evidence grids or clouds")
     return submaps
 
 
@@ -79,7 +80,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     begin = run.submaps[0].interval[0]
     shift = 0.0 if begin > after else float(np.ceil(after - begin) + 1000.0)
     keys = {s.key: first_key + k for k, s in enumerate(run.submaps)}
-    submaps = [_in_common(s, keys, name, shift) for s in with_grids(run)]
+    submaps = [_in_common(s, keys, name, shift) for s in with_maps(run)]
     fixes = None if run.fixes is None else replace(run.fixes, times=run.fixes.times + shift)
     return DenseSession(
         name, submaps, config, SessionMap(submaps, config.node_spacing), _inner(run, config), shift, fixes,

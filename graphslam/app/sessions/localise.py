@@ -17,7 +17,7 @@ from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.run import Run
-from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_grids
+from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_maps
 from graphslam.backend.sessions import DenseSession, attach, put
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
@@ -110,7 +110,7 @@ def localise(
     """
     opened = run if isinstance(run, Run) else open_run(run)
     if not is_dense(opened):
-        raise DataError("only maps of dense submaps are localised in", where=opened.name, wanted="submaps with grids")
+        raise DataError("only maps of dense submaps are localised in", where=opened.name, wanted="dense submaps")
     with one_blas_thread():
         if isinstance(source, SensorLog):
             submaps = window_submaps(opened, source)
@@ -146,7 +146,7 @@ def source_of(
             raise DataError(
                 "submaps do not follow one another in this run", where=str(path), got=list(keys), wanted=known
             )
-        submaps = with_grids(run)
+        submaps = with_maps(run)
         return submaps if not rows else [submaps[k] for k in rows]
     log = load_log_source(source)
     a, b = log.interval

@@ -136,7 +136,7 @@ def test_submaps_without_maps_cannot_be_searched() -> None:
     back = BackEnd(BackEndConfig(loops=True), "batch")
     for s in submaps:
         back.add(replace(s, grid=None))
-    with pytest.raises(DataError, match="no grid"):
+    with pytest.raises(DataError, match="no map"):
         back.finish()
 
 

@@ -116,6 +116,19 @@ def test_two_drives_become_one_map(drives: list[HallDrive], merged: Any) -> None
     assert {"there/scanner", "back/scanner"} <= streams
 
 
+def test_drives_of_clouds_become_one_map(tmp_path: Path) -> None:
+    world, rng = hall(cars=60), np.random.default_rng(3)
+    ways = straight_path(8.0, 44.0, 8.0, step=0.75), straight_path(50.0, 16.0, 9.0, yaw=np.pi, step=0.75)
+    drives = [hall_drive(world, way, rng, clouds=True) for way in ways]
+    runs = [solved(d, name, tmp_path / name) for d, name in zip(drives, ("there", "back"))]
+    assert (tmp_path / "there" / "cloud.ply").is_file()
+    m = graphslam.merge([r.folder for r in runs])
+    s = m.sessions[1]
+    e = se3.se3_log(se3.se3_between(s.T_world_base, truth_between(drives)))
+    assert e @ np.linalg.solve(s.covariance, e) < CHI2_6
+    assert np.linalg.norm(e[3:]) < 0.5
+
+
 def test_isam2_comes_to_the_same_optimum(runs: list[Any], merged: Any) -> None:
     other = graphslam.merge([r.folder for r in runs], solver="isam2")
     assert other.metric("objective") == pytest.approx(merged.metric("objective"), rel=1e-6)
@@ -188,7 +201,7 @@ def test_what_cannot_be_merged_is_refused(runs: list[Any], tmp_path: Path) -> No
     with pytest.raises(ConfigError, match="places, gps"):
         graphslam.merge(runs, by="identity")
     no_grids = replace(runs[1], folder=None, submaps=[replace(s, grid=None) for s in runs[1].submaps])
-    with pytest.raises(DataError, match="have no grid"):
+    with pytest.raises(DataError, match="have no map"):
         graphslam.merge([runs[0], no_grids])
 
 

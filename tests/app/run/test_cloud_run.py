@@ -1,0 +1,147 @@
+"""Runs whose submaps carry clouds: loops between them, fused maps of them, and every verb on their folders."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+import graphslam as gs
+from graphslam.app.cli import app
+from graphslam.app.run import pipeline
+from graphslam.app.run.files import loops_of_run
+from graphslam.app.run.outputs import SAME_BYTES
+from graphslam.app.run.run import Run
+from graphslam.core.config import build
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import SE3
+from graphslam.io.submap_store import read_submaps
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from tests.faults.kills import snapshot
+from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
+
+
+@pytest.fixture(scope="module")
+def log() -> SensorLog:
+    """Nearly one and a half times round a block: the way comes back to where it was."""
+    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+
+
+@pytest.fixture(scope="module")
+def go(log: SensorLog) -> Any:
+    """Runs the log with the front end of clouds through the public verb."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build(CloudConfig, o, "frontend")))
+
+        def run(out: Path | None = None, *, loops: bool = True, resume: bool = False, **front: Any) -> Run:
+            options = {"frontend": {"length": 8.0, "steps": {"max_range": 8.0}, **front}, "backend": {"loops": loops}}
+            return gs.run(log, frontend="clouds", config=options, out=out, resume=resume, progress=False)
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def finished(go: Callable[..., Run], tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return go(tmp_path_factory.mktemp("clouds") / "run")
+
+
+def assert_right(run: Run, log: SensorLog) -> int:
+    """Every accepted loop is where the truth has it, within 3 σ; returns how many there are."""
+    taken = [e for e in run.events if e["event"] == "loop" and e["verdict"] == "accepted"]
+    assert log.truth is not None
+    for e in taken:
+        x = log.truth.trajectory.interpolate(run.map.node_times[[e["i"], e["j"]]])
+        r = SE3.log(SE3.between(SE3.between(x[0], x[1]), np.array(e["T_ij"])))
+        assert r @ np.linalg.solve(np.array(e["covariance"]), r) < stats.chi2.ppf(0.9973, 6)
+        assert np.linalg.norm(r[3:]) < 0.5
+    return len(taken)
+
+
+def test_loops_between_clouds_close_the_map(finished: Run, go: Callable[..., Run], log: SensorLog) -> None:
+    assert all(s.grid is None and s.cloud is not None for s in finished.submaps)
+    assert assert_right(finished, log) >= 2
+    open_chain = go(loops=False)
+    assert finished.metric("path_rmse_aligned") < 0.3 * open_chain.metric("path_rmse_aligned")
+    assert finished.metric("map_entropy") < 0.95 * finished.metric("map_entropy_open_chain")
+    assert finished.metric("converged") == 1
+
+
+def test_points_alone_are_not_matched_where_they_do_not_fit_whole(go: Callable[..., Run], log: SensorLog) -> None:
+    """Without the places from which they were seen nothing says what is free: partial overlaps are refused."""
+    run = go(origins=False)
+    assert_right(run, log)
+    assert any(e["event"] == "loop" and "fitness" in e["why"] for e in run.events)
+    assert run.fused is not None
+    facts = run.fused.facts()
+    assert facts["free_space_known"] is False
+    assert facts["points"] == len(run.fused.points) > 1000
+
+
+def test_a_grid_beside_the_cloud_gives_the_space(go: Callable[..., Run], log: SensorLog) -> None:
+    run = go(origins=False, grid=True)
+    assert assert_right(run, log) >= 1
+    assert run.fused is not None
+    assert run.fused.facts()["free_space_known"] is True
+    assert run.fused.points is not None
+
+
+def test_the_folder_has_the_points_and_comes_back(finished: Run) -> None:
+    folder = finished.folder
+    assert folder is not None
+    assert finished.fused is not None
+    head, rows = (folder / "cloud.ply").read_bytes().split(b"end_header\n", 1)
+    assert f"element vertex {len(finished.fused.points)}".encode() in head
+    np.testing.assert_allclose(np.frombuffer(rows, "<f4").reshape(-1, 3), finished.fused.points, atol=1e-4)
+    # the points move with the graph: with the loops in they stand closer together than along the open chain
+    assert {"map.ply", "map.bt", "fused_map.json", "cloud.ply"} <= {p.name for p in folder.iterdir()}
+    back = read_submaps(folder)
+    for a, b in zip(back, finished.submaps):
+        np.testing.assert_array_equal(a.cloud.points, b.cloud.points)
+        np.testing.assert_array_equal(a.cloud.origins[a.cloud.scan], b.cloud.origins[b.cloud.scan])
+
+
+def test_every_verb_works_on_the_folder(finished: Run) -> None:
+    """Loops, map, report, undo and redo, as the command line has them."""
+    folder = finished.folder
+    assert folder is not None
+
+    def say(*words: object) -> Any:
+        done = CliRunner().invoke(app, [*map(str, words), "--json"], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return json.loads(done.stdout)
+
+    before = snapshot(folder, SAME_BYTES)
+    accepted = [d.loop for d in loops_of_run(folder).current() if d.verdict == "accepted"]
+    assert sum(d["verdict"] == "accepted" for d in say("loops", folder)["loops"]) == len(accepted)
+    made = say("map", folder)
+    assert made["points"] == len(finished.fused.points)
+    assert str(folder / "cloud.ply") in made["files"]
+    assert snapshot(folder, SAME_BYTES) == before
+    say("report", folder)
+    say("loops", folder, "--undo", accepted[0])
+    assert snapshot(folder, SAME_BYTES)["cloud.ply"] != before["cloud.ply"]
+    say("loops", folder, "--redo", accepted[0])
+    assert snapshot(folder, SAME_BYTES) == before
+
+
+def test_a_resumed_run_is_the_run(finished: Run, go: Callable[..., Run], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "submaps").mkdir(parents=True)
+    shutil.copy(finished.folder / "config.toml", folder)
+    for name in ("000000.npz", "000001.npz"):
+        shutil.copy(finished.folder / "submaps" / name, folder / "submaps")
+    index = json.loads((finished.folder / "submaps" / "index.json").read_text())
+    index |= {"count": 2, "submaps": index["submaps"][:2]}
+    (folder / "submaps" / "index.json").write_text(json.dumps(index))
+    go(folder, resume=True)
+    assert snapshot(folder, SAME_BYTES) == snapshot(finished.folder, SAME_BYTES)
