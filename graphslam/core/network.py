@@ -379,6 +379,20 @@ class PoseNetwork:
             else self.has_landmark,
         )
 
+    def only(self, used: Mask) -> PoseNetwork:
+        """The network with only the edges and observations of ``used`` ``(m + k,)``."""
+        m = len(self.edges)
+        e, o = np.flatnonzero(used[:m]), np.flatnonzero(used[m:])
+        return replace(
+            self,
+            edges=self.edges[e],
+            measurements=self.measurements[e],
+            information=self.information[e],
+            observations=self.observations[o],
+            observation_values=self.observation_values[o],
+            observation_information=self.observation_information[o],
+        )
+
     def __repr__(self) -> str:
         marks = f", {len(self.landmark_ids)} landmarks seen {len(self.observations)} times"
         return (

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.variables import KINDS, Layout, Values, split_name
 
@@ -52,26 +52,23 @@ class Diagnosis:
             )
 
 
-def unreached(records: Sequence[Record], layout: Layout) -> list[str]:
-    """Variables that no chain of factors ties to the fixed first base (cheap, no numbers)."""
-    parent: dict[str, str] = {n: n for n in [*layout.names(), "x0"]}
-
-    def root(a: str) -> str:
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        return a
-
-    touched = set()
-    for record in records:
-        names = record.variables()
-        touched.update(names)
-        for other in names[1:]:
-            parent[root(other)] = root(names[0])
-    # A prior ties its variable to a known value although no other factor has met it yet.
-    prior = {n for r in records if batch_of(type(r)).prior for n in r.variables()}
-    home = {root("x0"), *(root(n) for n in prior)}
-    return [n for n in layout.names() if n not in touched or root(n) not in home]
+def unreached(flat: FlatGraph) -> tuple[list[str], int]:
+    """Variables that no chain of factors ties to a held pose (cheap, no numbers), and in how many parts they are."""
+    lay, (factor, variable) = flat.layout, flat.links
+    ground = lay.size
+    prior = np.concatenate([np.zeros(0, dtype=bool), *(np.full(len(f), f.prior) for f in flat.batches)])
+    at = np.where(variable < 0, ground, variable)
+    at, factor, tied = at[variable != -2], factor[variable != -2], prior
+    # every factor is a node behind the columns; a prior ties its variable to a known value
+    rows = np.concatenate([at, np.full(int(tied.sum()), ground)])
+    factors = ground + 1 + np.concatenate([factor, np.flatnonzero(tied)])
+    size = ground + 1 + len(flat)
+    links = sp.coo_matrix((np.ones(len(rows)), (rows, factors)), shape=(size, size))
+    label = connected_components(links, directed=False)[1]
+    names = lay.names()
+    first = np.concatenate([[0], np.cumsum([split_name(n)[0].dof(lay.dim) for n in names])])[:-1].astype(np.intp)
+    loose = np.flatnonzero(label[first] != label[ground])
+    return [names[k] for k in loose.tolist()], len(np.unique(label[first[loose]]))
 
 
 def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diagnosis:
@@ -86,16 +83,16 @@ def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diag
         GPS fixes without a datum yet (for the remedy's wording).
     """
     lay = flat.layout
-    lost = unreached(flat.records, lay)
+    lost, _ = unreached(flat)
     if not lost:
         system = flat.evaluate(values)
-        lost = _null_variables(system.A, lay)
+        lost = null_variables(system.A, lay)
     if not lost:
         return Diagnosis()
     return Diagnosis(tuple(lost), tuple(_remedies(lost, flat, waiting_fixes)))
 
 
-def _null_variables(A: Array | sp.csc_matrix, lay: Layout) -> list[str]:
+def null_variables(A: Array | sp.csc_matrix, lay: Layout) -> list[str]:
     diagonal = np.asarray(A.diagonal())
     owner = np.array(lay.owner_of_columns(), dtype=object)
     if lay.size == 0:

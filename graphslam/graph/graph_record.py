@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import ItemsView, Iterator, Mapping, MutableMapping, Sequence, ValuesView
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import Record, batch_of
+from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.flat import FlatGraph
@@ -23,38 +24,112 @@ from graphslam.graph.gps_queue import GpsQueue
 from graphslam.graph.ledger import Ledger
 from graphslam.graph.score import Score, score
 from graphslam.graph.submap_node import SubmapNode
-from graphslam.graph.variables import Values
+from graphslam.graph.variables import Layout, Values
 
 
-class Factors(dict[int, "Record"]):
-    """Factors by id, with a journal of every change, so that a solver sees what is new without looking at the rest.
+@dataclass(frozen=True, slots=True, eq=False)
+class BetweenBlock:
+    """Relative poses that entered together, as arrays, under consecutive numbers.
 
-    A record of a kind that nobody registered is refused here.
+    Parameters
+    ----------
+    first_id : int
+    ends, T_ij, whiteners : (m, 2), (m, 3|7), (m, d, d)
+    group : str
+    kept : (m,) bool
+        Those that were not removed since.
+    """
+
+    first_id: int
+    ends: npt.NDArray[np.int64]
+    T_ij: Array
+    whiteners: Array
+    group: str
+    kept: npt.NDArray[np.bool_]
+
+    def batch(self, layout: Layout) -> BetweenBatch:
+        """What is kept, as a batch."""
+        k = np.flatnonzero(self.kept)
+        rows = slice(None) if len(k) == len(self.kept) else k
+        return BetweenBatch.of_arrays(
+            self.ends[rows], self.T_ij[rows], self.whiteners[rows], layout, group=self.group, ids=self.first_id + k
+        )
+
+    def record(self, factor_id: int) -> BetweenRecord:
+        """One of them."""
+        k = factor_id - self.first_id
+        i, j = self.ends[k].tolist()
+        return BetweenRecord(factor_id, i, j, self.T_ij[k], self.whiteners[k], group=self.group)
+
+
+class Factors(MutableMapping[int, "Record"]):
+    """Factors by number, with a journal of every change, so that a solver sees what is new without looking at the rest.
+
+    Factors that came as arrays stay arrays; a record of one is made when somebody asks for it. A record of a kind that
+    nobody registered is refused here.
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        self.single: dict[int, Record] = {}
+        self.blocks: list[BetweenBlock] = []
         self.journal: list[int] = []
+
+    def block_of(self, factor_id: int) -> BetweenBlock | None:
+        """The arrays that hold a factor."""
+        for b in self.blocks:
+            if 0 <= factor_id - b.first_id < len(b.kept) and b.kept[factor_id - b.first_id]:
+                return b
+        return None
+
+    def add_block(self, block: BetweenBlock) -> None:
+        """Take factors as arrays."""
+        self.blocks.append(block)
+        self.journal.extend(range(block.first_id, block.first_id + len(block.kept)))
+
+    def flat(self, layout: Layout) -> FlatGraph:
+        """All of them as a problem."""
+        return FlatGraph(list(self.single.values()), layout, [b.batch(layout) for b in self.blocks])
+
+    def __getitem__(self, factor_id: int) -> Record:
+        if factor_id not in self.single:
+            block = self.block_of(factor_id)
+            if block is not None:
+                return block.record(factor_id)
+        return self.single[factor_id]
 
     def __setitem__(self, factor_id: int, record: Record) -> None:
         batch_of(type(record))
-        super().__setitem__(factor_id, record)
+        if self.block_of(factor_id) is not None:
+            del self[factor_id]
+        self.single[factor_id] = record
         self.journal.append(factor_id)
 
     def __delitem__(self, factor_id: int) -> None:
-        super().__delitem__(factor_id)
+        block = None if factor_id in self.single else self.block_of(factor_id)
+        if block is None:
+            del self.single[factor_id]
+        else:
+            block.kept[factor_id - block.first_id] = False
         self.journal.append(factor_id)
 
-    def pop(self, factor_id: int, *default: Any) -> Any:
-        """See :meth:`dict.pop`."""
-        if factor_id in self:
-            self.journal.append(factor_id)
-        return super().pop(factor_id, *default)
+    def __contains__(self, factor_id: object) -> bool:
+        return factor_id in self.single or (isinstance(factor_id, int) and self.block_of(factor_id) is not None)
 
-    def update(self, other: Any = (), /, **named: Any) -> None:
-        """See :meth:`dict.update`."""
-        for k, r in dict(other, **named).items():
-            self[k] = r
+    def __iter__(self) -> Iterator[int]:
+        yield from self.single
+        for b in self.blocks:
+            yield from (b.first_id + np.flatnonzero(b.kept)).tolist()
+
+    def __len__(self) -> int:
+        return len(self.single) + sum(int(b.kept.sum()) for b in self.blocks)
+
+    def values(self) -> ValuesView[Record]:
+        """Records; those of arrays are made on the way."""
+        return super().values() if self.blocks else self.single.values()
+
+    def items(self) -> ItemsView[int, Record]:
+        """Numbers and records; those of arrays are made on the way."""
+        return super().items() if self.blocks else self.single.items()
 
 
 class Source(Protocol):
@@ -179,10 +254,12 @@ class GraphRecord:
             self.revision += 1
 
     def _take_out(self, factor_id: int, reason: str) -> None:
+        block = self.records.block_of(factor_id)
         record = self.records.pop(factor_id)
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] -= 1
-        self.ledger.refund(factor_id)
+        if block is None or not block.kept.any():  # factors that came together spent their evidence together
+            self.ledger.refund(factor_id if block is None else block.first_id)
         self.revision += 1
         if isinstance(record, SubmapRecord):
             for i in set(record.landmark_ids.tolist()):
@@ -288,7 +365,7 @@ class GraphRecord:
     def flat(self) -> FlatGraph:
         """Flat arrays of the factors, made once per revision."""
         if self._flat is None or self._flat[0] != self.revision:
-            self._flat = (self.revision, FlatGraph(list(self.records.values()), self.structure.layout()))
+            self._flat = (self.revision, self.records.flat(self.structure.layout()))
         return self._flat[1]
 
     def covariance(self) -> JointCovariance:

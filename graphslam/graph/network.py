@@ -1,14 +1,62 @@
-"""A graph as a plain pose network, for g2o files and for tools that know no submaps."""
+"""Pose networks (what a file says) and the least-squares problem: there and back."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.batch import FactorBatch
+from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.noise import whiteners
+from graphslam.graph.variables import KINDS, Layout, Values
+from graphslam.linear.symmetric_factor import elimination_order
+
+if TYPE_CHECKING:
+    from graphslam.graph.pose_graph import PoseGraph
+
+
+def values_of(network: PoseNetwork, poses: Array, landmarks: Array | None = None) -> Values:
+    """Values of the variables of a network's problem; the landmarks are the network's own if not given."""
+    marks = network.landmarks if landmarks is None else landmarks
+    return Values(network.dim, {"x": poses, "l": marks}, network.landmark_ids)
+
+
+def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGraph:
+    """The measurements of a network as a least-squares problem, with no object for each.
+
+    Factors count through the edges, then the observations. Fixed vertices (the first, if there are none) are held.
+
+    Parameters
+    ----------
+    ordered : bool
+        Columns come in a minimum-degree order of elimination: quicker than to order their scalars. Else in their own.
+    """
+    n, l = len(network), len(network.landmark_ids)
+    counts = tuple({"x": n, "l": l}.get(word, 0) for word in KINDS)
+    fixed = tuple(network.anchors.tolist())
+    order = None
+    if ordered:
+        at = np.full(n + l, -1)
+        free = np.setdiff1d(np.arange(n + l), network.anchors)
+        at[free] = np.arange(len(free))
+        i, j = at[np.concatenate([network.edges, network.observations + [0, n]])].T
+        tied = (i >= 0) & (j >= 0)
+        order = free[elimination_order(i[tied], j[tied], len(free))] if len(free) else free
+    layout = Layout(network.dim, counts, network.landmark_ids, fixed, order)
+    batches: list[FactorBatch] = [
+        BetweenBatch.of_arrays(network.edges, network.measurements, whiteners(network.information), layout)
+    ]
+    if len(network.observations):
+        polar = network.observation_kind == "bearing-range"
+        W = whiteners(network.observation_information)
+        batches.append(SightingBatch.of_arrays(network.observations, network.observation_values, polar, W, layout))
+    return FlatGraph((), layout, batches)
 
 
 def to_network(graph: PoseGraph) -> PoseNetwork:

@@ -49,6 +49,65 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
     return np.asarray(W, dtype=np.float64)
 
 
+def whiteners(information: Array) -> Array:
+    """Upper triangular ``W`` ``(m, d, d)`` with ``Wᵀ W`` = information, which may be singular in some directions."""
+    if len(information) == 0:
+        return information
+    try:
+        return np.asarray(np.swapaxes(np.linalg.cholesky(information), 1, 2))
+    except np.linalg.LinAlgError:
+        w, V = np.linalg.eigh(information)
+        return np.asarray(np.linalg.qr(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2), mode="r"))
+
+
+# So many matrices are turned into whiteners at a time.
+_PART = 1 << 15
+
+
+def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: str = "factor") -> Array:
+    """:func:`whitener` of many covariances, or of one that all share.
+
+    Parameters
+    ----------
+    covariances : (count, dim, dim) or (dim, dim)
+
+    Returns
+    -------
+    (count, dim, dim)
+        A view of one matrix where all share it.
+
+    Raises
+    ------
+    CovarianceError
+        Names the first one that is not finite, symmetric and positive definite.
+    """
+    P = np.asarray(covariances, dtype=np.float64)
+    if P.shape == (dim, dim):
+        return np.broadcast_to(whitener(P, what=f"covariance of every {what}", dim=dim), (count, dim, dim))
+    if P.shape != (count, dim, dim):
+        raise CovarianceError(f"covariances of the {what}s do not fit", got=P.shape, wanted=(count, dim, dim))
+    W = np.zeros((count, dim, dim))
+    for first in range(0, count, _PART):
+        part, out = P[first : first + _PART], W[first : first + _PART]
+        scale = np.sqrt(np.abs(np.diagonal(part, axis1=1, axis2=2)))
+        off = np.abs(part - np.swapaxes(part, 1, 2)) > 1e-6 * scale[:, :, None] * scale[:, None, :]
+        bad = np.asarray(off.any(axis=(1, 2)) | ~np.isfinite(part).all(axis=(1, 2)))
+        try:
+            L = np.linalg.cholesky(np.where(bad[:, None, None], np.eye(dim), part))
+        except np.linalg.LinAlgError:
+            bad |= np.linalg.eigvalsh(np.where(bad[:, None, None], np.eye(dim), part))[:, 0] <= 0.0
+        if bad.any():
+            k = int(bad.argmax())
+            check_covariance(part[k], what=f"covariance of {what} {first + k}", dim=dim)
+            raise CovarianceError(f"covariance of {what} {first + k} is not usable", got=part[k])
+        for j in range(dim):  # columns of the inverse by forward substitution, all matrices at once
+            out[:, j, j] = 1.0 / L[:, j, j]
+            for i in range(j + 1, dim):
+                known = np.einsum("mk,mk->m", L[:, i, j:i], out[:, j:i, j])
+                out[:, i, j] = -known / L[:, i, i]
+    return W
+
+
 @dataclass(frozen=True, slots=True)
 class Robust:
     """A robust kernel on the whitened norm ``d`` of one residual, with GTSAM's formulae.
@@ -98,6 +157,8 @@ def robust_terms(d2: Array, code: Any, k: Any) -> tuple[Array, Array]:
         :attr:`Robust.code` and width of each.
     """
     d2 = np.asarray(d2, dtype=np.float64)
+    if not np.any(code):
+        return d2, np.ones_like(d2)
     d = np.sqrt(d2)
     safe = np.where(d > 0, d, 1.0)
     out = d > k

@@ -75,11 +75,11 @@ def score(flat: FlatGraph, chi2: Array) -> Score:
     """Sum ``chi2`` ``(f,)``, in the order of ``flat.records``, by class."""
     lay = flat.layout
     sums: dict[str, list[float]] = {}
-    for record, value in zip(flat.records, chi2.tolist()):
-        c = sums.setdefault(record.group, [0.0, 0, 0])
-        c[0] += value
-        c[1] += 1
-        c[2] += record.rows
+    for name, factors, rows in sorted(flat.classes(), key=lambda c: int(c[1].min())):
+        c = sums.setdefault(name, [0.0, 0, 0])
+        c[0] += sum(chi2[factors].tolist())
+        c[1] += len(factors)
+        c[2] += int(rows.sum())
     unknowns: dict[str, int] = {}
     for word, kind in KINDS.items():
         free = lay.stop(word) - lay.start(word)

@@ -287,19 +287,8 @@ class Values:
         return Layout(self.dim, tuple(self.count(w) for w in KINDS), self.landmark_ids)
 
     def retract(self, step: Array) -> Values:
-        """Values after a step ``(layout.size,)``: poses (and the datum of the plane) ``T ∘ Exp(ξ)``, all else plus."""
-        new, c = {}, 0
-        for word, kind in KINDS.items():
-            rows, d = self[word], kind.dof(self.dim)
-            free = rows[1:] if word == "x" else rows
-            part = step[c : c + d * len(free)].reshape(len(free), d)
-            c += d * len(free)
-            if not len(rows):
-                continue
-            g = kind.pose_group(self.dim)
-            moved = free + part if g is None else g.compose(free, g.exp(part))
-            new[word] = np.concatenate([rows[:1], moved]) if word == "x" else moved
-        return Values(self.dim, new, self.landmark_ids)
+        """See :meth:`Layout.retract`, with the first pose alone held."""
+        return self.layout().retract(self, step)
 
     def distance(self, other: Values) -> float:
         """Greatest difference of any number."""
@@ -311,34 +300,74 @@ class Values:
 
 
 class Layout:
-    """Columns: kinds in the order of :data:`KINDS`, rows in their order; ``x0`` has none.
+    """Columns of the free scalars: kinds in the order of :data:`KINDS`, rows in their order, unless told otherwise.
 
     Parameters
     ----------
     dim : int
         2 or 3.
     counts : tuple of int
-        Rows of every kind, those of ``x`` with the fixed first base.
+        Rows of every kind, held poses included.
     landmark_ids : (n,) int64
         In row order.
+    fixed : tuple of int
+        Rows of ``x`` that are held: they have no columns. In a graph of submaps that is ``x0``.
+    order : (v,) int, optional
+        Variables, counted through all kinds, in the order of their columns: an order of elimination, say. Held ones
+        are left out.
     """
 
-    def __init__(self, dim: int, counts: tuple[int, ...], landmark_ids: Index) -> None:
+    def __init__(
+        self,
+        dim: int,
+        counts: tuple[int, ...],
+        landmark_ids: Index,
+        fixed: tuple[int, ...] = (0,),
+        order: Index | None = None,
+    ) -> None:
         self.dim = dim
         self.counts = counts
         self.landmark_ids = landmark_ids
+        self.fixed = fixed
+        self._order = order
         self._start: dict[str, int] = {}
         c = 0
         for (word, kind), n in zip(KINDS.items(), counts):
             self._start[word] = c
-            c += kind.dof(dim) * (max(n - 1, 0) if word == "x" else n)
+            c += kind.dof(dim) * (n - min(len(fixed), n) if word == "x" else n)
         self.size: int = c
         """Number of free scalars (``states``)."""
+
+    @cached_property
+    def _first(self) -> dict[str, Index]:
+        """By kind, the first column of every row; -1 of a held one."""
+        width = np.repeat([k.dof(self.dim) for k in KINDS.values()], self.counts)
+        free = np.ones(len(width), dtype=bool)
+        free[list(self.fixed[: len(width)])] = False  # poses come first
+        order = np.flatnonzero(free) if self._order is None else self._order
+        first = np.full(len(width), -1, dtype=np.int64)
+        first[order] = np.cumsum(width[order]) - width[order]
+        return dict(zip(KINDS, np.split(first, np.cumsum(self.counts)[:-1])))
+
+    def retract(self, values: Values, step: Array) -> Values:
+        """Values after a step ``(size,)``: poses (and the datum of the plane) ``T ∘ Exp(ξ)``, all else plus."""
+        new = {}
+        for word, kind in KINDS.items():
+            rows = values[word]
+            if not len(rows):
+                continue
+            first = self._first[word]
+            free = first >= 0
+            part = step[first[free, None] + np.arange(kind.dof(self.dim))]
+            g = kind.pose_group(self.dim)
+            new[word] = rows.copy()
+            new[word][free] = rows[free] + part if g is None else g.compose(rows[free], g.exp(part))
+        return Values(self.dim, new, values.landmark_ids)
 
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, Layout)
-            and (self.dim, self.counts) == (other.dim, other.counts)
+            and (self.dim, self.counts, self.fixed) == (other.dim, other.counts, other.fixed)
             and np.array_equal(self.landmark_ids, other.landmark_ids)
         )
 
@@ -354,14 +383,24 @@ class Layout:
 
     def stop(self, word: str) -> int:
         """Column behind the last one of a kind."""
-        rows = self.count(word) - (word == "x")
+        rows = self.count(word) - (len(self.fixed) if word == "x" else 0)
         return self._start[word] + KINDS[word].dof(self.dim) * max(rows, 0)
 
+    def first(self, word: str, rows: npt.ArrayLike) -> Index:
+        """First column of rows ``(k,)`` of a kind; -1 of held poses, -2 for negative rows (a variable left out)."""
+        r = np.asarray(rows, dtype=np.int64)
+        have = self._first[word]
+        return np.where(r < 0, -2, have[np.maximum(r, 0)] if len(have) else -2)
+
     def at(self, word: str, rows: npt.ArrayLike) -> Index:
-        """Columns ``(k, dof)`` of rows ``(k,)`` of a kind; -1 for negative rows, and for the fixed first base."""
-        d = KINDS[word].dof(self.dim)
-        r = np.asarray(rows, dtype=np.int64)[..., None] - (word == "x")
-        return np.where(r < 0, -1, self._start[word] + d * r + np.arange(d))
+        """Columns ``(k, dof)`` of rows ``(k,)`` of a kind; -1 for negative rows and for held poses."""
+        first = self.first(word, rows)[..., None]
+        return np.where(first < 0, -1, first + np.arange(KINDS[word].dof(self.dim)))
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the columns are in an order of elimination."""
+        return self._order is not None
 
     @property
     def nodes(self) -> int:
@@ -384,16 +423,14 @@ class Layout:
         return {i: r for r, i in enumerate(self.landmark_ids.tolist())}
 
     def names(self) -> list[str]:
-        """Names of the variables in column order."""
+        """Names of the free variables in the order of their columns."""
         out: list[str] = []
         for (word, kind), n in zip(KINDS.items(), self.counts):
-            if word == "l":
-                out += [f"l{i}" for i in self.landmark_ids.tolist()]
-            elif kind.single:
-                out += [word] * n
-            else:
-                out += [f"{word}{k}" for k in range(word == "x", n)]
-        return out
+            numbers = self.landmark_ids.tolist() if word == "l" else range(n)
+            out += [word] * n if kind.single else [f"{word}{k}" for k in numbers]
+        first = np.concatenate(list(self._first.values()))
+        order = np.argsort(first, kind="stable")
+        return [out[k] for k in order[first[order] >= 0].tolist()]
 
     def owner_of_columns(self) -> list[str]:
         """Name of the variable that each column belongs to."""
@@ -415,7 +452,7 @@ class Layout:
         return c[c >= 0].astype(np.intp)
 
     def pose_columns(self, nodes: npt.ArrayLike) -> Index:
-        """Columns ``(k, dof)`` of nodes ``(k,)``; -1 for the fixed first base."""
+        """Columns ``(k, dof)`` of nodes ``(k,)``; -1 for held ones."""
         return self.at("x", nodes)
 
     def columns_of(self, names: Iterable[str]) -> npt.NDArray[np.intp]:

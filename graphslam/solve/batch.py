@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -14,8 +14,26 @@ from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values
-from graphslam.solve.levenberg import LevenbergConfig, Optimum, newton_step, optimise
+from graphslam.solve.descent import Limits, Optimum, polish
 from graphslam.solve.solution import Solution, make_solution
+from graphslam.solve.sparse import PcgProblem, SparseProblem
+
+
+@dataclass(frozen=True, slots=True)
+class LevenbergConfig:
+    """When to stop.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Gauss-Newton and damped steps together.
+    tolerance : float
+        Converged when the Newton decrement ``gᵀ A⁻¹ g``, the decrease that the quadratic model still promises, is at
+        most ``tolerance · (1 + objective)``.
+    """
+
+    max_iterations: int = 100
+    tolerance: float = 1e-12
 
 
 class BatchSolver:
@@ -54,9 +72,13 @@ class BatchSolver:
         """Solve until nothing is left to gain."""
         self._solve(self.config)
 
+    def problem(self) -> SparseProblem:
+        """What the graph holds now, with the way to make its steps."""
+        return SparseProblem(self.graph.flat())
+
     def _solve(self, config: LevenbergConfig) -> None:
         t0 = time.perf_counter()
-        optimum = optimise_graph(self.graph, config)
+        optimum = optimise_graph(self.graph, config, self.problem())
         self.graph.set_values(optimum.values)
         self.iterations += optimum.iterations
         self.seconds += time.perf_counter() - t0
@@ -82,8 +104,48 @@ class BatchSolver:
         )
 
 
-def optimise_graph(graph: PoseGraph, config: LevenbergConfig | None = None) -> Optimum:
+class PcgSolver(BatchSolver):
+    """Batch solving by preconditioned conjugate gradients: for graphs too large to factorise."""
+
+    name = "pcg"
+
+    def problem(self) -> SparseProblem:
+        """See :meth:`BatchSolver.problem`."""
+        return PcgProblem(self.graph.flat())
+
+
+def optimise(problem: SparseProblem, values: Values, config: LevenbergConfig | None = None) -> Optimum:
+    """Minimise a problem from ``values``: Gauss–Newton steps while they help, damped ones when they do not.
+
+    Raises
+    ------
+    IndeterminateError
+        It does not determine its variables (:meth:`PoseGraph.diagnose` names them).
+    SolverError
+        The objective is not finite at the start.
+    """
+    cfg = config or LevenbergConfig()
+    initial = problem.objective(values)
+    if not np.isfinite(initial):
+        raise SolverError(f"objective is {initial} at the initial values; a factor or a value is not finite")
+    if problem.flat.layout.size == 0:
+        return Optimum(values, initial, initial, 0.0, 0, "converged")
+    limits = Limits(cfg.tolerance, cfg.tolerance, patience=1)
+    found = polish(problem, values, max_iterations=cfg.max_iterations, limits=limits)
+    if not np.isfinite(found.decrement):
+        raise IndeterminateError("the Gauss-Newton matrix is singular")
+    return found
+
+
+def optimise_graph(
+    graph: PoseGraph, config: LevenbergConfig | None = None, problem: SparseProblem | None = None
+) -> Optimum:
     """Optimum of a graph from its present values; the graph is not changed.
+
+    Parameters
+    ----------
+    problem : SparseProblem, optional
+        How its steps are made; by direct solves if not given.
 
     Raises
     ------
@@ -91,7 +153,7 @@ def optimise_graph(graph: PoseGraph, config: LevenbergConfig | None = None) -> O
         Names the unconstrained variables and what would fix them.
     """
     try:
-        return optimise(graph.flat(), graph.values, config)
+        return optimise(problem or SparseProblem(graph.flat()), graph.values, config)
     except IndeterminateError:
         graph.diagnose().raise_if_bad()
         raise
@@ -105,14 +167,14 @@ def linearisation_gap(graph: PoseGraph) -> float:
 
 def state_of(graph: PoseGraph) -> Optimum:
     """The present values seen as an (unconverged) optimum: objective, and the decrease still promised."""
-    flat = graph.flat()
-    system = flat.evaluate(graph.values)
-    try:
-        _, decrement = newton_step(system)
-    except IndeterminateError:
+    problem = SparseProblem(graph.flat())
+    objective, decrement = problem.objective(graph.values), 0.0
+    if graph.flat().layout.size:
+        decrement = problem.decrement(graph.values)
+    if not np.isfinite(decrement):
         graph.diagnose().raise_if_bad()
-        raise
-    return Optimum(graph.values, system.objective, system.objective, decrement, 0, False, system.chi2)
+        raise IndeterminateError("the Gauss-Newton matrix is singular")
+    return Optimum(graph.values, objective, objective, decrement, 0, "stalled")
 
 
 def optimise_with_gtsam(graph: PoseGraph, *, max_iterations: int = 100) -> tuple[Values, float]:

@@ -24,9 +24,9 @@ from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import NO_KERNEL
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.batch import BatchSolver
-from graphslam.solve.levenberg import LevenbergConfig, optimise
+from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise
 from graphslam.solve.solution import Solution
+from graphslam.solve.sparse import SparseProblem
 
 logger = logging.getLogger(__name__)
 
@@ -124,20 +124,20 @@ def outliers(
         return []
     mu = 1.0 / max(2.0 * worst - 1.0, 1e-6)
     for _ in range(cfg.max_rounds):
-        w[doubtful] = _weights(d2[doubtful] / limit[doubtful], mu)
+        w[doubtful] = truncation_weights(d2[doubtful] / limit[doubtful], mu)
         try:
-            optimum = optimise(flat, values, solver, weights=w)
+            optimum = optimise(SparseProblem(flat, w), values, solver)
         except IndeterminateError:  # so much is doubted that the rest does not hold together
             break
         values, d2 = optimum.values, flat.evaluate(optimum.values, hessian=False).chi2
         if np.all((w < 1e-3) | (w > 1.0 - 1e-3)) and mu > 1.0:
             break
         mu *= cfg.growth
-    w[doubtful] = _weights(d2[doubtful] / limit[doubtful], max(mu, 1e3))
+    w[doubtful] = truncation_weights(d2[doubtful] / limit[doubtful], max(mu, 1e3))
     return [(records[k], float(d2[k]), float(limit[k])) for k in np.flatnonzero(doubtful & (w < 0.5))]
 
 
-def _weights(ratio: Array, mu: float) -> Array:
+def truncation_weights(ratio: Array, mu: float) -> Array:
     """Weights of truncated least squares by the ratio of χ² to its limit (Yang et al., eq. 14)."""
     low, high = mu / (mu + 1.0), (mu + 1.0) / mu
     between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from graphslam.core.errors import UnknownNameError
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.batch import BatchSolver
+from graphslam.solve.batch import BatchSolver, PcgSolver
 from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.solution import Solution
@@ -39,7 +39,13 @@ class Solver(Protocol):
         ...
 
 
-SOLVERS: dict[str, type] = {"isam2": Isam2Solver, "batch": BatchSolver, "lm": BatchSolver, "gnc": GncSolver}
+SOLVERS: dict[str, type] = {
+    "isam2": Isam2Solver,
+    "batch": BatchSolver,
+    "lm": BatchSolver,
+    "gnc": GncSolver,
+    "pcg": PcgSolver,
+}
 
 
 def make_solver(name: str, graph: PoseGraph, **options: Any) -> Solver:

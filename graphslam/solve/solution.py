@@ -20,7 +20,7 @@ from graphslam.graph.flat import FlatGraph
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
 from graphslam.graph.score import Score, score
 from graphslam.graph.variables import Values, vector_form
-from graphslam.solve.levenberg import Optimum
+from graphslam.solve.descent import Optimum
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def make_solution(
     return Solution(
         solver=solver,
         values=optimum.values.copy(),
-        score=score(flat, optimum.chi2),
+        score=score(flat, flat.evaluate(optimum.values, hessian=False).chi2),
         iterations=iterations,
         converged=optimum.decrement <= CONVERGED * max(1.0, optimum.objective),
         decrement=optimum.decrement,

@@ -16,7 +16,7 @@ from graphslam.association.consistent_set import (
     pair_chi2,
 )
 from graphslam.core.errors import ConfigError, CovarianceError, GeometryError
-from graphslam.solve.network.model import between, compose, exp, inverse
+from tests.reference.plain_network import between, compose, exp, inverse
 from tests.reference.slow_loops import cycle_chi2, largest_clique
 
 

@@ -26,9 +26,9 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.factors import from_values, to_graph, to_values
-from graphslam.solve.network.model import edge_costs
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import odometry_start
+from tests.reference.plain_network import edge_costs
 from tests.reference.wrong_loops import WrongLoops, add_wrong_loops, is_odometry
 
 FILES = ("input_M3500_g2o", "parking-garage", "sphere2500")

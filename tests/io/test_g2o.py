@@ -89,7 +89,7 @@ def test_what_we_write_gtsam_reads_the_same(tmp_path: Path, data_dir: Path) -> N
     write_g2o(tmp_path / "g.g2o", net)
     graph, values = gtsam.readG2o(str(tmp_path / "g.g2o"), True)
     ours = to_graph(net)
-    mine = to_values(net, *canonical_start(net))
+    mine = to_values(net, canonical_start(net).poses, canonical_start(net).landmarks)
     # ours has one gauge prior more, with residual zero at the file's values
     assert graph.size() == ours.size() - 1
     assert graph.error(values) == pytest.approx(ours.error(mine), rel=1e-9)
@@ -202,7 +202,8 @@ def test_victoria_park_graph_is_read_as_gtsam_reads_it(tmp_path: Path, data_dir:
     assert (len(net), len(net.edges), len(net.landmark_ids), len(net.observations)) == (6969, 6968, 151, 3640)
     (tmp_path / "vp.txt").write_bytes(gzip.decompress(path.read_bytes()))
     graph, _ = gtsam.load2D(str(tmp_path / "vp.txt"))
-    poses, marks = canonical_start(net)
+    start = canonical_start(net)
+    poses, marks = start.poses, start.landmarks
     values = gtsam.Values()
     for vertex, pose in zip(net.ids, poses, strict=True):
         values.insert(int(vertex), gtsam.Pose2(*pose))

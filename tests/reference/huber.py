@@ -14,9 +14,10 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.network import values_of
+from graphslam.solve.descent import polish
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.descent import polish
-from graphslam.solve.network.model import edge_costs
+from tests.reference.plain_network import edge_costs
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +77,14 @@ def huber_least_squares(
     if len(network.observations):
         raise ConfigError("Huber's loss is for edges only; the network has landmark observations")
     now = np.array(poses, dtype=np.float64)
-    none = np.zeros((0, 2))
     costs = edge_costs(network, now)
     cost = _huber(costs, trusted, k)
     for count in range(1, rounds + 1):
         weights = np.where(trusted, 1.0, np.minimum(1.0, k / np.sqrt(np.maximum(costs, 1e-300))))
         weighted = replace(network, information=weights[:, None, None] * network.information)
         problem = BatchProblem(weighted)
-        moved = problem.arrays(polish(problem, problem.values(now, none), max_iterations=3).values)[0]
+        end = polish(problem, problem.pack(values_of(network, now)), max_iterations=3)
+        moved = problem.unpack(end.values).poses
         costs = edge_costs(network, moved)
         fresh = _huber(costs, trusted, k)
         fall, cost, now = cost - fresh, min(fresh, cost), moved if fresh <= cost else now

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.model import Layout, compose, edge_residuals, exp, linearise, square_root
+from tests.reference.plain_network import Layout, compose, edge_residuals, exp, linearise, square_root
 
 
 def least(J: Array, r: Array) -> float:

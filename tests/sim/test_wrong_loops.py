@@ -12,7 +12,7 @@ from graphslam.association.consistent_set import Chain, LoopArrays, pair_chi2
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
-from graphslam.solve.network.model import between, compose, edge_costs, exp
+from tests.reference.plain_network import between, compose, edge_costs, exp
 from tests.reference.wrong_loops import Kind, add_wrong_loops, is_odometry
 
 

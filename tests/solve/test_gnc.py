@@ -82,4 +82,4 @@ def test_without_outliers_it_is_least_squares(rng, dim):
 def test_settings_that_cannot_work_are_refused():
     with pytest.raises(ConfigError, match="cannot work"):
         GncConfig(growth=1.0)
-    assert set(SOLVERS) == {"isam2", "batch", "lm", "gnc"}
+    assert set(SOLVERS) == {"isam2", "batch", "lm", "gnc", "pcg"}

@@ -11,11 +11,12 @@ from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
 from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
 from graphslam.graph.factors.landmark_submap import SubmapBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
+from graphslam.graph.factors.sighting import SightingBatch
 
 for _batch in (
     *(SubmapBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
-    *(RangeBatch, BeaconRangeBatch),
+    *(RangeBatch, BeaconRangeBatch, SightingBatch),
 ):
     register_factor(_batch)

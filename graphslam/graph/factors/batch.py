@@ -10,8 +10,9 @@ else a custom factor that calls the batch on one row. A record of a kind that no
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, Self
 
 import gtsam
 import numpy as np
@@ -63,6 +64,23 @@ def offsets(lengths: Sequence[int] | Index) -> Index:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
 
+class LazyRecords(Sequence[Any]):
+    """Records of factors that stand in arrays, each made when somebody asks for it."""
+
+    def __init__(self, count: int, make: Callable[[int], Any]) -> None:
+        self._count, self._make = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, k: Any) -> Any:
+        if isinstance(k, slice):
+            return [self._make(i) for i in range(*k.indices(self._count))]
+        if not -self._count <= k < self._count:
+            raise IndexError(k)
+        return self._make(int(k) % self._count)
+
+
 class FactorBatch(ABC):
     """All factors of one kind.
 
@@ -74,10 +92,10 @@ class FactorBatch(ABC):
 
     Attributes
     ----------
-    widths : (k,) int
-        Columns of each factor, fixed ones included.
-    columns : (Σ widths,) int
-        Where they are in the layout; -1 = fixed.
+    arity : (k,) int
+        Variables of each factor, held ones and ones left out included.
+    first, width : (Σ arity,) int
+        First column of each of these in the layout (-1: held, -2: left out), and its degrees of freedom.
     code, k : (k,)
         Robust kernel of each (:func:`~graphslam.graph.noise.robust_terms`).
     """
@@ -85,18 +103,44 @@ class FactorBatch(ABC):
     record: ClassVar[type]
     prior: ClassVar[bool] = False
     """A factor of this kind ties its variables to known values although no other factor meets them."""
+    group: str | None = None
+    """Class of all of them, where they were made from arrays."""
+    arity: Index
+    first: Index
+    width: Index
 
     def __init__(self, records: Sequence[Any], layout: Layout) -> None:
-        self.records = list(records)
+        self.records = records
         self.layout = layout
         kernels = [getattr(r, "robust", NO_KERNEL) for r in records]
         self.code = np.array([r.code for r in kernels], dtype=np.int64)
         self.k = np.array([r.k for r in kernels])
-        self.widths: Index = np.zeros(0, dtype=np.int64)
-        self.columns: Index = np.zeros(0, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.records)
+
+    @property
+    def columns(self) -> Index:
+        """Columns of the scalars of all variables, factor by factor; -1 where there is none."""
+        within = np.arange(self.width.sum()) - np.repeat(np.cumsum(self.width) - self.width, self.width)
+        first = np.repeat(self.first, self.width)
+        return np.where(first < 0, -1, first + within)
+
+    @cached_property
+    def rows(self) -> Index:
+        """Dimension of the residual of each ``(k,)``."""
+        return np.array([r.rows for r in self.records], dtype=np.int64)
+
+    def classes(self) -> Iterator[tuple[str, Index]]:
+        """Classes of factors in here, with the numbers of their factors."""
+        if self.group is not None:
+            yield self.group, np.arange(len(self))
+            return
+        members: dict[str, list[int]] = {}
+        for k, r in enumerate(self.records):
+            members.setdefault(r.group, []).append(k)
+        for name, numbers in members.items():
+            yield name, np.array(numbers, dtype=np.int64)
 
     @abstractmethod
     def squared(self, values: Values) -> Array:
@@ -134,18 +178,36 @@ class UniformBatch(FactorBatch):
 
     def __init__(self, records: Sequence[Any], layout: Layout) -> None:
         super().__init__(records, layout)
-        self.dim = layout.dim
         keys = np.array([[-1 if k is None else k for k in self.keys(r)] for r in records], dtype=np.int64)
-        self._rows = keys.reshape(-1, len(self.slots))
+        rows = keys.reshape(-1, len(self.slots))
         for s, word in enumerate(self.slots):
             if word == "l":
-                self._rows[:, s] = [layout.row_of.get(k, -1) for k in self._rows[:, s].tolist()]
-        columns = [layout.at(word, self._rows[:, s]) for s, word in enumerate(self.slots)]
-        every = np.concatenate([c.reshape(len(records), -1) for c in columns], axis=1)
-        self.columns = every.ravel()
-        self.widths = np.full(len(self), every.shape[1], dtype=np.int64)
+                rows[:, s] = [layout.row_of.get(k, -1) for k in rows[:, s].tolist()]
         d = records[0].rows if records else 0
-        self.whiteners = np.array([self.whitener(r) for r in records]).reshape(len(records), d, d)
+        self._fill(layout, rows, np.array([self.whitener(r) for r in records]).reshape(len(records), d, d))
+
+    @classmethod
+    def _bare(cls, rows: Index, whiteners: Array, layout: Layout, group: str, record: Callable[[int], Any]) -> Self:
+        """A batch from arrays, to which the kind adds its measurements; ``record`` makes a record for messages."""
+        out = cls.__new__(cls)
+        out.records, out.layout, out.group = LazyRecords(len(rows), record), layout, group
+        out.code, out.k = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), NO_KERNEL.k)
+        out._fill(layout, np.asarray(rows, dtype=np.int64), whiteners)
+        out.__dict__["rows"] = np.full(len(rows), whiteners.shape[-1], dtype=np.int64)
+        return out
+
+    def _fill(self, layout: Layout, rows: Index, whiteners: Array) -> None:
+        """Columns and noise of factors whose variables stand in ``rows`` ``(k, slots)``."""
+        self.dim, self._rows, self.whiteners = layout.dim, rows, whiteners
+        widths = [KINDS[word].dof(layout.dim) for word in self.slots]
+        self.arity = np.full(len(rows), len(widths), dtype=np.int64)
+        self.width = np.tile(np.array(widths, dtype=np.int64), len(rows))
+
+    @cached_property
+    def first(self) -> Index:  # type: ignore[override]
+        """See :class:`FactorBatch`."""
+        columns = [self.layout.first(word, self._rows[:, s]) for s, word in enumerate(self.slots)]
+        return np.stack(columns, axis=1).ravel()
 
     @staticmethod
     @abstractmethod
@@ -177,6 +239,10 @@ class UniformBatch(FactorBatch):
             out.append(np.where(absent[:, None], 0.0, block) if np.any(absent) else block)
         return out
 
+    def residuals(self, *blocks: Array) -> Array:
+        """The residuals ``(k, d)`` of :meth:`terms` alone; a kind may have a shorter way to them."""
+        return self.terms(*blocks)[0]
+
     def whitened(self, values: Values) -> tuple[Array, Array]:
         """Whitened residuals ``(k, d)`` and Jacobians ``(k, d, c)``."""
         r, J = self.terms(*self.gather(values))
@@ -184,18 +250,23 @@ class UniformBatch(FactorBatch):
 
     def squared(self, values: Values) -> Array:
         """``rᵀ Λ r`` ``(k,)``."""
-        return np.sum(self.whitened(values)[0] ** 2, axis=1) if len(self) else np.zeros(0)
+        if len(self) == 0:
+            return np.zeros(0)
+        return np.sum(np.einsum("kij,kj->ki", self.whiteners, self.residuals(*self.gather(values))) ** 2, axis=1)
 
     def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
         """See :meth:`FactorBatch.blocks`."""
         if len(self) == 0:
             return np.zeros(0)
+        if not hessian:
+            return robust_terms(self.squared(values), self.code, self.k)[0]
         r, J = self.whitened(values)
         loss, w = robust_terms(np.sum(r**2, axis=1), self.code, self.k)
-        if hessian:
-            Jt = np.swapaxes(J, 1, 2) * w[:, None, None]
-            H[H_offset[0] : H_offset[-1]] = (Jt @ J).ravel()
-            g[g_offset[0] : g_offset[-1]] = (Jt @ r[..., None]).ravel()
+        Jt = np.swapaxes(J, 1, 2)
+        if np.any(self.code):
+            Jt = Jt * w[:, None, None]
+        np.matmul(Jt, J, out=H[H_offset[0] : H_offset[-1]].reshape(J.shape[0], J.shape[2], -1))
+        g[g_offset[0] : g_offset[-1]] = (Jt @ r[..., None]).ravel()
         return loss
 
     @classmethod

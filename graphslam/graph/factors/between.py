@@ -8,10 +8,17 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, group_of
-from graphslam.graph.factors.batch import UniformBatch, gtsam_pose, safe_factor, with_kernel
+from graphslam.graph.factors.batch import (
+    Index,
+    UniformBatch,
+    gtsam_pose,
+    safe_factor,
+    with_kernel,
+)
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.variables import gtsam_key
 
@@ -60,10 +67,58 @@ class BetweenBatch(UniformBatch):
         self._group = SE2 if layout.dim == 2 else SE3
         self._T = np.array([r.T_ij for r in records]).reshape(-1, self._group.size)
 
+    @classmethod
+    def of_arrays(
+        cls,
+        ends: Index,
+        T_ij: Array,
+        whiteners: Array,
+        layout: Any,
+        *,
+        group: str = "between",
+        ids: npt.NDArray[Any] | None = None,
+    ) -> BetweenBatch:
+        """A batch without an object for each factor.
+
+        Parameters
+        ----------
+        ends : (m, 2) int
+            Rows of the nodes.
+        T_ij : (m, 3|7)
+        whiteners : (m, d, d)
+        group : str
+            Class of all of them.
+        ids : (m,) int, optional
+            Numbers of the factors; counted from 0 if not given.
+        """
+
+        def record(k: int) -> BetweenRecord:
+            i, j = ends[k].tolist()
+            return BetweenRecord(k if ids is None else int(ids[k]), i, j, T_ij[k], whiteners[k], group=group)
+
+        out = cls._bare(ends, whiteners, layout, group, record)
+        out._group, out._T = (SE2 if layout.dim == 2 else SE3), T_ij
+        return out
+
+    @property
+    def ends(self) -> Index:
+        """Rows ``(m, 2)`` of the nodes."""
+        return self._rows
+
+    @property
+    def measured(self) -> Array:
+        """``T_ij`` ``(m, 3|7)``."""
+        return self._T
+
     @staticmethod
     def keys(record: BetweenRecord) -> Sequence[int | None]:
         """From, to."""
         return record.i, record.j
+
+    def residuals(self, *blocks: Array) -> Array:
+        """See :meth:`UniformBatch.residuals`."""
+        G = self._group
+        return G.log(G.between(self._T, G.between(*blocks)))
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""

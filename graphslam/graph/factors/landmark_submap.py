@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_factor
-from graphslam.graph.normal_kernels import submap_blocks
 from graphslam.graph.variables import Layout, Values, gtsam_key
 
 _TWO_PI = 2.0 * math.pi
@@ -84,11 +83,13 @@ class SubmapBatch(FactorBatch):
         self._z_offset = offsets([len(r.z) for r in records])
         self._info = np.concatenate([np.zeros(0), *(r.information for r in records)])
         self._info_offset = offsets([len(r.z) ** 2 for r in records])
-        self.widths = 6 + 2 * np.diff(self._entry_offset)
-        # every submap: two poses, then its entries; the heads are put in front of the entries' flat columns
-        points = (layout.landmark_start + 2 * self._entry_row[:, None] + np.arange(2)).ravel()
-        heads = np.concatenate([layout.pose_columns(self._start), layout.pose_columns(self._start + 1)], axis=1).ravel()
-        self.columns = np.insert(points, np.repeat(2 * self._entry_offset[:-1], 6), heads)
+        entries = np.diff(self._entry_offset)
+        self.arity = 2 + entries
+        # every submap: two poses, then its entries
+        heads = np.repeat(self._entry_offset[:-1], 2)
+        poses = layout.first("x", np.stack([self._start, self._start + 1], axis=1)).ravel()
+        self.first = np.insert(layout.first("l", self._entry_row), heads, poses)
+        self.width = np.insert(np.full(len(ids), 2), heads, 3)
 
     def squared(self, values: Values) -> Array:
         """``rᵀ Λ r`` ``(k,)``."""
@@ -97,6 +98,8 @@ class SubmapBatch(FactorBatch):
 
     def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
         """See :meth:`FactorBatch.blocks`."""
+        from graphslam.graph.normal_kernels import submap_blocks  # numba takes a third of a second to load
+
         chi2 = np.zeros(len(self))
         if len(self) == 0:
             return chi2

@@ -1,7 +1,7 @@
 """Batch least squares on GTSAM's native factors, where plain numpy is slower (3-D) or loses digits (QR).
 
 GTSAM's LM returns the initial values without a word when the factorisation fails, so the iteration is driven from here
-(:mod:`~graphslam.solve.network.descent`).
+(:mod:`~graphslam.solve.descent`).
 """
 
 from __future__ import annotations
@@ -11,12 +11,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.descent import RELATIVE
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import RELATIVE
 from graphslam.solve.network.factors import from_values, to_graph, to_values
-from graphslam.solve.network.model import CHOLESKY_LIMIT, information_spread
 
+# Above this spread of information normal equations lose the small directions: QR instead of Cholesky.
+CHOLESKY_LIMIT = 1e10
 # A damped step that lowers the objective by less than this share of it is not worth another one of its kind.
 LITTLE = 1e-3
 # The trust region begins with this radius [m, rad]; shrinking it costs evaluations of the objective, no solves.
@@ -33,19 +36,20 @@ class BatchProblem:
         Which edges and observations enter; all of them if not given.
     """
 
-    def __init__(self, network: PoseNetwork, used: np.ndarray | None = None) -> None:
+    def __init__(self, network: PoseNetwork, used: np.ndarray | None = None, flat: FlatGraph | None = None) -> None:
         self.network = network
+        self.flat = problem_of_network(network, ordered=False) if flat is None else flat
         self.graph = to_graph(network, used)
         self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(self.graph)
         self.factorization = "QR" if information_spread(network) > CHOLESKY_LIMIT else "CHOLESKY"
 
-    def values(self, poses: Array, landmarks: Array) -> gtsam.Values:
-        """Arrays to GTSAM values."""
-        return to_values(self.network, poses, landmarks)
+    def pack(self, values: Values) -> gtsam.Values:
+        """Values as GTSAM holds them."""
+        return to_values(self.network, values.poses, values.landmarks)
 
-    def arrays(self, values: gtsam.Values) -> tuple[Array, Array]:
-        """GTSAM values to arrays."""
-        return from_values(self.network, values)
+    def unpack(self, values: gtsam.Values) -> Values:
+        """GTSAM's values as ours."""
+        return values_of(self.network, *from_values(self.network, values))
 
     def objective(self, values: gtsam.Values) -> float:
         """``Σ rᵀ Ω r`` (GTSAM's error is half of it)."""
@@ -128,3 +132,10 @@ def _downhill(
         if small:
             return values, taken, step + 1
     return values, taken, budget
+
+
+def information_spread(network: PoseNetwork) -> float:
+    """Ratio of the extreme positive eigenvalues of all information matrices."""
+    parts = [np.linalg.eigvalsh(i).ravel() for i in (network.information, network.observation_information)]
+    w = np.concatenate(parts)
+    return float(w.max(initial=0.0)) / float(w.min(initial=np.inf, where=w > 0.0))

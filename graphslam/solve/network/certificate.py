@@ -30,9 +30,10 @@ import scipy.sparse.linalg as spla
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.descent import SAME, polish
+from graphslam.graph.network import values_of
+from graphslam.solve.descent import SAME, polish
 from graphslam.solve.network.multistart import make_problem
-from graphslam.solve.network.sparse import factor
+from graphslam.solve.sparse import factor
 
 Verdict = Literal["certified", "not certified", "not known"]
 # S is taken for positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
@@ -111,9 +112,8 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
         lowest = smallest_eigenvalue(S) if negative else _least_bound(S)
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
-    start = _poses_of(X, network)
     problem = make_problem(network)
-    back = polish(problem, problem.values(start, np.zeros((0, 2)))).objective
+    back = polish(problem, problem.pack(values_of(network, _poses_of(X, network)))).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)
     word = "lower" if back < objective else "higher"

@@ -21,10 +21,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graphslam.association.consistent_set import Chain, LoopArrays, chain_chi2, pair_chi2
-from graphslam.core import se3
-from graphslam.core.geometry import Array, se2_adjoint, se2_inverse
+from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.start import identity
+from graphslam.core.poses import group_of
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -94,7 +93,7 @@ def chain_of(network: PoseNetwork, odometry: Mask) -> Chain:
     rows = np.flatnonzero(odometry)
     loops = LoopArrays.of(_blank(network), network.edges[rows], network.measurements[rows], np.zeros((len(rows), d, d)))
     at, first = np.unique(loops.ends[:, 0], return_index=True)
-    increments, covariances = identity(network, n - 1), np.zeros((n - 1, d, d))
+    increments, covariances = _identities(network, n - 1), np.zeros((n - 1, d, d))
     known = np.zeros(n - 1, dtype=np.bool_)
     information = network.information[rows[first]]
     w = np.linalg.eigvalsh(information)
@@ -110,9 +109,13 @@ def chain_of(network: PoseNetwork, odometry: Mask) -> Chain:
     return Chain.of(increments, covariances, known)
 
 
+def _identities(network: PoseNetwork, n: int) -> Array:
+    return np.tile(group_of(network.poses).identity, (n, 1))
+
+
 def _blank(network: PoseNetwork) -> Chain:
     n, d = len(network), network.tangent_dim
-    return Chain(identity(network, n), np.zeros((n, d, d)), np.zeros(n, dtype=np.int64))
+    return Chain(_identities(network, n), np.zeros((n, d, d)), np.zeros(n, dtype=np.int64))
 
 
 def loop_consensus(network: PoseNetwork) -> Consensus:
@@ -171,14 +174,11 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
 def _informative(chain: Chain, loops: LoopArrays) -> Mask:
     """Loops whose ends the chain does not tie far better than they do: those agree with anything near them."""
     a, b = loops.ends.T
-    home = se2_adjoint(se2_inverse(chain.poses[b])) if chain.tangent_dim == 3 else _home3(chain.poses[b])
+    g = group_of(chain.poses)
+    home = g.adjoint(g.inverse(chain.poses[b]))
     spread = home @ (chain.spread[b] - chain.spread[a]) @ np.swapaxes(home, 1, 2)
     ratio = np.trace(np.linalg.solve(loops.covariance, spread), axis1=1, axis2=2) / chain.tangent_dim
     return np.asarray((ratio > INFORMATIVE) | (chain.part[a] != chain.part[b]))
-
-
-def _home3(poses: Array) -> Array:
-    return se3.se3_adjoint(se3.se3_inverse(poses))
 
 
 def _largest(label: Ints, keep: Mask) -> Mask:

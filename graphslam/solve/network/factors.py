@@ -13,7 +13,7 @@ from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.se3 import matrix_to_quat, quat_normalize, quat_to_matrix
-from graphslam.solve.network.model import square_root
+from graphslam.graph.noise import whiteners
 
 LANDMARK = "l"
 
@@ -68,7 +68,7 @@ def _noise(information: Array) -> list[gtsam.noiseModel.Base]:
     d = information.shape[1]
     rows = np.ascontiguousarray(information).reshape(-1, d * d).view(np.dtype((np.void, 8 * d * d))).ravel()
     _, first, which = np.unique(rows, return_index=True, return_inverse=True)
-    models = [gtsam.noiseModel.Gaussian.SqrtInformation(R, True) for R in square_root(information[first])]
+    models = [gtsam.noiseModel.Gaussian.SqrtInformation(R, True) for R in whiteners(information[first])]
     return [models[k] for k in which.tolist()]
 
 

@@ -18,10 +18,10 @@ from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array, ArrayLike, rotation2, se2_adjoint, se2_compose, se2_inverse
 from graphslam.core.network import PoseNetwork
 from graphslam.core.records import LandmarkObservations
+from graphslam.graph.network import problem_of_network, values_of
 from graphslam.linear.symmetric_factor import SymmetricFactor
-from graphslam.solve.network.descent import is_converged, polish
-from graphslam.solve.network.model import Layout, linearise
-from graphslam.solve.network.sparse import SparseProblem
+from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.sparse import SparseProblem
 
 Ids = npt.NDArray[np.int64]
 
@@ -149,23 +149,20 @@ def full_batch(
         observation_kind="bearing-range",
         source="full batch",
     )
-    problem = SparseProblem(network)
-    best = polish(problem, (network.poses, network.landmarks), max_iterations=max_iterations)
-    x, l = problem.arrays(best.values)
-    objective = problem.objective((x, l))
-    if not np.isfinite(objective):
-        raise SolverError(f"full batch diverged: objective {objective}; wanted a finite one")
-    layout = Layout.of(network)
-    J, r = linearise(network, x, l, layout)
+    problem = SparseProblem(problem_of_network(network))
+    best = polish(problem, values_of(network, network.poses, network.landmarks), max_iterations=max_iterations)
+    if not np.isfinite(best.objective):
+        raise SolverError(f"full batch diverged: objective {best.objective}; wanted a finite one")
+    flat = problem_of_network(network, ordered=False)
     return FullBatch(
-        poses=se2_compose(x, se2_inverse(sensor)),
+        poses=se2_compose(best.values.poses, se2_inverse(sensor)),
         landmark_ids=ids,
-        landmarks=l,
-        objective=objective,
-        dof=len(r) - layout.size,
-        information=sp.csc_matrix(J.T @ J),
+        landmarks=best.values.landmarks,
+        objective=best.objective,
+        dof=network.residuals - network.states,
+        information=sp.csc_matrix(flat.evaluate(best.values, dense=False).A),
         iterations=best.iterations,
-        converged=is_converged(network, objective, problem.decrement((x, l))),
+        converged=limits_of(network.residuals).reached(best.objective, problem.decrement(best.values)),
         seconds=time.perf_counter() - start,
         sensor=np.asarray(sensor, dtype=np.float64),
     )

@@ -1,8 +1,8 @@
-"""A pose network fed to iSAM2 pose by pose, as a robot would have built it, and its linearisation gap closed on demand.
+"""A pose network fed to iSAM2 pose by pose, as a robot would have built it.
 
 iSAM2 (Kaess et al. 2012) keeps old linearisation points and stops solving where steps are small. With its default
-thresholds it is fast and *near* the optimum; how near is not something it knows. Here the gap is measured against the
-batch optimum, and closed by relinearising everything, which makes iSAM2 a Gauss-Newton iteration on its Bayes tree.
+thresholds it is fast and *near* the optimum; how near is not something it knows. So its estimate is a start of the
+descent, whose end the gap is measured against.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from tqdm import tqdm
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.network import PoseNetwork
+from graphslam.core.poses import group_of
 from graphslam.solve.network.factors import (
     anchor_factors,
     edge_factors,
@@ -28,7 +29,6 @@ from graphslam.solve.network.factors import (
     pose3_array,
     pose_values,
 )
-from graphslam.solve.network.model import compose, inverse
 from graphslam.solve.network.start import cartesian_observations, neighbours
 
 log = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
     for k, (v, _) in enumerate(network.observations.tolist()):
         seen_from[v].append(k)
     local, _ = cartesian_observations(network)
-    z, z_inv = network.measurements, inverse(network.measurements)
+    z, z_inv = network.measurements, group_of(network.poses).inverse(network.measurements)
     poses: dict[int, Array] = {}  # where each inserted vertex was thought to be when it was last looked up
     anchors = dict(zip(network.anchors.tolist(), anchor_factors(network), strict=True))
     known_marks: set[int] = set()
@@ -172,7 +172,7 @@ def _from_neighbour(
     near, edge = int(others[best]), links[best]
     if near not in fresh:
         poses[near] = _current(network, isam, near)
-    return np.asarray(compose(poses[near], z[edge] if ends[best, 1] == v else z_inv[edge]))
+    return np.asarray(group_of(z).compose(poses[near], z[edge] if ends[best, 1] == v else z_inv[edge]))
 
 
 def _current(network: PoseNetwork, isam: gtsam.ISAM2, k: int) -> Array:
@@ -180,41 +180,3 @@ def _current(network: PoseNetwork, isam: gtsam.ISAM2, k: int) -> Array:
         p = isam.calculateEstimatePose2(k)
         return np.array([p.x(), p.y(), p.theta()])
     return pose3_array(isam.calculateEstimatePose3(k))
-
-
-def relinearise_all(
-    network: PoseNetwork,
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    *,
-    factorization: str = "CHOLESKY",
-    tolerance: float = 1e-10,
-    max_updates: int = 30,
-) -> tuple[gtsam.Values, int]:
-    """Gauss-Newton on iSAM2's Bayes tree: thresholds zero, every variable relinearised at every update.
-
-    Stops when the objective no longer falls by ``tolerance`` of itself; an update that raises it is not taken.
-
-    Returns
-    -------
-    values : gtsam.Values
-        Best seen; never worse than what came in.
-    updates : int
-    """
-    options = Isam2Options(relinearize_threshold=0.0, relinearize_skip=1, factorization=factorization)
-    isam = gtsam.ISAM2(options.params())
-    best, lowest = values, graph.error(values)
-    try:
-        isam.update(graph, values)
-        for updates in range(1, max_updates + 1):
-            now = isam.calculateEstimate()
-            error = graph.error(now)
-            if not error < lowest:
-                return best, updates
-            drop, best, lowest = lowest - error, now, error
-            if drop <= tolerance * lowest:
-                return best, updates
-            isam.update()
-    except RuntimeError as error:
-        raise indeterminate(network, error) from None
-    return best, max_updates

@@ -12,10 +12,12 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.descent import SAME, Polished, Problem, polish
-from graphslam.solve.network.model import objective
-from graphslam.solve.network.sparse import MANY, SparseProblem
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import SAME, Optimum, Problem, polish
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
+from graphslam.solve.sparse import MANY, SparseProblem
 
 if TYPE_CHECKING:
     from graphslam.solve.network.batch import BatchProblem
@@ -104,14 +106,23 @@ def default_starts(network: PoseNetwork) -> tuple[str, ...]:
     return tuple(n for n in names if n != "file" or network.has_initial.all())
 
 
-def canonical_start(network: PoseNetwork) -> Start:
+def canonical_start(network: PoseNetwork) -> Values:
     """What the file says: its values where it has them all, else its odometry chain."""
-    return _file(network) or _odometry(network)
+    return values_of(network, *(_file(network) or _odometry(network)))
 
 
-def make_problem(network: PoseNetwork) -> Problem:
+def flat_of(network: PoseNetwork) -> FlatGraph:
+    """The problem of a network, in an order of elimination unless it is dissected later or GTSAM orders it."""
+    return problem_of_network(
+        network, ordered=network.dim == 2 and (len(network) <= MANY or len(network.landmark_ids) > 0)
+    )
+
+
+def make_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> Problem:
     """Plain numpy in 2-D and for many poses, where it beats GTSAM's factors; these for the rest of 3-D."""
-    return SparseProblem(network) if network.dim == 2 or len(network) > MANY else native_problem(network)
+    if network.dim == 2 or len(network) > MANY:
+        return SparseProblem(flat or flat_of(network))
+    return native_problem(network, flat)
 
 
 def native(network: PoseNetwork) -> bool:
@@ -119,21 +130,21 @@ def native(network: PoseNetwork) -> bool:
     return len(network.observations) == 0 or network.observation_kind == "bearing-range"
 
 
-def native_problem(network: PoseNetwork) -> BatchProblem:
+def native_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> BatchProblem:
     """The network as a GTSAM graph."""
     from graphslam.solve.network.batch import BatchProblem  # gtsam, which most files do not need
 
-    return BatchProblem(network)
+    return BatchProblem(network, flat=flat)
 
 
 @dataclass(frozen=True, slots=True)
-class Optimum:
+class Starts:
     """Best of the starts that were tried.
 
     Parameters
     ----------
     problem : Problem
-    best : Polished
+    best : Optimum
     start : str
         Which won.
     reports : tuple of StartReport
@@ -143,7 +154,7 @@ class Optimum:
     """
 
     problem: Problem
-    best: Polished
+    best: Optimum
     start: str
     reports: tuple[StartReport, ...]
     doubt: str = ""
@@ -154,7 +165,7 @@ class Optimum:
         return sum(r.iterations for r in self.reports)
 
 
-def doubt(problem: Problem, end: Polished) -> str:
+def doubt(network: PoseNetwork, problem: Problem, end: Optimum) -> str:
     """Why an answer may not be the best one, in words; empty if nothing speaks against it.
 
     * The descent did not end at a stationary point.
@@ -163,12 +174,11 @@ def doubt(problem: Problem, end: Polished) -> str:
     * χ² is beyond what the stated noise allows, and the cycles do not decide whether it is the noise or the answer.
     * Landmarks: their observations close loops that no cycle of edges shows.
     """
-    network = problem.network
     if end.status != "converged":
         return f"the first start did not converge ({end.status})"
     if len(network.observations):
         return "loops by landmarks show in no cycle of edges"
-    wound, undecided, cycles = wound_cycles(network, problem.arrays(end.values)[0])
+    wound, undecided, cycles = wound_cycles(network, problem.unpack(end.values).poses)
     if wound:
         return f"{wound} of {cycles} cycles turn once too often"
     dof = network.residuals - network.states
@@ -183,11 +193,12 @@ def best_of_starts(
     network: PoseNetwork,
     names: Sequence[str] | None = None,
     *,
-    given: dict[str, Start] | None = None,
+    given: dict[str, Values] | None = None,
+    flat: FlatGraph | None = None,
     problem: Problem | None = None,
-    certified: Callable[[Problem, Polished], bool] | None = None,
+    certified: Callable[[PoseNetwork, Problem, Optimum], bool] | None = None,
     progress: bool = False,
-) -> Optimum:
+) -> Starts:
     """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
 
     Parameters
@@ -195,10 +206,12 @@ def best_of_starts(
     names : sequence of str, optional
         Keys of :data:`STARTS`, all of which are tried. If not given: the first (of ``given``, then of
         :func:`default_starts`), and the others if there is :func:`doubt` that no certificate settles.
-    given : dict of str to (poses, landmarks), optional
+    given : dict of str to Values, optional
         Further starts, tried first.
+    flat : FlatGraph, optional
+        The network as a problem, where it was made already.
     problem : Problem, optional
-        How the network is solved; :func:`make_problem` if not given.
+        How it is solved; :func:`make_problem` if not given.
     certified : callable, optional
         Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
 
@@ -214,10 +227,10 @@ def best_of_starts(
         if name not in STARTS:
             raise UnknownNameError("start", name, STARTS)
     own = problem is None
-    problem = problem or make_problem(network)
+    problem = problem or make_problem(network, flat)
     given = given or {}
     offered = [*given, *(n for n in chosen if n not in given)]
-    best: Polished | None = None
+    best: Optimum | None = None
     winner = ""
     reports: list[StartReport] = []
     failure: IndeterminateError | None = None
@@ -226,36 +239,37 @@ def best_of_starts(
         if best is not None and network.residuals > LARGE and _agreed(reports, best.objective):
             break
         try:
-            start = given[name] if name in given else STARTS[name](network)
+            made = None if name in given else STARTS[name](network)
         except IndeterminateError as error:
             failure = error
             reports.append(StartReport(name, float("inf"), float("inf"), 0, "failed"))
             continue
-        if start is None:
+        if name not in given and made is None:
             continue
-        initial = objective(network, *start)
+        start = given[name] if made is None else values_of(network, *made)
+        initial = problem.flat.objective(start)
         twin = next((r for r in reports if abs(r.objective_initial - initial) <= TWIN * abs(initial)), None)
         if twin is not None:
             reports.append(StartReport(name, initial, twin.objective, 0, f"same as {twin.name}"))
             continue
         known = np.inf if best is None else best.objective
-        end = polish(problem, problem.values(*start), best_known=known, foretell=True)
+        end = polish(problem, problem.pack(start), best_known=known, foretell=True)
         if own and end.status in ("stalled", "out of iterations") and native(network) and not _is_native(problem):
             # GTSAM has more ways down: a trust region, and QR
-            problem = native_problem(network)
-            best = best and replace(best, values=problem.values(*best.values))
-            end = polish(problem, problem.values(*end.values), best_known=known, foretell=True)
+            problem = native_problem(network, problem.flat)
+            best = best and replace(best, values=problem.pack(best.values))
+            end = polish(problem, problem.pack(end.values), best_known=known, foretell=True)
         reports.append(StartReport(name, initial, end.objective, end.iterations, end.status))
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):
             best, winner = end, name
         if names is None and len(reports) == 1:
-            why = doubt(problem, end)
-            if not why or (certified is not None and end.status == "converged" and certified(problem, end)):
+            why = doubt(network, problem, end)
+            if not why or (certified is not None and end.status == "converged" and certified(network, problem, end)):
                 break
     if best is None:
         raise failure or IndeterminateError(f"{network.source}: no start could be made")
-    return Optimum(problem, best, winner, tuple(reports), why)
+    return Starts(problem, best, winner, tuple(reports), why)
 
 
 def _shown(names: list[str]) -> Iterable[str]:

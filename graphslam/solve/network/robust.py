@@ -23,11 +23,14 @@ from tqdm import tqdm
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.network import values_of
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import Optimum, polish
+from graphslam.solve.gnc import truncation_weights
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
-from graphslam.solve.network.descent import Polished, polish
 from graphslam.solve.network.diagnose import check_determined
-from graphslam.solve.network.model import edge_costs, observation_costs, subnetwork
 from graphslam.solve.network.settle import FEW, Settled, settle
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start
 
@@ -61,7 +64,7 @@ class Robust:
         Edges, then observations.
     problem : BatchProblem
         Of the inliers alone.
-    end : Polished
+    end : Optimum
         Its objective is that of the inliers.
     truncated : float
         Truncated cost here.
@@ -77,7 +80,7 @@ class Robust:
 
     inliers: Mask
     problem: BatchProblem
-    end: Polished
+    end: Optimum
     truncated: float
     limit: Array
     scale: float
@@ -85,9 +88,9 @@ class Robust:
     reached: dict[str, float]
 
 
-def truncated_cost(network: PoseNetwork, arrays: tuple[Array, Array], limit: Array) -> float:
-    """``Σ min(rᵀ Ω r, limit)`` over edges and observations."""
-    return float(np.minimum(_costs(network, *arrays), limit).sum())
+def truncated_cost(flat: FlatGraph, values: Values, limit: Array) -> float:
+    """``Σ min(rᵀ Ω r, limit)`` over all factors."""
+    return float(np.minimum(flat.squared(values), limit).sum())
 
 
 def truncated_least_squares(
@@ -143,9 +146,8 @@ def truncated_least_squares(
                 continue
             starts[name] = (begun, used)
             if noise_scale is None:
-                scale = min(
-                    _scale(network, problem.arrays(begun), used, believed), scale if len(starts) > 1 else np.inf
-                )
+                costs = problem.flat.squared(problem.unpack(begun))
+                scale = min(_scale(network, costs, used, believed), scale if len(starts) > 1 else np.inf)
     if not starts and trusted.any():
         used = trusted.copy()
         used[m:] = True
@@ -159,13 +161,13 @@ def truncated_least_squares(
         if name not in starts:
             continue
         values, believed = starts[name]
-        trimmed = _trim(network, values, _costs(network, *problem.arrays(values)) <= limit, limit)
+        trimmed = _trim(problem, values, problem.flat.squared(problem.unpack(values)) <= limit, limit)
         confirmed = (trimmed.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED
         if not (name == "consensus" and confirmed):
-            weights, annealed = _anneal(network, values, limit, believed)
-            trimmed = min(trimmed, _trim(network, annealed, weights > 0.5, limit), key=lambda t: t.cost)
+            weights, annealed = _anneal(problem, values, limit, believed)
+            trimmed = min(trimmed, _trim(problem, annealed, weights > 0.5, limit), key=lambda t: t.cost)
         best = settle(
-            network,
+            problem,
             trimmed.end.values,
             trimmed.inliers,
             limit,
@@ -181,30 +183,31 @@ def truncated_least_squares(
     limit = np.min([f.limit for _, f in found], axis=0)
     reached: dict[str, float] = {}
     for name, settled in found:
-        arrays = settled.problem.arrays(settled.end.values)
-        reached[name] = min(truncated_cost(network, arrays, limit), reached.get(name, np.inf))
+        cost = truncated_cost(problem.flat, problem.unpack(settled.end.values), limit)
+        reached[name] = min(cost, reached.get(name, np.inf))
     name, best = min(found, key=lambda f: reached[f[0]])
-    final = _trim(network, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
+    final = _trim(problem, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
     return Robust(final.inliers, final.problem, final.end, final.cost, best.limit, best.scale, name, reached)
 
 
 def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
     """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
-    part = subnetwork(problem.network, used)
+    part = problem.network.only(used)
+    inner = BatchProblem(part)
     try:
-        check_determined(part)
+        check_determined(part, inner.flat)
         if chordal and not len(part.observations):
             arrays = chordal_start(part)
         else:
             poses = odometry_start(part)
             arrays = poses, landmarks_from(part, poses)
-        return polish(BatchProblem(part), problem.values(*arrays), max_iterations=START_STEPS).values
+        return polish(inner, inner.pack(values_of(part, *arrays)), max_iterations=START_STEPS).values
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
 
 
-def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believed: Mask) -> float:
+def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> float:
     """True over stated variance of the loops, at most 1, from the median cost of those believed, after least squares.
 
     More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then,
@@ -216,7 +219,7 @@ def _scale(network: PoseNetwork, arrays: tuple[Array, Array], used: Mask, believ
     m = len(network.edges)
     rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
     left = max(rows - network.states, 1) / rows
-    costs = edge_costs(network, arrays[0])[believed]
+    costs = costs[:m][believed]
     costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
     if len(costs) < FEW:
         return 1.0
@@ -230,29 +233,27 @@ def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mas
     return limit
 
 
-def _anneal(network: PoseNetwork, values: gtsam.Values, limit: Array, believed: Mask) -> tuple[Array, gtsam.Values]:
+def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed: Mask) -> tuple[Array, gtsam.Values]:
     """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the values they lead to."""
-    m = len(network.edges)
-    problem = BatchProblem(network)
-    costs = _costs(network, *problem.arrays(values))
+    network, m = problem.network, len(problem.network.edges)
+
+    def ratio(values: gtsam.Values) -> Array:
+        return np.where(loose, problem.flat.squared(problem.unpack(values)) / np.where(loose, limit, 1.0), 0.0)
+
     loose = np.isfinite(limit)
-    ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
-    worst = float(min(ratio[believed].max(initial=0.0), WORST))
+    now = ratio(values)
+    worst = float(min(now[believed].max(initial=0.0), WORST))
     mu = 1.0 / max(2.0 * worst - 1.0, 1.0)
     weights = np.ones(len(limit))
     for _ in range(STAGES):
-        fresh = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
-        fresh[ratio <= mu / (mu + 1.0)] = 1.0
-        fresh[ratio >= (mu + 1.0) / mu] = 0.0
-        weights = np.where(loose, fresh, 1.0)
+        weights = np.where(loose, truncation_weights(now, mu), 1.0)
         weighted = replace(
             network,
             information=weights[:m, None, None] * network.information,
             observation_information=weights[m:, None, None] * network.observation_information,
         )
         values = polish(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
-        costs = _costs(network, *problem.arrays(values))
-        ratio = np.where(loose, costs / np.where(loose, limit, 1.0), 0.0)
+        now = ratio(values)
         if not ((weights > 0.0) & (weights < 1.0)).any():
             break
         mu *= GROWTH
@@ -263,27 +264,23 @@ def _anneal(network: PoseNetwork, values: gtsam.Values, limit: Array, believed: 
 class _Trimmed:
     inliers: Mask
     problem: BatchProblem
-    end: Polished
+    end: Optimum
     cost: float
 
 
 def _trim(
-    network: PoseNetwork, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
+    problem: BatchProblem, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
 ) -> _Trimmed:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
     Neither step raises the truncated cost, so it ends.
     """
     for _ in range(ROUNDS):
-        inner = BatchProblem(network, inliers)
+        inner = BatchProblem(problem.network, inliers, problem.flat)
         end = polish(inner, values, max_iterations=steps)
-        costs = _costs(network, *inner.arrays(end.values))
+        costs = problem.flat.squared(problem.unpack(end.values))
         fresh = costs <= limit
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values
     return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
-
-
-def _costs(network: PoseNetwork, poses: Array, landmarks: Array) -> Array:
-    return np.concatenate([edge_costs(network, poses), observation_costs(network, poses, landmarks)])

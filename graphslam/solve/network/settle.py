@@ -24,7 +24,7 @@ of the accepted D² is followed as far as it is populated (Hill 1975).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -34,22 +34,14 @@ from scipy import stats
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from graphslam.core import geometry as se2
-from graphslam.core import se3
 from graphslam.core.geometry import Array
-from graphslam.core.network import PoseNetwork
+from graphslam.core.poses import group_of
+from graphslam.graph.factors.between import BetweenBatch
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import Optimum, polish
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.descent import Polished, polish
-from graphslam.solve.network.model import (
-    Layout,
-    edge_costs,
-    edge_jacobians,
-    linearise,
-    observation_costs,
-    square_root,
-    subnetwork,
-)
-from graphslam.solve.network.sparse import factor
+from graphslam.solve.sparse import factor
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -86,7 +78,7 @@ class Settled:
         Edges, then observations.
     problem : BatchProblem
         Of the inliers alone.
-    end : Polished
+    end : Optimum
     limit : (m + k,)
         What D² was compared with; infinite for trusted edges.
     scale : float
@@ -97,7 +89,7 @@ class Settled:
 
     inliers: Mask
     problem: BatchProblem
-    end: Polished
+    end: Optimum
     limit: Array
     scale: float
     rounds: int
@@ -162,19 +154,20 @@ def groups_of(ends: npt.ArrayLike, near: int = NEAR) -> Ints:
 
 
 def loop_evidence(
-    network: PoseNetwork, inliers: Mask, rows: npt.ArrayLike, arrays: tuple[Array, Array], *, accepted: bool
+    flat: FlatGraph, inliers: Mask, rows: npt.ArrayLike, values: Values, *, accepted: bool
 ) -> tuple[Array, Array, Ints]:
     """``D²`` of loops and of their groups against the posterior of what is accepted, themselves left out.
 
     Parameters
     ----------
-    network : PoseNetwork
+    flat : FlatGraph
+        Edges come first.
     inliers : (m + k,) bool
         What is accepted.
     rows : (l,) int
         Edges, all of them accepted or all refused.
-    arrays : tuple
-        Poses and landmarks: a minimum of the accepted's objective.
+    values : Values
+        A minimum of the accepted's objective.
     accepted : bool
         Whether ``rows`` are among the inliers.
 
@@ -187,20 +180,22 @@ def loop_evidence(
         Which group.
     """
     at = np.asarray(rows, dtype=np.intp)
-    d, layout = network.tangent_dim, Layout.of(network)
-    label = groups_of(network.edges[at])
+    edges = flat.batches[0]
+    assert isinstance(edges, BetweenBatch)
+    d, layout = flat.layout.pose_dof, flat.layout
+    label = groups_of(edges.ends[at])
     order = np.argsort(label, kind="stable")
-    poses, marks = arrays
-    J, _ = linearise(subnetwork(network, inliers), poses, marks, layout)
-    lu = factor(sp.csc_matrix(J.T @ J))
-    ordered = replace(
-        subnetwork(network, np.zeros_like(inliers)),
-        edges=network.edges[at[order]],
-        measurements=network.measurements[at[order]],
-        information=network.information[at[order]],
+    lu = factor(sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A))
+    ordered = BetweenBatch.of_arrays(
+        edges.ends[at[order]], edges.measured[at[order]], edges.whiteners[at[order]], layout
     )
-    A, r = linearise(ordered, poses, marks, layout)
-    G = _common_motion(ordered, poses)
+    whole, J = ordered.whitened(values)
+    columns = np.broadcast_to(ordered.columns.reshape(len(at), 1, 2 * d), J.shape)
+    row = np.broadcast_to(np.arange(len(at) * d).reshape(-1, d, 1), J.shape)
+    free = columns >= 0
+    A = sp.csr_matrix((J[free], (row[free], columns[free])), shape=(len(at) * d, layout.size))
+    r = whole.ravel()
+    G = _common_motion(ordered, J, values.poses)
     single, group = np.empty(len(at)), np.empty(len(at))
     sign = -1.0 if accepted else 1.0
     for first, last in _chunks(label[order], max(COLUMNS // d, 1)):
@@ -232,21 +227,15 @@ def loop_evidence(
     return single[back], group[back], label
 
 
-def _common_motion(network: PoseNetwork, poses: Array) -> Array:
+def _common_motion(loops: BetweenBatch, J: Array, poses: Array) -> Array:
     """Whitened derivative ``(l d, d)`` of the loops' residuals by a motion of all later ends, a left tangent about the
     middle of their positions (the condition of what follows is better there than about the origin)."""
-    d = network.tangent_dim
+    g, ends = group_of(poses), loops.ends
     # a loop that runs back says the same of the inverse motion: the later end is the one that moves
-    later = np.max(network.edges, axis=1)
-    moved = poses[later].copy()
-    p = network.dim
-    moved[:, :p] -= moved[:, :p].mean(axis=0) if len(moved) else 0.0
-    ad = se2.se2_adjoint(se2.se2_inverse(moved)) if p == 2 else se3.se3_adjoint(se3.se3_inverse(moved))
-    _, J_i, J_j = edge_jacobians(network, poses)
-    blocks = square_root(network.information) @ np.where(
-        (network.edges[:, 0] > network.edges[:, 1])[:, None, None], J_i, J_j
-    )
-    return np.asarray((blocks @ ad).reshape(len(later) * d, d))
+    moved = poses[np.max(ends, axis=1)].copy()
+    moved[:, : g.dim] -= moved[:, : g.dim].mean(axis=0) if len(moved) else 0.0
+    blocks = np.where((ends[:, 0] > ends[:, 1])[:, None, None], J[:, :, : g.dof], J[:, :, g.dof :])
+    return np.asarray((blocks @ g.adjoint(g.inverse(moved))).reshape(len(ends) * g.dof, g.dof))
 
 
 def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
@@ -271,7 +260,7 @@ def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
 
 
 def settle(
-    network: PoseNetwork,
+    whole: BatchProblem,
     values: gtsam.Values,
     inliers: Mask,
     limit: Array,
@@ -283,7 +272,8 @@ def settle(
 
     Parameters
     ----------
-    network : PoseNetwork
+    whole : BatchProblem
+        Of all measurements.
     values : gtsam.Values
         Near a minimum of the inliers' objective.
     inliers : (m + k,) bool
@@ -295,6 +285,7 @@ def settle(
     own_tail : bool
         The limit of edges is the file's own (:func:`tail_limit`); that of ``limit`` if not.
     """
+    network, flat = whole.network, whole.flat
     m, d = len(network.edges), network.tangent_dim
     w = np.linalg.eigvalsh(network.information)
     judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
@@ -304,18 +295,19 @@ def settle(
     back = False
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
     for rounds in range(1, ROUNDS + 1):
-        problem = BatchProblem(network, inliers)
+        problem = BatchProblem(network, inliers, flat)
         end = polish(problem, values, max_iterations=STEPS)
-        values, arrays = end.values, problem.arrays(end.values)
+        values, here = end.values, problem.unpack(end.values)
         if back:
             break
         seen.add(inliers.tobytes())
         fresh = inliers.copy()
-        fresh[m:] = observation_costs(network, *arrays) <= limit[m:]
+        every = flat.squared(here)
+        fresh[m:] = every[m:] <= limit[m:]
         inside = np.flatnonzero(judged & inliers[:m])
         asked = inside[~(worst[inside] <= scale * dull)]
         if len(asked):
-            single[asked], group, _ = loop_evidence(network, inliers, asked, arrays, accepted=True)
+            single[asked], group, _ = loop_evidence(flat, inliers, asked, here, accepted=True)
             worst[asked] = np.maximum(single[asked], group)
         if len(inside):
             quantile = family_quantile(probability, len(inside))
@@ -327,7 +319,7 @@ def settle(
             bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())
             fresh[inside[bad]] = False
             worst[inside[bad]] = np.nan
-        costs = edge_costs(network, arrays[0])
+        costs = every[:m]
         partial = ~judged & np.isfinite(limit[:m])
         fresh[:m][partial] = costs[partial] <= limit[:m][partial]
         outside = np.flatnonzero(judged & ~inliers[:m])
@@ -337,11 +329,11 @@ def settle(
             # the dear ones only where nothing else changes: what the accepted do not hold may lie far off
             some = outside[first:last]
             if len(some) and (first == 0 or (fresh == inliers).all()):
-                against[some] = loop_evidence(network, inliers, some, arrays, accepted=False)[0]
+                against[some] = loop_evidence(flat, inliers, some, here, accepted=False)[0]
         # the group of a right loop is that of those that could be right: wrong ones may lie beside it
         good = outside[against[outside] <= limit[outside]]
         if len(good):
-            alone, group, _ = loop_evidence(network, inliers, good, arrays, accepted=False)
+            alone, group, _ = loop_evidence(flat, inliers, good, here, accepted=False)
             fresh[good[np.maximum(alone, group) <= limit[good]]] = True
         if (fresh == inliers).all() or rounds == ROUNDS:
             break

@@ -13,19 +13,23 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.descent import SAME, Polished, Problem, is_converged, polish
+from graphslam.core.poses import group_of
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import SAME, Optimum, Problem, limits_of, polish
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
-from graphslam.solve.network.model import objective, subnetwork
 from graphslam.solve.network.multistart import (
-    Optimum,
     StartReport,
+    Starts,
     best_of_starts,
     canonical_start,
     default_starts,
+    flat_of,
     native,
     native_problem,
 )
-from graphslam.solve.network.sparse import PcgProblem
+from graphslam.solve.sparse import PcgProblem
 
 if TYPE_CHECKING:
     from graphslam.solve.network.batch import BatchProblem
@@ -72,7 +76,7 @@ class NetworkSolution:
         Which start won.
     starts : tuple of StartReport
         What every start that was tried reached.
-    initial : tuple of (n, 3 | 7), (l, 2)
+    initial : Values
         What the file says.
     details : dict
         What only this solver has to say.
@@ -95,7 +99,7 @@ class NetworkSolution:
     gap: float
     start: str
     starts: tuple[StartReport, ...]
-    initial: tuple[Array, Array]
+    initial: Values
     details: dict[str, Any] = field(default_factory=dict)
     inliers: npt.NDArray[np.bool_] | None = None
     certificate: Certificate | None = None
@@ -103,12 +107,12 @@ class NetworkSolution:
     @property
     def objective_g2o(self) -> float:
         """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the same answer."""
-        return objective(self.network, self.poses, self.landmarks, "g2o")
+        return g2o_objective(self.network, values_of(self.network, self.poses, self.landmarks))
 
     @property
     def objective_g2o_initial(self) -> float:
         """g2o's objective at what the file says."""
-        return objective(self.network, *self.initial, "g2o")
+        return g2o_objective(self.network, self.initial)
 
     def to_network(self) -> PoseNetwork:
         """The network with the solution as its values, ready to be written."""
@@ -123,12 +127,25 @@ class NetworkSolution:
         )
 
 
+def g2o_objective(network: PoseNetwork, values: Values) -> float:
+    """``Σ rᵀ Ω r`` with g2o's residual of an edge: (x, y, θ), in 3-D (t, vec q), of the transform whose logarithm
+    GTSAM takes. The objective differs wherever a residual is not small."""
+    g, (i, j) = group_of(values.poses), network.edges.T
+    r = g.between(network.measurements, g.between(values.poses[i], values.poses[j]))
+    if network.dim == 3:
+        r = np.concatenate([r[:, 3:6], r[:, :3]], axis=1)
+    total = float(np.einsum("mi,mij,mj->m", r, network.information, r).sum())
+    if len(network.observations):
+        total += float(problem_of_network(network, ordered=False).squared(values)[len(r) :].sum())
+    return total
+
+
 @dataclass(frozen=True, slots=True)
 class _Answer:
     values: Any
-    arrays: tuple[Array, Array]
+    end: Values
     iterations: int
-    optimum: Optimum
+    optimum: Starts
     start: str
     details: dict[str, Any]
     # what the solver minimised, where that is not the whole objective
@@ -137,7 +154,7 @@ class _Answer:
     inliers: npt.NDArray[np.bool_] | None = None
 
 
-Solver = Callable[[PoseNetwork, Sequence[str] | None, dict[str, Any], bool], _Answer]
+Solver = Callable[[PoseNetwork, FlatGraph, Sequence[str] | None, dict[str, Any], bool], _Answer]
 
 
 def solve_network(
@@ -186,39 +203,40 @@ def solve_network(
     if starts is not None:
         starts = default_starts(network) if starts == "all" else [starts] if isinstance(starts, str) else list(starts)
     begin = time.perf_counter()
-    check_determined(network)
+    flat = flat_of(network)
+    check_determined(network, flat)
     initial = canonical_start(network)
-    check_full_rank(network, *initial)
-    answer = run(network, starts, options, progress)
-    poses, landmarks = answer.arrays
+    check_full_rank(network, flat, initial)
+    answer = run(network, flat, starts, options, progress)
     best = answer.optimum.best
-    value = best.objective if answer.values is best.values else objective(network, poses, landmarks)
+    value = best.objective if answer.values is best.values else flat.objective(answer.end)
     gap = value - best.objective
-    if answer.values is best.values and best.status == "converged":
+    if answer.values is best.values and best.converged:
         # judged where the descent ended: evaluated again one step on, a decrement at the limit may lie beyond it
         decrement, stationary = best.decrement, True
     else:
         decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
-        stationary = is_converged(network, value if answer.minimum is None else answer.minimum, decrement)
+        reached = limits_of(network.residuals).reached
+        stationary = reached(value if answer.minimum is None else answer.minimum, decrement)
     at_optimum = gap <= SAME * abs(best.objective) + 1e-12 * network.residuals
     shown = None
     if certificate:
         from graphslam.solve.network.certificate import certify
 
-        judged = network if answer.inliers is None else subnetwork(network, answer.inliers)
-        shown = certify(judged, poses, objective(judged, poses, landmarks))
+        judged = network if answer.inliers is None else network.only(answer.inliers)
+        shown = certify(judged, answer.end.poses, value if answer.minimum is None else answer.minimum)
     return NetworkSolution(
         network=network,
         solver=solver,
-        poses=poses,
-        landmarks=landmarks,
+        poses=answer.end.poses,
+        landmarks=answer.end.landmarks.reshape(-1, 2),
         objective=value,
-        objective_initial=objective(network, *initial),
+        objective_initial=flat.objective(initial),
         iterations=answer.iterations,
         seconds=time.perf_counter() - begin,
         converged=bool(stationary and (at_optimum or answer.minimised is not None)),
         decrement=decrement,
-        gap=max(gap, 0.0) if best.status == "converged" or answer.minimised is not None else float("nan"),
+        gap=max(gap, 0.0) if best.converged or answer.minimised is not None else float("nan"),
         start=answer.start,
         starts=answer.optimum.reports,
         initial=initial,
@@ -228,22 +246,26 @@ def solve_network(
     )
 
 
-def _certified(problem: Problem, end: Polished) -> bool:
+def _certified(network: PoseNetwork, problem: Problem, end: Optimum) -> bool:
     from graphslam.solve.network.certificate import certify
 
-    poses, _ = problem.arrays(end.values)
-    return certify(problem.network, poses, end.objective, eigenvalue=False).verdict == "certified"
+    poses = problem.unpack(end.values).poses
+    return certify(network, poses, end.objective, eigenvalue=False).verdict == "certified"
 
 
-def _lm(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
-    optimum = best_of_starts(network, starts, certified=_certified, progress=progress)
+def _lm(
+    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
+) -> _Answer:
+    optimum = best_of_starts(network, starts, flat=flat, certified=_certified, progress=progress)
     best = optimum.best
-    arrays = optimum.problem.arrays(best.values)
-    return _Answer(best.values, arrays, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
+    end = optimum.problem.unpack(best.values)
+    return _Answer(best.values, end, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
 
 
-def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
-    problem = PcgProblem(network, **options)
+def _pcg(
+    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
+) -> _Answer:
+    problem = PcgProblem(flat, **options)
     optimum = best_of_starts(network, starts, problem=problem, certified=_certified, progress=progress)
     best, report = optimum.best, problem.report
     details = {
@@ -254,53 +276,50 @@ def _pcg(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
         "worst_linear_residual": max(report.residuals, default=0.0),
         "decrement_by": "direct sparse solve",
     }
-    return _Answer(best.values, problem.arrays(best.values), best.iterations, optimum, optimum.start, details)
+    return _Answer(best.values, best.values, best.iterations, optimum, optimum.start, details)
 
 
-def _isam2(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
-    from graphslam.solve.network.incremental import Isam2Options, relinearise_all, run_isam2
+def _isam2(
+    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
+) -> _Answer:
+    from graphslam.solve.network.incremental import Isam2Options, run_isam2
 
     options = dict(options)
     close = bool(options.pop("relinearise", True))
-    problem = _native(network, "isam2")
+    problem = _native(network, flat, "isam2")
     begin = time.perf_counter()
     settings = Isam2Options(factorization=problem.factorization, **options)
     grown = run_isam2(network, settings, progress=progress)
     seconds = time.perf_counter() - begin
     # the batch optimum is what the gap is measured against; iSAM2's own estimate is one of its starts
     names = None if starts is None else [n for n in starts if n != "incremental"]
-    given = {"incremental": problem.arrays(grown)}
+    given = {"incremental": problem.unpack(grown)}
     optimum = best_of_starts(network, names, given=given, problem=problem, certified=_certified, progress=progress)
-    lowest, raw = optimum.best.objective, problem.objective(grown)
+    best, raw = optimum.best, problem.objective(grown)
     details: dict[str, Any] = {
         "doubt": optimum.doubt,
         "objective_incremental": raw,
-        "gap_incremental": raw - lowest,
+        "gap_incremental": raw - best.objective,
         "seconds_incremental": seconds,
     }
-    values, updates, start = grown, 0, "incremental"
-    if close:
-        values, updates = relinearise_all(network, problem.graph, grown, factorization=problem.factorization)
-        own = problem.objective(values)
-        details["objective_relinearised"] = own
-        details["reseeded"] = False
-        if own > lowest * (1.0 + SAME) + 1e-12 * network.residuals:
-            # another basin is lower: iSAM2 goes on from the start that found it
-            values, more = relinearise_all(
-                network, problem.graph, optimum.best.values, factorization=problem.factorization
-            )
-            updates, start = updates + more, optimum.start
-            details["reseeded"] = True
-    return _Answer(values, problem.arrays(values), updates, optimum, start, details)
+    if not close:
+        return _Answer(grown, given["incremental"], 0, optimum, "incremental", details)
+    # closed by relinearising everything, again and again: by the descent from there, or from another start in a lower
+    # basin
+    details["objective_relinearised"] = optimum.reports[0].objective
+    details["reseeded"] = optimum.start != "incremental"
+    return _Answer(best.values, problem.unpack(best.values), best.iterations, optimum, optimum.start, details)
 
 
-def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, Any], progress: bool) -> _Answer:
+def _gnc(
+    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
+) -> _Answer:
     from graphslam.solve.network.consensus import odometry_edges  # scipy's statistics take a second to load
     from graphslam.solve.network.robust import truncated_cost, truncated_least_squares
 
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
     scale = options.get("noise_scale")
-    problem = _native(network, "gnc")
+    problem = _native(network, flat, "gnc")
     # least squares of everything, from every start, is worth its time only if asked for: wrong loops make it slow
     asked = best_of_starts(network, starts, problem=problem, progress=progress) if starts is not None else None
     trust = bool(options.get("trust_odometry", True))
@@ -328,7 +347,7 @@ def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
         ],
         "objective_inliers": end.objective,
         "objective_truncated": robust.truncated,
-        "objective_truncated_batch": truncated_cost(network, problem.arrays(optimum.best.values), robust.limit),
+        "objective_truncated_batch": truncated_cost(flat, problem.unpack(optimum.best.values), robust.limit),
         "inlier_probability": probability,
         "noise_scale": robust.scale,
         "edge_limit": float(np.min(robust.limit[:m], initial=np.inf, where=np.isfinite(robust.limit[:m]))),
@@ -337,7 +356,7 @@ def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
     }
     return _Answer(
         end.values,
-        problem.arrays(end.values),
+        problem.unpack(end.values),
         end.iterations,
         optimum,
         robust.start,
@@ -348,25 +367,25 @@ def _gnc(network: PoseNetwork, starts: Sequence[str] | None, options: dict[str, 
     )
 
 
-def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: Robust) -> Optimum:
+def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: Robust) -> Starts:
     """What least squares of everything makes of the robust answer, in a few steps: the gap is measured against it."""
     initial = problem.objective(robust.end.values)
     if np.mean(~robust.inliers) > FEW:
         # random loops fill the factorisation: a step of everything costs many times the whole robust solve
-        unknown = Polished(robust.end.values, float("nan"), float("inf"), 0, "rejected")
-        return Optimum(problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),))
+        unknown = Optimum(robust.end.values, initial, float("nan"), float("inf"), 0, "rejected")
+        return Starts(problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),))
     best = polish(problem, robust.end.values, max_iterations=BATCH_STEPS)
     report = StartReport("inliers", initial, best.objective, best.iterations, best.status)
-    return Optimum(problem, best, "inliers", (report,))
+    return Starts(problem, best, "inliers", (report,))
 
 
-def _native(network: PoseNetwork, solver: str) -> BatchProblem:
+def _native(network: PoseNetwork, flat: FlatGraph, solver: str) -> BatchProblem:
     if not native(network):
         raise SolverError(
             f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "
             "observations; use lm or pcg"
         )
-    return native_problem(network)
+    return native_problem(network, flat)
 
 
 # name -> (function, its options)

@@ -19,21 +19,13 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import PoseNetwork
-from graphslam.solve.network.model import compose, inverse
-from graphslam.solve.network.sparse import MANY, BlockElimination, factor
+from graphslam.core.poses import group_of
+from graphslam.solve.sparse import MANY, BlockElimination, factor
 
 Index = npt.NDArray[np.intp]
 
 # A cycle that the measurements themselves close no better than this [rad] says nothing about turns too many.
 UNDECIDED = 2.0 * np.pi / 3.0
-
-
-def identity(network: PoseNetwork, n: int) -> Array:
-    """``n`` identity poses."""
-    out = np.zeros((n, 3 if network.dim == 2 else 7))
-    if network.dim == 3:
-        out[:, 6] = 1.0
-    return out
 
 
 def neighbours(network: PoseNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,12 +103,13 @@ def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> Tree:
 
 def tree_poses(network: PoseNetwork, tree: Tree) -> Array:
     """Poses by chaining the measurements of a tree from the anchors."""
-    step = identity(network, len(network))
+    g = group_of(network.poses)
+    step = np.tile(g.identity, (len(network), 1))
     roots = tree.edge < 0
     step[network.anchors] = network.poses[network.anchors]
     z = network.measurements[tree.edge[~roots]]
-    step[~roots] = np.where(tree.forward[~roots, None], z, inverse(z))
-    return tree.rooted(step, compose)
+    step[~roots] = np.where(tree.forward[~roots, None], z, g.inverse(z))
+    return tree.rooted(step, g.compose)
 
 
 def odometry_start(network: PoseNetwork) -> Array:

@@ -10,8 +10,10 @@ import pytest
 
 from graphslam.app.solve_file import solve_file
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.network import values_of
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
+from graphslam.solve.descent import polish
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.certificate import (
     _descend,
@@ -22,9 +24,8 @@ from graphslam.solve.network.certificate import (
     isotropic,
     residual_matrix,
 )
-from graphslam.solve.network.descent import polish
-from graphslam.solve.network.model import exp
 from graphslam.solve.network.solve import solve_network
+from tests.reference.plain_network import exp
 from tests.solve.network.test_model import random_network
 
 
@@ -89,10 +90,10 @@ def twisted_ring(n: int, turns: int) -> tuple[PoseNetwork, np.ndarray]:
 def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
     net, wound = twisted_ring(20, 1)
     problem = BatchProblem(net)
-    end = polish(problem, problem.values(wound, np.zeros((0, 2))))
+    end = polish(problem, problem.pack(values_of(net, wound)))
     assert end.status == "converged"
     assert end.objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
-    refused = certify(net, problem.arrays(end.values)[0], end.objective)
+    refused = certify(net, problem.unpack(end.values).poses, end.objective)
     assert refused.verdict == "not certified"
     assert refused.smallest_eigenvalue < -1e-3
     assert str(refused) == f"not certified (λ_min = {refused.smallest_eigenvalue:.3g})"
@@ -144,10 +145,10 @@ def test_a_grid_solved_from_nonsense_is_refused(data_dir: Path) -> None:
         poses = exp(np.concatenate([2.0 * rng.standard_normal((len(net), 3)), rng.standard_normal((len(net), 3))], 1))
         poses[0] = net.poses[0]
         problem = BatchProblem(net)
-        end = polish(problem, problem.values(poses, np.zeros((0, 2))))
+        end = polish(problem, problem.pack(values_of(net, poses)))
         if end.status != "converged" or end.objective < 1.001 * best:
             continue
-        found = certify(net, problem.arrays(end.values)[0], end.objective)
+        found = certify(net, problem.unpack(end.values).poses, end.objective)
         assert found.verdict != "certified"
         refused += 1
     assert refused

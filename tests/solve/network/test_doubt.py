@@ -9,16 +9,15 @@ import pytest
 
 import graphslam.core.network as core
 import graphslam.solve.network.solve as solving
-import graphslam.solve.network.sparse as sparse
 import graphslam.solve.network.start as starts
+import graphslam.solve.sparse as sparse
 from graphslam.core.errors import CovarianceError
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.network import problem_of_network, values_of
+from graphslam.solve.descent import polish
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.descent import polish
-from graphslam.solve.network.model import compose, inverse
 from graphslam.solve.network.multistart import doubt
 from graphslam.solve.network.solve import solve_network
-from graphslam.solve.network.sparse import SparseProblem
 from graphslam.solve.network.start import (
     chordal_rotations,
     chordal_start,
@@ -28,7 +27,9 @@ from graphslam.solve.network.start import (
     tree_poses,
     wound_cycles,
 )
+from graphslam.solve.sparse import SparseProblem
 from tests.reference.grid_world import grid_world
+from tests.reference.plain_network import compose, inverse
 from tests.solve.network.test_certificate import twisted_ring
 from tests.solve.network.test_model import random_network
 
@@ -71,15 +72,15 @@ def rotated(net: PoseNetwork, rng: np.random.Generator, sigma: float) -> np.ndar
 
 def test_every_other_minimum_from_random_starts_is_doubted(rng: np.random.Generator) -> None:
     net = grid_world(300, rng, share=0.8)
-    problem = SparseProblem(net)
+    problem = SparseProblem(problem_of_network(net))
     best = solve_network(net)
     assert best.details["doubt"] == ""
     found = 0
     for _ in range(12):
-        end = polish(problem, (rotated(net, rng, 2.0), np.zeros((0, 2))))
+        end = polish(problem, values_of(net, rotated(net, rng, 2.0)))
         worse = end.objective > 1.001 * best.objective
         found += worse
-        assert bool(doubt(problem, end)) == worse or end.status != "converged"
+        assert bool(doubt(net, problem, end)) == worse or end.status != "converged"
     assert found >= 3
 
 
@@ -104,7 +105,7 @@ def test_doubt_that_a_certificate_settles_needs_no_other_start(
     said = solve_network(quiet)
     assert "degrees of freedom" in said.details["doubt"]
     assert [s.name for s in said.starts] == ["chordal"]
-    monkeypatch.setattr(solving, "_certified", lambda problem, end: False)
+    monkeypatch.setattr(solving, "_certified", lambda network, problem, end: False)
     assert len(solve_network(quiet).starts) > 1
 
 
@@ -148,17 +149,17 @@ def test_elimination_by_blocks_takes_the_same_step(
     rng: np.random.Generator, dim: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     net = grid_world(200, rng, dim=dim, share=0.8)
-    start = net.poses, np.zeros((0, 2))
-    (a, _), fall, now = SparseProblem(net).newton_step(start)
+    start = values_of(net, net.poses)
+    a, fall, now = SparseProblem(problem_of_network(net)).newton_step(start)
     monkeypatch.setattr(sparse, "MANY", 0)
-    (b, _), fall_b, now_b = SparseProblem(net).newton_step(start)
+    b, fall_b, now_b = SparseProblem(problem_of_network(net, ordered=False)).newton_step(start)
     native = BatchProblem(net)
-    values, fall_c, _ = native.newton_step(native.values(*start))
+    values, fall_c, _ = native.newton_step(native.pack(start))
     assert fall_b == pytest.approx(fall, rel=1e-9)
     assert fall_c == pytest.approx(fall, rel=1e-6)
     assert now_b == pytest.approx(now, rel=1e-6)
-    assert np.allclose(a, b, atol=1e-6)
-    assert np.allclose(native.arrays(values)[0], b, atol=1e-4)
+    assert np.allclose(a.poses, b.poses, atol=1e-6)
+    assert np.allclose(native.unpack(values).poses, b.poses, atol=1e-4)
 
 
 def test_too_few_digits_are_an_error_and_not_a_step() -> None:

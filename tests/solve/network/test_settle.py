@@ -10,9 +10,9 @@ from scipy import stats
 
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
+from graphslam.graph.network import problem_of_network, values_of
+from graphslam.solve.descent import polish
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.descent import polish
-from graphslam.solve.network.model import edge_costs, subnetwork
 from graphslam.solve.network.settle import (
     LARGEST,
     family_quantile,
@@ -22,11 +22,10 @@ from graphslam.solve.network.settle import (
     tail_limit,
 )
 from graphslam.solve.network.solve import solve_network
+from tests.reference.plain_network import edge_costs, subnetwork
 from tests.reference.slow_loop_evidence import fall_if_moved, fall_without
 from tests.reference.wrong_loops import add_wrong_loops, is_odometry
 from tests.sim.test_wrong_loops import ring_drive
-
-NONE = np.zeros((0, 2))
 
 
 def thinned(dim: int, n: int = 100, seed: int = 0) -> PoseNetwork:
@@ -47,7 +46,9 @@ def test_evidence_is_that_of_a_dense_solver(dim: int) -> None:
     rows = np.flatnonzero(~is_odometry(net.edges))
     everything = np.ones(len(edges), bool)
     poses = solve_network(net, starts=("chordal",)).poses
-    single, group, label = loop_evidence(net, everything, rows, (poses, NONE), accepted=True)
+    single, group, label = loop_evidence(
+        problem_of_network(net), everything, rows, values_of(net, poses), accepted=True
+    )
     assert sorted(np.bincount(label).tolist()) == [1, 3, 4]
     for k, row in enumerate(rows):
         assert single[k] == pytest.approx(fall_without(net, everything, int(row), poses), rel=1e-5)
@@ -57,7 +58,7 @@ def test_evidence_is_that_of_a_dense_solver(dim: int) -> None:
     out = rows[[0, 1, -1]]
     inliers = ~np.isin(np.arange(len(edges)), out)
     poses = solve_network(subnetwork(net, inliers), starts=("chordal",)).poses
-    single, group, label = loop_evidence(net, inliers, out, (poses, NONE), accepted=False)
+    single, group, label = loop_evidence(problem_of_network(net), inliers, out, values_of(net, poses), accepted=False)
     for k, row in enumerate(out):
         assert single[k] == pytest.approx(fall_without(net, inliers, int(row), poses), rel=1e-5)
         members = out[label == label[k]]
@@ -75,8 +76,8 @@ def test_evidence_of_right_loops_is_chi_squared(inflated: float) -> None:
         net = replace(net, information=net.information * inflated)
         rows = np.flatnonzero(~is_odometry(net.edges))
         problem = BatchProblem(net)
-        poses = problem.arrays(polish(problem, problem.values(net.poses, NONE)).values)[0]
-        s, g, label = loop_evidence(net, np.ones(len(net.edges), bool), rows, (poses, NONE), accepted=True)
+        values = problem.unpack(polish(problem, problem.pack(values_of(net, net.poses))).values)
+        s, g, label = loop_evidence(problem.flat, np.ones(len(net.edges), bool), rows, values, accepted=True)
         single.append(s[4])  # alone
         group += [g[np.flatnonzero(label == name)[0]] for name in np.unique(label)]
     for D2 in (np.array(single), np.array(group)):
@@ -138,11 +139,11 @@ def test_a_wrong_loop_that_bends_the_map_to_itself_is_taken_out_and_a_right_one_
     begun = solve_network(subnetwork(wrong, inliers), starts=("chordal",))
     costs = edge_costs(wrong, begun.poses)
     assert (costs[loops[:4]] < limit[loops[:4]]).all()
-    problem = BatchProblem(wrong, inliers)
-    end = settle(wrong, problem.values(begun.poses, NONE), inliers, limit, own_tail=False)
+    problem = BatchProblem(wrong)
+    end = settle(problem, problem.pack(values_of(wrong, begun.poses)), inliers, limit, own_tail=False)
     assert not end.inliers[loops[:4]].any()
     assert end.inliers[loops[4:]].all()
-    poses = end.problem.arrays(end.end.values)[0]
+    poses = end.problem.unpack(end.end.values).poses
     # the answer is that of the right loops alone, and nearer to that of all of them than where it began
     alone = solve_network(subnetwork(net, end.inliers), starts=("chordal",)).poses
     assert np.abs(poses[:, :2] - alone[:, :2]).max() < 1e-4
@@ -150,7 +151,7 @@ def test_a_wrong_loop_that_bends_the_map_to_itself_is_taken_out_and_a_right_one_
     assert error.mean() < 0.7 * np.linalg.norm(begun.poses[:, :2] - clean[:, :2], axis=1).mean()
     # nothing to do where all is right
     problem = BatchProblem(net)
-    same = settle(net, problem.values(clean, NONE), np.ones(len(net.edges), bool), limit)
+    same = settle(problem, problem.pack(values_of(net, clean)), np.ones(len(net.edges), bool), limit)
     assert same.inliers.all()
     assert same.rounds == 1
 

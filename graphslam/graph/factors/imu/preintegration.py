@@ -22,7 +22,6 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
-from graphslam.graph.factors.imu.imu_kernels import preintegrate_spans
 
 LEAST_WALK = 1e-4
 """A bias that is said not to walk walks by this share of its σ a span of time: the factor is not to be singular."""
@@ -92,6 +91,8 @@ def preintegrate(imu: Imu, begin: ArrayLike, end: ArrayLike, bias: ArrayLike = 0
     ConfigError
         Gyro or accelerometer without noise.
     """
+    from graphslam.graph.factors.imu.imu_kernels import preintegrate_spans  # numba is slow to load
+
     t0, t1 = (np.atleast_1d(np.asarray(t, dtype=np.float64)) for t in (begin, end))
     n = imu.noise
     if not (n.gyro > 0 and n.accelerometer > 0):

@@ -1,6 +1,4 @@
-"""Pose networks without GTSAM: vectorised numpy blocks, and a choice of direct or conjugate-gradient linear solves.
-
-Serves networks that GTSAM has no native factor for (Cartesian landmark observations) and the ``pcg`` solver.
+"""Steps of a descent without GTSAM: vectorised numpy blocks, and a choice of direct or conjugate-gradient solves.
 
 Conjugate gradients stop on an estimate of the error in the *energy* norm, which is the fall of the objective that is
 still missing, not on the residual: on long chains a residual of 1e-6 goes with solutions that are wrong by 100 %.
@@ -15,23 +13,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.linalg import lapack
 
 from graphslam.core.errors import IndeterminateError
-from graphslam.core.geometry import Array, se2_adjoint
-from graphslam.core.network import PoseNetwork
-from graphslam.core.se3 import se3_adjoint
-from graphslam.solve.network.model import Layout, inverse, linearise, objective
+from graphslam.core.geometry import Array
+from graphslam.core.se3 import skew
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import FAILED
 
 if TYPE_CHECKING:
     from graphslam.linear.block_cholesky import BlockFactor
 
-Values = tuple[Array, Array]
 # The missing fall of the objective is estimated from the falls of this many last iterations (Strakoš & Tichý 2002).
 DELAY = 10
 # Columns that SuperLU takes together: its default of 20 suits larger fronts than those of pose networks.
 PANEL = 10
 # Beyond so many poses they are eliminated as blocks, in an order by nested dissection.
 MANY = 5_000
+# A dense Cholesky factorisation beats a sparse one that has no order yet below this many columns (measured).
+DENSE_SOLVE_LIMIT = 600
+SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
 def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
@@ -101,53 +103,69 @@ class BlockElimination:
 
 
 class SparseProblem:
-    """A network in numpy, with direct sparse solves.
+    """A problem with direct solves.
 
     Parameters
     ----------
-    network : PoseNetwork
+    flat : FlatGraph
+    weights : (f,), optional
+        Factor on the information of every factor.
     """
 
     factorization = "LU"
 
-    def __init__(self, network: PoseNetwork) -> None:
-        self.network = network
-        # many poses: compiled block elimination, which begins with half a second of loading
-        self._by_block = len(network) > MANY and len(network.landmark_ids) == 0
-        self.layout = Layout.of(network) if self._by_block else Layout.for_elimination(network)
+    def __init__(self, flat: FlatGraph, weights: Array | None = None) -> None:
+        self.flat, self.weights = flat, weights
+        layout = flat.layout
+        # many poses and nothing else: compiled block elimination, which begins with half a second of loading
+        self._by_block = layout.size > MANY * layout.pose_dof and layout.stop("x") == layout.size
+        self._dense = not layout.ordered and layout.size <= DENSE_SOLVE_LIMIT
         self._elimination: BlockElimination | None = None
 
-    def values(self, poses: Array, landmarks: Array) -> Values:
-        """Arrays are the values."""
-        return poses, landmarks
+    def pack(self, values: Values) -> Values:
+        """Values are what they are."""
+        return values
 
-    def arrays(self, values: Values) -> Values:
-        """Values are the arrays."""
+    def unpack(self, values: Values) -> Values:
+        """Values are what they are."""
         return values
 
     def objective(self, values: Values) -> float:
         """``Σ rᵀ Ω r``."""
-        return objective(self.network, *values)
+        return self.flat.evaluate(values, hessian=False, weights=self.weights).objective
+
+    def _system(self, values: Values) -> tuple[sp.csc_matrix, Array]:
+        """Gauss-Newton matrix and right-hand side."""
+        system = self.flat.evaluate(values, dense=self._dense, weights=self.weights)
+        d = np.asarray(system.A.diagonal())
+        if not np.all(d > 0) or not np.all(np.isfinite(d)):
+            raise IndeterminateError("a variable has no information at all")
+        return system.A, -system.g
 
     def solve_linear(self, values: Values, H: sp.csc_matrix, b: Array) -> Array:
         """``H⁻¹ b`` at ``values``, with one step of iterative refinement.
 
         Raises
         ------
-        RuntimeError
+        IndeterminateError
             Singular, or refinement corrects more than a hundredth of the energy: too few digits are left.
         """
-        lu = self._blocks(H) if self._by_block else factor(H, ordered=True)
+        if self._dense:
+            return _dense_solve(H, b)
+        try:
+            lu = self._blocks(H) if self._by_block else factor(H, ordered=self.flat.layout.ordered)
+        except RuntimeError:
+            raise IndeterminateError(SINGULAR) from None
         x = lu.solve(b)
         left = b - H @ x
         more = lu.solve(left)
         if not abs(more @ left) <= 0.01 * abs(x @ b):
-            raise RuntimeError("the linear system is singular to working precision")
+            raise IndeterminateError(SINGULAR)
         return np.asarray(x + more)
 
     def _blocks(self, H: sp.csc_matrix) -> BlockFactor:
         if self._elimination is None:
-            self._elimination = BlockElimination(H, self.network.tangent_dim)
+            self._elimination = BlockElimination(H, self.flat.layout.pose_dof)
         return self._elimination.factor(H)
 
     def newton_step(self, values: Values) -> tuple[Values, float, float]:
@@ -155,23 +173,21 @@ class SparseProblem:
 
         Raises
         ------
-        RuntimeError
+        IndeterminateError
             Singular linear system.
         """
-        J, r = linearise(self.network, *values, self.layout)
-        step = self.solve_linear(values, sp.csc_matrix(J.T @ J), -(J.T @ r))
-        if not np.isfinite(step).all():
-            raise RuntimeError("the linear system is singular")
-        moved = self.layout.retract(*values, step)
-        return moved, float(r @ r - np.sum((J @ step + r) ** 2)), self.objective(moved)
+        H, b = self._system(values)
+        step = self.solve_linear(values, H, b)
+        moved = self.flat.layout.retract(values, step)
+        return moved, float(2.0 * (b @ step) - step @ (H @ step)), self.objective(moved)
 
     def decrement(self, values: Values) -> float:
         """Predicted remaining fall of the objective, always by a direct solve; infinite if that fails."""
         try:
-            J, r = linearise(self.network, *values, self.layout)
-            step = SparseProblem.solve_linear(self, values, sp.csc_matrix(J.T @ J), -(J.T @ r))
-            fall = float(r @ r - np.sum((J @ step + r) ** 2))
-        except RuntimeError:
+            H, b = self._system(values)
+            step = SparseProblem.solve_linear(self, values, H, b)
+            fall = float(2.0 * (b @ step) - step @ (H @ step))
+        except FAILED:
             return float("inf")
         return abs(fall) if np.isfinite(fall) else float("inf")
 
@@ -180,14 +196,13 @@ class SparseProblem:
         taken: list[float] = []
         damping, steps = 1e-6, 0
         for _ in range(min(10, budget)):
-            J, r = linearise(self.network, *values, self.layout)
-            H, b = sp.csc_matrix(J.T @ J), -(J.T @ r)
-            D = sp.diags(H.diagonal(), format="csc")
+            H, b = self._system(values)
+            D = np.diag(H.diagonal()) if self._dense else sp.diags(H.diagonal(), format="csc")
             while damping < 1e12:
                 try:
-                    moved = self.layout.retract(*values, self.solve_linear(values, H + damping * D, b))
+                    moved = self.flat.layout.retract(values, self.solve_linear(values, H + damping * D, b))
                     now = self.objective(moved)
-                except RuntimeError:
+                except FAILED:
                     now = np.inf
                 if now < objective:
                     break
@@ -203,6 +218,20 @@ class SparseProblem:
         return values, taken, steps
 
 
+def _dense_solve(H: Array, b: Array) -> Array:
+    """By Cholesky, scaled to a unit diagonal."""
+    if not len(b):
+        return b
+    s = 1.0 / np.sqrt(H.diagonal())
+    M = H * s[:, None]
+    M *= s
+    L, info = lapack.dpotrf(M.T, lower=1, overwrite_a=1)  # .T: LAPACK's order, no copy
+    x = lapack.dpotrs(L, b * s, lower=1)[0] * s if info == 0 else b
+    if info != 0 or not np.all(np.isfinite(x)):
+        raise IndeterminateError(SINGULAR)
+    return np.asarray(x)
+
+
 @dataclass
 class PcgReport:
     """What conjugate gradients did over a whole solve."""
@@ -214,43 +243,50 @@ class PcgReport:
 
 
 class PcgProblem(SparseProblem):
-    """A network in numpy, with two-level preconditioned conjugate gradients.
+    """A problem with two-level preconditioned conjugate gradients.
 
-    Vertices are grouped, ten neighbours in id order to a group, landmarks with the group that first sees them. The
-    fine level solves every group for itself; the coarse level solves for one rigid motion of the world for each
+    Poses are grouped, ten neighbours by number to a group, all else with the first pose that it shares a factor with.
+    The fine level solves every group for itself; the coarse level solves for one rigid motion of the world for each
     group, which is what long chains and loops are slow in. The two are combined as a balancing preconditioner
     (Mandel 1993). Against a spanning-tree preconditioner it needs 6 to 60 times fewer iterations on the recorded
     networks.
 
     Parameters
     ----------
-    network : PoseNetwork
+    flat : FlatGraph
     tolerance : float
         Relative error of a linear solution in the energy norm. Its square is the share of the fall of the objective
         that a step misses.
     max_iterations : int
         Per linear solve. One that runs out is counted in ``report.unconverged`` and its step is used as it is.
     group : int
-        Vertices a group.
+        Poses a group.
     """
 
     factorization = "PCG"
 
     def __init__(
-        self, network: PoseNetwork, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
+        self, flat: FlatGraph, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
     ) -> None:
-        super().__init__(network)
+        super().__init__(flat)
+        self._dense = False
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.report = PcgReport()
-        groups = np.arange(len(network)) // group
-        marks = np.full(len(network.landmark_ids), len(network) - 1)
-        np.minimum.at(marks, network.observations[:, 1], network.observations[:, 0])
-        self._groups = np.concatenate([groups, groups[marks]])
-        # the owner of every free scalar
-        self._owner = np.empty(self.layout.size, dtype=np.intp)
-        free = np.flatnonzero(self.layout.pose_at >= 0)
-        self._owner[self.layout.pose_at[free, None] + np.arange(network.tangent_dim)] = groups[free, None]
-        self._owner[self.layout.mark_at[:, None] + np.arange(2)] = self._groups[len(network) :, None]
+        layout, (factors, variable) = flat.layout, flat.links
+        n, far = layout.count("x"), np.iinfo(np.int64).max
+        poses = layout.first("x", np.arange(n))
+        number = np.full(layout.size + 2, far)  # by first column: the pose whose group a variable belongs to
+        number[poses] = np.arange(n)
+        number[-1] = 0  # held (what is left out stands before it)
+        lowest = np.full(len(flat), far)
+        np.minimum.at(lowest, factors, number[variable])
+        other = (variable >= 0) & (number[variable] == far)
+        np.minimum.at(number, variable[other], lowest[factors[other]])
+        widths = np.zeros(layout.size + 1, dtype=np.int64)
+        widths[variable[variable >= 0]] = np.concatenate([f.width for f in flat.batches])[variable >= 0]
+        first = np.flatnonzero(widths)
+        # the group of every free scalar; what shares a factor with no pose goes with the first
+        self._owner = np.repeat(np.where(number[first] == far, 0, number[first]), widths[first]) // group
 
     def solve_linear(self, values: Values, H: sp.csc_matrix, b: Array) -> Array:
         """``H⁻¹ b`` by preconditioned conjugate gradients."""
@@ -278,20 +314,24 @@ class PcgProblem(SparseProblem):
         return x
 
     def _rigid_motions(self, values: Values) -> sp.csc_matrix:
-        """Columns: a twist of the world for every group, ``Exp(ξ) x = x Exp(Ad(x⁻¹) ξ)``, for landmarks ``ξ × l``."""
-        poses, marks = values
-        network, d = self.network, self.network.tangent_dim
-        free = np.flatnonzero(self.layout.pose_at >= 0)
-        back = inverse(poses[free])
-        blocks = se2_adjoint(back) if network.dim == 2 else se3_adjoint(back)
-        parts = [_block_triplets(blocks, self.layout.pose_at[free], d * self._groups[free])]
+        """Columns: a twist of the world for every group, ``Exp(ξ) x = x Exp(Ad(x⁻¹) ξ)``, for points ``ξ × l``."""
+        layout, g = self.flat.layout, values.group
+        first = layout.first("x", np.arange(layout.count("x")))
+        free = np.flatnonzero(first >= 0)
+        d, at = g.dof, first[free]
+        parts = [_block_triplets(g.adjoint(g.inverse(values.poses[free])), at, d * self._owner[at])]
+        marks = values.landmarks
         if len(marks):
-            turn = np.zeros((len(marks), 2, 3))
-            turn[:, 0, 0] = turn[:, 1, 1] = 1.0
-            turn[:, 0, 2], turn[:, 1, 2] = -marks[:, 1], marks[:, 0]
-            parts.append(_block_triplets(turn, self.layout.mark_at, d * self._groups[len(network) :]))
+            turn = np.zeros((len(marks), g.dim, d))
+            turn[:, :, g.position] = np.eye(g.dim)
+            if g.dim == 2:
+                turn[:, 0, 2], turn[:, 1, 2] = -marks[:, 1], marks[:, 0]
+            else:
+                turn[:, :, :3] = -skew(marks)
+            at = layout.first("l", np.arange(len(marks)))
+            parts.append(_block_triplets(turn, at, d * self._owner[at]))
         data, rows, columns = (np.concatenate(p) for p in zip(*parts, strict=True))
-        return sp.csc_matrix((data, (rows, columns)), shape=(self.layout.size, d * (int(self._groups.max()) + 1)))
+        return sp.csc_matrix((data, (rows, columns)), shape=(layout.size, d * (int(self._owner.max(initial=0)) + 1)))
 
 
 def _block_triplets(blocks: Array, row: np.ndarray, column: np.ndarray) -> tuple[Array, np.ndarray, np.ndarray]:

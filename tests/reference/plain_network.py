@@ -1,4 +1,4 @@
-"""Residuals of a pose network in vectorised numpy: GTSAM's and g2o's objective, and the linearised system.
+"""A second form of the problem of a pose network, by rows: GTSAM's and g2o's objective, the linearised system.
 
 GTSAM 4.3 evaluates a ``BetweenFactor`` as ``r = Log(z⁻¹ x_i⁻¹ x_j)`` with the full logarithm in 2-D and in 3-D
 (its default build) and with exact Jacobians; the agreement is tested. g2o takes the vector (x, y, θ), in 3-D
@@ -31,8 +31,6 @@ from graphslam.core.network import PoseNetwork
 from graphslam.linear.symmetric_factor import elimination_order
 
 Residual = Literal["gtsam", "g2o"]
-# Above this spread of information normal equations lose the small directions: QR instead of Cholesky.
-CHOLESKY_LIMIT = 1e10
 
 
 def compose(a: Array, b: Array) -> Array:
@@ -148,18 +146,6 @@ def square_root(information: Array) -> Array:
     except np.linalg.LinAlgError:
         w, V = np.linalg.eigh(information)
         return np.asarray(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2))
-
-
-def information_spread(network: PoseNetwork) -> float:
-    """Ratio of the extreme positive eigenvalues of all information matrices."""
-    top, low = 0.0, np.inf
-    for information in (network.information, network.observation_information):
-        if len(information):
-            w = np.linalg.eigvalsh(information)
-            top = max(top, float(w.max()))
-            positive = w[w > 0.0]
-            low = min(low, float(positive.min()) if len(positive) else np.inf)
-    return top / low
 
 
 def subnetwork(network: PoseNetwork, used: npt.NDArray[np.bool_]) -> PoseNetwork:

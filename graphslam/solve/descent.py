@@ -1,4 +1,4 @@
-"""Descent to a minimum of a pose network: Gauss-Newton while it helps, damped steps where it does not.
+"""Descent to a minimum of a least-squares problem: Gauss-Newton while it helps, damped steps where it does not.
 
 Stopping rules that look at the fall of the objective say nothing where progress is merely slow. So an answer counts as
 converged only if the *predicted* remaining fall of a full Gauss-Newton step (the decrement
@@ -9,13 +9,14 @@ predicted of them, if it will be by the rate at which the decrement falls.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from graphslam.core.geometry import Array
-from graphslam.core.network import PoseNetwork
+from graphslam.core.errors import IndeterminateError
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.variables import Values
 
 log = logging.getLogger(__name__)
 
@@ -31,20 +32,22 @@ CLIMB, PATIENCE = 1e4, 8
 # The decrement may be foretold if the last step changed the objective by what it predicted to this share of it, and if
 # each decrement is at most this share of the one before (a third of the limit is asked for then).
 TRUE_TO_WORD, FAST = 0.1, 0.02
+FAILED = (RuntimeError, IndeterminateError)
+"""What a linear system that cannot be solved throws: GTSAM's, or ours."""
 # A start that after so many steps is still above the best of the others is given up.
 CHALLENGE = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Polished:
+class Optimum:
     """Where a local solver ended.
 
     Parameters
     ----------
     values : object
         As the problem holds them.
-    objective : float
-        ``Σ rᵀ Ω r``.
+    objective_initial, objective : float
+        ``Σ rᵀ Ω r`` before and after.
     decrement : float
         Predicted further fall of the objective; infinite if the linear system could not be solved.
     iterations : int
@@ -53,21 +56,48 @@ class Polished:
     """
 
     values: Any
+    objective_initial: float
     objective: float
     decrement: float
     iterations: int
     status: Status
 
+    @property
+    def converged(self) -> bool:
+        """At a stationary point."""
+        return self.status == "converged"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When a descent has converged, and how long Gauss-Newton may climb.
+
+    Parameters
+    ----------
+    relative, absolute : float
+        Converged: the next step would lower the objective by less than this share of it plus this.
+    patience : int
+        Gauss-Newton steps in a row without a new best.
+    """
+
+    relative: float
+    absolute: float
+    patience: int = PATIENCE
+
+    def reached(self, objective: float, decrement: float) -> bool:
+        """Whether a decrement is negligible."""
+        return bool(decrement <= self.relative * objective + self.absolute)
+
 
 class Problem(Protocol):
-    """What :func:`polish` needs of a problem; ``values`` are whatever the problem makes of them."""
+    """A least-squares problem with a way to make its steps; ``values`` are whatever that makes of them."""
 
-    network: PoseNetwork
+    flat: FlatGraph
     factorization: str
 
-    def values(self, poses: Array, landmarks: Array) -> Any: ...
+    def pack(self, values: Values) -> Any: ...
 
-    def arrays(self, values: Any) -> tuple[Array, Array]: ...
+    def unpack(self, values: Any) -> Values: ...
 
     def objective(self, values: Any) -> float: ...
 
@@ -78,9 +108,9 @@ class Problem(Protocol):
     def damped(self, values: Any, objective: float, budget: int) -> tuple[Any, list[float], int]: ...
 
 
-def is_converged(network: PoseNetwork, objective: float, decrement: float) -> bool:
-    """Whether a decrement is negligible: 1e-9 of the objective, or 1e-14 per residual."""
-    return bool(decrement <= RELATIVE * objective + ABSOLUTE * network.residuals)
+def limits_of(measurements: int) -> Limits:
+    """A decrement is negligible at 1e-9 of the objective, or 1e-14 per residual."""
+    return Limits(RELATIVE, ABSOLUTE * measurements)
 
 
 def polish(
@@ -90,7 +120,8 @@ def polish(
     best_known: float = np.inf,
     max_iterations: int = 200,
     foretell: bool = False,
-) -> Polished:
+    limits: Limits | None = None,
+) -> Optimum:
     """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
 
     Parameters
@@ -102,39 +133,46 @@ def polish(
         Gauss-Newton and damped steps together.
     foretell : bool
         Save the last step where the rate of convergence foretells that it changes nothing that counts.
+    limits : Limits, optional
+        By default :func:`limits_of` the measurements.
 
     Returns
     -------
-    Polished
+    Optimum
         Never worse than ``values``.
     """
-    best = _descend(problem, values, best_known, max_iterations, foretell)
+    limits = limits or limits_of(problem.flat.measurements)
+    best = _descend(problem, values, best_known, max_iterations, foretell, limits)
     if best.status == "stalled" and not np.isfinite(best.decrement) and problem.factorization == "CHOLESKY":
         # the normal equations are what failed; QR squares no condition number
-        log.info("%s: Cholesky made no progress, going on with QR", problem.network.source)
+        log.info("Cholesky made no progress, going on with QR")
         problem.factorization = "QR"
-        again = _descend(problem, best.values, best_known, max_iterations, foretell)
+        again = _descend(problem, best.values, best_known, max_iterations, foretell, limits)
         if again.objective <= best.objective:
-            best = Polished(
-                again.values, again.objective, again.decrement, best.iterations + again.iterations, again.status
+            best = replace(
+                again, objective_initial=best.objective_initial, iterations=best.iterations + again.iterations
             )
     return best
 
 
-def _descend(problem: Problem, values: Any, best_known: float, budget: int, foretell: bool) -> Polished:
+def _descend(problem: Problem, values: Any, best_known: float, budget: int, foretell: bool, limits: Limits) -> Optimum:
     objective, used, attempts = problem.objective(values), 0, 0
     history = [objective]
+
+    def end(decrement: float, status: Status) -> Optimum:
+        return Optimum(values, history[0], objective, decrement, used, status)
+
     while used < budget:
-        patience = PATIENCE if attempts == 0 else 2
-        found = _newton(problem, values, objective, min(budget - used, 40), patience, foretell)
+        patience = limits.patience if attempts == 0 else min(2, limits.patience)
+        found = _newton(problem, values, objective, min(budget - used, 40), patience, foretell, limits)
         used, attempts = used + found.iterations, attempts + 1
         if found.objective < objective:
             values, objective = found.values, found.objective
             history.append(objective)
-        if found.status == "converged":
-            return Polished(values, objective, found.decrement, used, "converged")
+        if found.converged:
+            return end(found.decrement, "converged")
         if _hopeless(history, best_known, used):
-            return Polished(values, objective, found.decrement, used, "rejected")
+            return end(found.decrement, "rejected")
         # damped: always downhill, until Gauss-Newton is worth another try
         before = objective
         values, taken, steps = problem.damped(values, objective, budget - used)
@@ -142,17 +180,17 @@ def _descend(problem: Problem, values: Any, best_known: float, budget: int, fore
         objective = history[-1]
         used += max(steps, 1)
         if _hopeless(history, best_known, used):
-            return Polished(values, objective, float("inf"), used, "rejected")
+            return end(float("inf"), "rejected")
         if not objective < before:
             decrement = problem.decrement(values)
-            done = is_converged(problem.network, objective, decrement)
-            return Polished(values, objective, decrement, used, "converged" if done else "stalled")
+            return end(decrement, "converged" if limits.reached(objective, decrement) else "stalled")
     decrement = problem.decrement(values)
-    done = is_converged(problem.network, objective, decrement)
-    return Polished(values, objective, decrement, used, "converged" if done else "out of iterations")
+    return end(decrement, "converged" if limits.reached(objective, decrement) else "out of iterations")
 
 
-def _newton(problem: Problem, values: Any, objective: float, budget: int, patience: int, foretell: bool) -> Polished:
+def _newton(
+    problem: Problem, values: Any, objective: float, budget: int, patience: int, foretell: bool, limits: Limits
+) -> Optimum:
     """Full Gauss-Newton steps, allowed to climb for a while.
 
     After rotations-first the first step often trades a higher objective for the right shape, and the next ones fall
@@ -162,14 +200,14 @@ def _newton(problem: Problem, values: Any, objective: float, budget: int, patien
     while steps < budget and since < patience:
         try:
             moved, fall, now = problem.newton_step(values)
-        except RuntimeError:
+        except FAILED:
             break
         steps += 1
         # at a minimum to rounding the step may go either way by a trifle; a clearly negative fall is a failed solve
-        if values is best and is_converged(problem.network, lowest, abs(fall)):
+        if values is best and limits.reached(lowest, abs(fall)):
             if now < lowest:
                 best, lowest = moved, now
-            return Polished(best, lowest, max(fall, 0.0), steps, "converged")
+            return Optimum(best, objective, lowest, max(fall, 0.0), steps, "converged")
         if not np.isfinite(now) or fall < 0.0 or now > CLIMB * lowest:
             break
         held = values is best and abs(lowest - now - fall) <= TRUE_TO_WORD * fall
@@ -177,9 +215,9 @@ def _newton(problem: Problem, values: Any, objective: float, budget: int, patien
         values, since = moved, since + 1
         if now < lowest:
             best, lowest, since = moved, now, 0
-            if foretell and held and left <= FAST * fall and is_converged(problem.network, lowest, 3.0 * left):
-                return Polished(best, lowest, left, steps, "converged")
-    return Polished(best, lowest, float("inf"), steps, "stalled")
+            if foretell and held and left <= FAST * fall and limits.reached(lowest, 3.0 * left):
+                return Optimum(best, objective, lowest, left, steps, "converged")
+    return Optimum(best, objective, lowest, float("inf"), steps, "stalled")
 
 
 def _hopeless(history: list[float], best_known: float, used: int) -> bool:
