@@ -6,7 +6,7 @@
 
 g2o orders a 3-D information matrix translation first; a :class:`PoseNetwork` holds rotation first. The entries
 themselves are kept as they are, as GTSAM does: g2o's own residual uses the vector part of the quaternion, half the
-rotation vector, so the two programs print different objectives for one file (:mod:`graphslam.solve.network.model`
+rotation vector, so the two programs print different objectives for one file (:mod:`graphslam.solve.network.solve`
 offers both). Files end in blank lines and may be compressed.
 """
 

@@ -67,7 +67,7 @@ def test_registry():
         assert solver.solution().converged
         assert solver.gap() == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(solver.covariance().marginal("x1"), C, rtol=1e-9)
-    with pytest.raises(UnknownNameError, match="batch, gnc, isam2, lm"):
+    with pytest.raises(UnknownNameError, match="batch, gnc, isam2, lm, pcg"):
         make_solver("magic", PoseGraph())
     with pytest.raises(ConfigError, match="positive thresholds"):
         Isam2Solver(PoseGraph(), relinearize_threshold=0.0)

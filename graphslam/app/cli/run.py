@@ -43,7 +43,7 @@ def register(app: typer.Typer) -> None:
 def run(
     source: str = typer.Argument(..., help="Name of a data-set card, or a folder that holds a log."),
     frontend: str = typer.Option("rbpf-ekf", help="Name of the front end that turns the log into submaps."),
-    solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch or gnc."),
+    solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
     config: Path | None = typer.Option(
         None, help="TOML file with options; they replace those of the preset of the source."
     ),

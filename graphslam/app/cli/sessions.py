@@ -25,7 +25,7 @@ def merge(
         "auto",
         help="How runs are aligned. Landmarks: identity or constellation. Dense submaps: places or gps. Or auto.",
     ),
-    solver: str = typer.Option("batch", help="Name of the solver: isam2, lm, batch or gnc."),
+    solver: str = typer.Option("batch", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
     identity_gate: float = typer.Option(
         25.0, help="Sightings with a larger χ² (2 degrees of freedom) become separate landmarks. 0: never."
     ),
