@@ -38,7 +38,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> SensorLog:
     return load_log(folder)
 
 
-@pytest.mark.parametrize("solver", ["isam2", "lm", "gnc"])
+@pytest.mark.parametrize("solver", ["isam2", "lm", "gnc", "pcg"])
 def test_a_recorded_compass_and_beacons_enter_the_graph(recorded: SensorLog, solver: str, tmp_path: Path) -> None:
     config = {"compass": {"use": "auto"}, "beacons": {"use": "radio", "robust": "huber"}, "gps": {"use": "all"}}
     run = gs.run(recorded, seed=5, solver=solver, out=tmp_path / "r", progress=False, config=config)
