@@ -24,8 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
+from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.network import values_of
 from graphslam.io.network_file import read_network
-from graphslam.solve.network.factors import from_values, to_graph, to_values
+from graphslam.solve.network.factors import to_graph
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import odometry_start
 from tests.reference.plain_network import edge_costs
@@ -52,11 +54,11 @@ def gtsam_gnc(network: PoseNetwork, limit: float) -> tuple[np.ndarray, np.ndarra
     params.setLossType(gtsam.GncLossType.TLS)
     a = len(network.anchors)
     params.setKnownInliers([*range(a), *(a + np.flatnonzero(is_odometry(network.edges))).tolist()])
-    values = to_values(network, odometry_start(network), np.zeros((0, 2)))
-    optimizer = gtsam.GncLMOptimizer(to_graph(network), values, params)
+    start = values_of(network, odometry_start(network))
+    optimizer = gtsam.GncLMOptimizer(to_graph(network), to_gtsam(start, held=True), params)
     optimizer.setInlierCostThresholds(0.5 * limit)
     found = optimizer.optimize()
-    return from_values(network, found)[0], np.asarray(optimizer.getWeights())[a:] < 0.5
+    return from_gtsam(found, start).poses, np.asarray(optimizer.getWeights())[a:] < 0.5
 
 
 def main() -> int:

@@ -16,7 +16,9 @@ from graphslam.graph.factors.batch import (
     Index,
     UniformBatch,
     gtsam_pose,
+    gtsam_poses,
     safe_factor,
+    shared_noise,
     with_kernel,
 )
 from graphslam.graph.noise import NO_KERNEL, Robust
@@ -128,6 +130,12 @@ class BetweenBatch(UniformBatch):
         J_j = np.linalg.inv(G.right_jacobian(r))  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
         J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
         return r, np.concatenate([J_i, J_j], axis=2)
+
+    def natives(self) -> list[gtsam.NonlinearFactor]:
+        """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular."""
+        make = gtsam.BetweenFactorPose2 if self.dim == 2 else gtsam.BetweenFactorPose3
+        i, j = (gtsam_key("x0") + self._rows).T.tolist()
+        return list(map(make, i, j, gtsam_poses(self._T), shared_noise(self.whiteners)))
 
     @classmethod
     def gtsam(cls, record: BetweenRecord, origin: Array) -> gtsam.NonlinearFactor:

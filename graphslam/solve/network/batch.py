@@ -13,10 +13,11 @@ import numpy as np
 
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.flat import FlatGraph
+from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import problem_of_network, values_of
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import RELATIVE
-from graphslam.solve.network.factors import from_values, to_graph, to_values
+from graphslam.solve.network.factors import to_graph
 
 # Above this spread of information normal equations lose the small directions: QR instead of Cholesky.
 CHOLESKY_LIMIT = 1e10
@@ -39,17 +40,17 @@ class BatchProblem:
     def __init__(self, network: PoseNetwork, used: np.ndarray | None = None, flat: FlatGraph | None = None) -> None:
         self.network = network
         self.flat = problem_of_network(network, ordered=False) if flat is None else flat
-        self.graph = to_graph(network, used)
+        self.graph = to_graph(network, used, self.flat)
         self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(self.graph)
         self.factorization = "QR" if information_spread(network) > CHOLESKY_LIMIT else "CHOLESKY"
 
     def pack(self, values: Values) -> gtsam.Values:
         """Values as GTSAM holds them."""
-        return to_values(self.network, values.poses, values.landmarks)
+        return to_gtsam(values, held=True)
 
     def unpack(self, values: gtsam.Values) -> Values:
         """GTSAM's values as ours."""
-        return values_of(self.network, *from_values(self.network, values))
+        return from_gtsam(values, values_of(self.network, self.network.poses))
 
     def objective(self, values: gtsam.Values) -> float:
         """``Σ rᵀ Ω r`` (GTSAM's error is half of it)."""

@@ -20,18 +20,18 @@ from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.graph.factors.batch import gtsam_pose, pose_array
+from graphslam.graph.network import problem_of_network
+from graphslam.graph.variables import gtsam_key
 from graphslam.solve.network.factors import (
     anchor_factors,
-    edge_factors,
     indeterminate,
-    landmark_key,
-    observation_factors,
-    pose3_array,
-    pose_values,
+    measured_factors,
 )
 from graphslam.solve.network.start import cartesian_observations, neighbours
 
 log = logging.getLogger(__name__)
+X, L = gtsam_key("x0"), gtsam_key("l0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
     """
     options = options or Isam2Options()
     isam = gtsam.ISAM2(options.params())
-    edges, sightings = edge_factors(network), observation_factors(network)
+    edges, sightings = measured_factors(problem_of_network(network, ordered=False))
     seen_from: list[list[int]] = [[] for _ in range(len(network))]
     for k, (v, _) in enumerate(network.observations.tolist()):
         seen_from[v].append(k)
@@ -137,7 +137,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
             graph.push_back(anchors[v])
         else:
             poses[v] = _from_neighbour(network, v, links, poses, fresh, isam, z, z_inv)
-        values.insert(v, pose_values(network, poses[v][None])[0])
+        values.insert(X + v, gtsam_pose(poses[v]))
         fresh.add(v)
         for e in links:
             graph.push_back(edges[e])
@@ -146,7 +146,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
             mark = int(network.observations[k, 1])
             if mark not in known_marks:
                 known_marks.add(mark)
-                values.insert(landmark_key(mark), se2_transform(poses[v], local[k]))
+                values.insert(L + int(network.landmark_ids[mark]), se2_transform(poses[v], local[k]))
         if count % batch == 0 or count == len(steps):
             try:
                 isam.update(graph, values)
@@ -176,7 +176,5 @@ def _from_neighbour(
 
 
 def _current(network: PoseNetwork, isam: gtsam.ISAM2, k: int) -> Array:
-    if network.dim == 2:
-        p = isam.calculateEstimatePose2(k)
-        return np.array([p.x(), p.y(), p.theta()])
-    return pose3_array(isam.calculateEstimatePose3(k))
+    estimate = isam.calculateEstimatePose2 if network.dim == 2 else isam.calculateEstimatePose3
+    return pose_array(estimate(X + k))

@@ -78,10 +78,11 @@ def _chordal(network: PoseNetwork) -> Start:
 
 
 def _incremental(network: PoseNetwork) -> Start:
-    from graphslam.solve.network.factors import from_values
+    from graphslam.graph.gtsam_values import from_gtsam
     from graphslam.solve.network.incremental import run_isam2
 
-    return from_values(network, run_isam2(network))
+    found = from_gtsam(run_isam2(network), values_of(network, network.poses))
+    return found.poses, found.landmarks
 
 
 # In the order in which they are tried.

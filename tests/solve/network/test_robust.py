@@ -13,11 +13,12 @@ from scipy import stats
 from graphslam.core.errors import ConfigError
 from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
+from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import problem_of_network, values_of
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import loop_consensus, odometry_edges
-from graphslam.solve.network.factors import from_values, to_graph, to_values
+from graphslam.solve.network.factors import to_graph
 from graphslam.solve.network.robust import truncated_cost
 from graphslam.solve.network.solve import solve_network
 from tests.reference.huber import huber_least_squares
@@ -124,14 +125,14 @@ def test_gtsams_gnc_agrees_where_it_succeeds() -> None:
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers([0, *(1 + np.flatnonzero(is_odometry(mixed.network.edges))).tolist()])
-    start = to_values(mixed.network, net.poses, np.zeros((0, 2)))
-    optimizer = gtsam.GncLMOptimizer(to_graph(mixed.network), start, params)
+    start = values_of(mixed.network, net.poses)
+    optimizer = gtsam.GncLMOptimizer(to_graph(mixed.network), to_gtsam(start, held=True), params)
     optimizer.setInlierCostThresholds(0.5 * float(answer.details["edge_limit"]))
-    arrays = from_values(mixed.network, optimizer.optimize())
+    found = from_gtsam(optimizer.optimize(), start)
     assert answer.inliers is not None
     assert ((np.asarray(optimizer.getWeights())[1:] > 0.5) == answer.inliers).all()
     limit = np.where(is_odometry(mixed.network.edges), np.inf, stats.chi2.ppf(0.9999, 3))
-    theirs = truncated_cost(problem_of_network(mixed.network), values_of(mixed.network, *arrays), limit)
+    theirs = truncated_cost(problem_of_network(mixed.network), found, limit)
     assert answer.details["objective_truncated"] <= theirs * (1 + 1e-6)
 
 
