@@ -24,7 +24,7 @@ from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
-from graphslam.loops.find_loops import FindConfig, find_loops
+from graphslam.loops.find_loops import FindConfig, LoopSearch
 from graphslam.loops.ledger import DECIDED, Decision, LoopLedger, ledger_of_events, same_loop
 from graphslam.loops.ties import TieConfig, ties_entries
 from graphslam.solve.registry import make_solver
@@ -91,6 +91,8 @@ class BackEnd:
         self.solver = make_solver(self.solver_name, self.graph)
         self._waiting: list[tuple[Gps, GpsOptions]] = []
         self._later: list[Callable[[PoseGraph], object]] = []  # until the first submap says which dimension it is
+        self._loops: LoopSearch | None = None
+        self._noted = 0  # decisions on loops that are among the events
         kind = self.config.match_robust
         self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
         self._association = AssociationConfig(
@@ -126,11 +128,21 @@ class BackEnd:
         solved = time.perf_counter()
         self.seconds["associate"] += associated - start
         self.seconds["solve"] += solved - associated
-        if self.config.merge_every and len(self.graph.submaps) % self.config.merge_every == 0:
+        n = len(self.graph.submaps)
+        if self.config.merge_every and n % self.config.merge_every == 0:
             self.merge()
+        if self.config.look_every and n % self.config.look_every == 0:
+            self._look()
         self.per_submap_s.append(time.perf_counter() - start)
         for o in self.observers:
             o.submap_added(submap, self.graph)
+
+    def _look(self) -> None:
+        """While the run goes on: what IMUs say of the submaps so far, and loops."""
+        if self.imu is not None and self.imu.tie(self.graph, more=True):
+            self.solver.update()
+        if self.config.loops:
+            self.find_loops(last=False)
 
     def append(self, submap: Submap) -> float:
         """Associate and add without solving; returns the time at which it was associated [s]."""
@@ -223,22 +235,31 @@ class BackEnd:
             o.solved(solution)
         return solution
 
-    def find_loops(self) -> LoopLedger:
+    def find_loops(self, *, last: bool = True) -> LoopLedger:
         """Look for loops between the submaps, take those that are believed, and note every decision.
 
         The front end's matches are among them: until now each had a factor by its support alone.
+
+        Parameters
+        ----------
+        last : bool
+            No more submaps will come (:class:`~graphslam.loops.find_loops.LoopSearch`).
         """
         start = time.perf_counter()
         for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
             self.graph.remove(fid, reason=DECIDED)
         self.solver.solve_to_optimum()
-        ledger = find_loops(self.graph, self.solver, self.submaps, find_config(self.config)).ledger
-        for event in ledger.events():
+        self._loops = self._loops or LoopSearch(find_config(self.config))
+        ledger = self._loops.look(self.graph, self.solver, self.submaps, last=last).ledger
+        new = ledger.decisions[self._noted :]
+        self._noted = len(ledger.decisions)
+        for decision in new:
+            event = decision.event()
             self.graph.note(event.pop("event"), **event)
-        for decision in ledger.current():
+        for n in dict.fromkeys(d.loop for d in new):
             for o in self.observers:
-                o.loop_decided(decision, self.graph)
-        self.seconds["loops"] = time.perf_counter() - start
+                o.loop_decided(ledger.of(n), self.graph)
+        self.seconds["loops"] = self.seconds.get("loops", 0.0) + time.perf_counter() - start
         return ledger
 
     def undo_loop(self, loop: int) -> None:

@@ -81,8 +81,10 @@ class BackEndConfig:
     match_width: float = 2.385
     """Width of that kernel in standard deviations."""
     loops: bool = False
-    """At the end, look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
+    """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
     The front end's matches are decided on with them; without, each that has the support is a factor."""
+    look_every: int = 5
+    """While the run goes on, tie in IMUs and look for loops after every so many submaps, too; 0 = at the end only."""
     loop_overlap: float = 8.0
     """Maps of two places are matched if the places may be nearer than this [m] …"""
     loop_height: float = 1.0
@@ -93,6 +95,6 @@ class BackEndConfig:
     """Also try places that look alike, wherever they are."""
 
     def __post_init__(self) -> None:
-        for name in ("node_spacing", "level_sigma", "match_support", "loop_overlap", "loop_height"):
+        for name in ("node_spacing", "level_sigma", "match_support", "loop_overlap", "loop_height", "look_every"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"backend.{name} must not be negative, got {getattr(self, name)}")

@@ -96,7 +96,7 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
 
 
 class ImuPart:
-    """The IMUs of a run: axes are looked at while it goes on, factors are made when its submaps are complete.
+    """The IMUs of a run: axes are looked at, and factors are made, while it goes on.
 
     Parameters
     ----------
@@ -112,6 +112,7 @@ class ImuPart:
     def __init__(self, imus: dict[str, Imu], config: ImuOptions) -> None:
         self.imus, self.config = imus, config
         self._looked: set[str] = set()
+        self._given: set[str] = set()
         if config.use not in ("none", "auto") and config.use not in imus:
             raise MissingDataError(
                 "imu.use names no IMU of the log",
@@ -138,8 +139,14 @@ class ImuPart:
                 self._looked.add(name)
                 graph.check_imu(imu, stream=name, axes=self.config.axes)
 
-    def tie(self, graph: PoseGraph) -> int:
-        """Give the graph the IMUs that are to be used; returns the number of factors.
+    def tie(self, graph: PoseGraph, *, more: bool = False) -> int:
+        """Give the graph the IMUs that are to be used; returns the number of new factors.
+
+        Parameters
+        ----------
+        graph : PoseGraph
+        more : bool
+            More submaps will come: what is said once of an IMU is said later.
 
         Raises
         ------
@@ -149,10 +156,16 @@ class ImuPart:
         made = 0
         for name in self._wanted(graph):
             if graph.dim != 3:
+                if more:
+                    continue
                 graph.note("imu-not-used", stream=name, why="the graph is in the plane")
                 logger.warning("%s is not used: the graph is in the plane", name)
                 continue
-            made += len(graph.add_imu(self.imus[name], stream=name, config=self.config))
+            imu = self.imus[name]
+            if name in self._given:  # its readings are there already: only submaps are new
+                imu = imu.take(np.zeros(len(imu.times), dtype=bool))
+            made += len(graph.add_imu(imu, stream=name, config=self.config, more=more))
+            self._given.add(name)
         return made
 
     def _wanted(self, graph: PoseGraph) -> list[str]:
@@ -161,7 +174,7 @@ class ImuPart:
         if self.config.use != "auto":
             return [self.config.use]
         spent = {e.stream for e in graph.ledger.entries()}
-        return [name for name in self.imus if name not in spent]
+        return [name for name in self.imus if name in self._given or name not in spent]
 
 
 def recentred(graph: PoseGraph, solver: Solver) -> None:

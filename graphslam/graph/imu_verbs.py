@@ -49,7 +49,9 @@ class ImuVerbs(AttitudeVerbs):
         super().__init__(dim)
         self.imus: dict[str, ImuUse] = {}
 
-    def add_imu(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None) -> list[int]:
+    def add_imu(
+        self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False
+    ) -> list[int]:
         """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
 
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
@@ -71,6 +73,9 @@ class ImuVerbs(AttitudeVerbs):
             Its name in the ledger.
         config : ImuConfig, optional
             By default that of the call before.
+        more : bool
+            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
+            not checked, nor what is left out counted.
 
         Returns
         -------
@@ -96,20 +101,25 @@ class ImuVerbs(AttitudeVerbs):
             raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
         bias_sigma(imu.noise)
         places = places_of(self.submaps, cfg.window)
+        if more and self.submaps:
+            places.pop(self.submaps[-1].exit_node, None)
         plan = plan_of(self.submaps, self.records.values(), imu, stream, cfg, places)
         for a, b in plan.pairs:
             self.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
         for n in plan.gravity:
             self.ledger.check(f"gravity seen by {stream} at x{n}", [stream], window_of(places[n].time, cfg))
-        self.check_imu(imu, stream=stream, axes=cfg.axes)
+        if not more:
+            self.check_imu(imu, stream=stream, axes=cfg.axes)
         self.imus[stream] = ImuUse(imu, cfg)
         ids = self._add_ways(imu, stream, cfg, places, plan.pairs)
         ids += self._add_forces(imu, stream, cfg, places, plan)
         ids += self._relink(stream)
-        self._event(
-            "imu", stream=stream, factors=len(ids), ways=len(plan.pairs), gravity=len(plan.gravity),
-            dropped=dict(plan.dropped),
-        )  # fmt: skip
+        if not more:
+            mine = [r for r in self.records.values() if getattr(r, "stream", None) == stream]
+            self._event(
+                "imu", stream=stream, factors=len(mine), ways=sum(isinstance(r, ImuRecord) for r in mine),
+                gravity=sum(isinstance(r, ForceRecord) for r in mine), dropped=dict(plan.dropped),
+            )  # fmt: skip
         return ids
 
     def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:

@@ -140,6 +140,7 @@ def proximity_candidates(
     *,
     exclude: Collection[tuple[int, int]] = (),
     tried: Sequence[tuple[int, int]] = (),
+    since: int = 0,
 ) -> list[Candidate]:
     """Pairs that may see the same surroundings by what the graph knows, most telling first.
 
@@ -153,6 +154,8 @@ def proximity_candidates(
         Pairs of submaps (either way round) that are not tried: their maps hold the same scans.
     tried : sequence of (int, int)
         Pairs of places that were tried before: their stretches are not tried again.
+    since : int
+        Only pairs whose later place lies in this submap of the chain or a later one.
 
     Returns
     -------
@@ -163,7 +166,7 @@ def proximity_candidates(
     first, second = np.triu_indices(n, 1)
     far = places.way[second] - places.way[first] >= c.least_way
     # a map against itself finds itself: stretches of one submap are no pair
-    far &= places.submap[first] != places.submap[second]
+    far &= (places.submap[first] != places.submap[second]) & (places.submap[second] >= since)
     if exclude:
         m = int(places.submap.max()) + 1
         shut = np.zeros((m, m), bool)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from graphslam.core.errors import ConfigError, DataError
@@ -22,6 +22,7 @@ from graphslam.loops.graph_loops import GraphLoops, GraphSolver, chain_of_graph
 from graphslam.loops.judge import settled_loops
 from graphslam.loops.loops import LoopCloser, LoopConfig
 from graphslam.loops.measure import LoopMeasurer
+from graphslam.loops.places import Places
 from graphslam.loops.ties import Entry, TieConfig, tie_candidates, ties_entries
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.place_descriptor import DescriptorConfig, describe, join
@@ -94,41 +95,91 @@ def find_loops(
     >>> found = gs.find_loops(graph, solver, submaps)
     >>> found.ledger.table()
     """
-    c = FindConfig() if config is None else config
-    if [s.key for s in submaps] != [s.key for s in graph.submaps]:
-        raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))
-    ours = GraphLoops(graph, solver)
-    closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions, judge=settled_loops)
-    measurer = LoopMeasurer(submaps, ours.places, c.pairs)
-    shared = sharing_maps(submaps)
-    tried: list[tuple[int, int]] = []
+    return LoopSearch(config).look(graph, solver, submaps, last=True, progress=progress)
 
-    def go(candidates: Sequence[Candidate]) -> int:
-        before = len(closer.accepted)
-        closer.propose(measurer.measure(candidates, progress=progress))
-        return len(closer.accepted) - before
 
-    if c.front_end:
-        go(front_end_candidates(submaps, ours.places, c.candidates))
-    for _ in range(c.rounds):
-        near = proximity_candidates(ours.places, ours.relative, c.candidates, exclude=shared, tried=tried)
-        tried += [(x.i, x.j) for x in near]
-        if go(near) <= 0:
-            break
-    if c.appearance is not None and len(submaps) > 1:
+class LoopSearch:
+    """Looks for loops in a graph again and again while it grows; what was decided is decided on again with what is new.
+
+    A look compares the submaps that came since the one before with all of them. The last look takes all pairs, also
+    those that were refused, for the graph knows more of them by then; and it takes what asks for the whole chain:
+    places that look alike, ties.
+
+    Parameters
+    ----------
+    config : FindConfig, optional
+    """
+
+    def __init__(self, config: FindConfig | None = None) -> None:
+        self.config = FindConfig() if config is None else config
+        self.closer: LoopCloser | None = None
+        self._measurer: LoopMeasurer | None = None
+        self._seen = 0
+
+    def look(
+        self,
+        graph: PoseGraph,
+        solver: GraphSolver,
+        submaps: Sequence[Submap],
+        *,
+        last: bool = False,
+        progress: bool = False,
+    ) -> LoopCloser:
+        """Look for loops; parameters and errors are those of :func:`find_loops`; ``last``: no more submaps come."""
+        c = self.config
+        if [s.key for s in submaps] != [s.key for s in graph.submaps]:
+            raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))
+        ours = GraphLoops(graph, solver)
         p = ours.places
+        if self.closer is None or self._measurer is None:
+            self.closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions, judge=settled_loops)
+            self._measurer = LoopMeasurer(submaps, p, c.pairs)
+        closer, measurer = self.closer, self._measurer
+        closer.go_on(ours, *chain_of_graph(graph))
+        measurer.go_on(submaps, p)
+        shared, since = sharing_maps(submaps), 0 if last else self._seen
+
+        def go(candidates: Sequence[Candidate]) -> int:
+            before = len(closer.accepted)
+            closer.propose(measurer.measure(candidates, progress=progress))
+            return len(closer.accepted) - before
+
+        if c.front_end:
+            go([x for x in front_end_candidates(submaps, p, c.candidates) if p.submap[x.j] >= self._seen])
+        # what was refused may have a better place beside it by now
+        tried = [(x.i, x.j) for x in closer.loops.values() if not x.why]
+        for _ in range(c.rounds):
+            near = proximity_candidates(p, ours.relative, c.candidates, exclude=shared, tried=tried, since=since)
+            tried += [(x.i, x.j) for x in near]
+            if go(near) <= 0:
+                break
+        self._seen = len(submaps)
+        if last:
+            self._look_alike(p, shared, tried, go)
+            if c.ties is not None and c.front_end:
+                go(tie_candidates(submaps, p, _believed(closer), c.ties))
+                _drop_orphans(closer)
+        logger.info("loops: %s", closer.ledger.counts() or "no candidates")
+        return closer
+
+    def _look_alike(
+        self,
+        p: Places,
+        shared: set[tuple[int, int]],
+        tried: Sequence[tuple[int, int]],
+        go: Callable[[Sequence[Candidate]], int],
+    ) -> None:
+        """Also places that look alike, wherever they are."""
+        c, measurer = self.config, self._measurer
+        if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
+            return
         parts = [
             describe(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
-            for k in range(len(submaps))
+            for k in range(len(measurer.submaps))
         ]
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, join(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
-    if c.ties is not None and c.front_end:
-        go(tie_candidates(submaps, ours.places, _believed(closer), c.ties))
-        _drop_orphans(closer)
-    logger.info("loops: %s", closer.ledger.counts() or "no candidates")
-    return closer
 
 
 def _believed(closer: LoopCloser) -> set[Entry]:

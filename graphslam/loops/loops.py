@@ -77,6 +77,10 @@ class LoopCloser:
 
     # ---------------------------------------------------------------- deciding
 
+    def go_on(self, graph: LoopGraph, increments: Array, covariances: Array) -> None:
+        """The chain has grown: the same loops, in a longer chain."""
+        self.graph, self.increments, self.covariances = graph, increments, covariances
+
     @property
     def accepted(self) -> list[int]:
         """Numbers of the loops that are in the graph."""

@@ -69,6 +69,10 @@ class LoopMeasurer:
         self.config = PairConfig() if config is None else config
         self._maps: dict[int, PreparedMap] = {}
 
+    def go_on(self, submaps: Sequence[Submap], places: Places) -> None:
+        """The chain has grown; maps that are prepared stay so."""
+        self.submaps, self.places = submaps, places
+
     def prepared(self, k: int) -> PreparedMap:
         """The map of submap ``k`` of the chain.
 

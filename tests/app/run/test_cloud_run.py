@@ -19,10 +19,14 @@ from graphslam.app.run import pipeline
 from graphslam.app.run.files import loops_of_run
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.run import Run
+from graphslam.backend.back_end import Observer
 from graphslam.core.config import build
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
+from graphslam.core.submap import Submap
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_store import read_submaps
+from graphslam.loops.ledger import Decision
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -33,7 +37,7 @@ from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Nearly one and a half times round a block: the way comes back to where it was."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +47,13 @@ def go(log: SensorLog) -> Any:
         patch.setattr(pipeline, "recommended", lambda *_: {})
         patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build(CloudConfig, o, "frontend")))
 
-        def run(out: Path | None = None, *, loops: bool = True, resume: bool = False, **front: Any) -> Run:
-            options = {"frontend": {"length": 8.0, "steps": {"max_range": 8.0}, **front}, "backend": {"loops": loops}}
-            return gs.run(log, frontend="clouds", config=options, out=out, resume=resume, progress=False)
+        def run(out: Path | None = None, *, every: int = 2, loops: bool = True, **how: Any) -> Run:
+            front = {k: how.pop(k) for k in ("origins", "grid") if k in how}
+            options = {
+                "frontend": {"length": 8.0, "steps": {"max_range": 8.0}, **front},
+                "backend": {"loops": loops, "look_every": every},
+            }
+            return gs.run(log, frontend="clouds", config=options, out=out, progress=False, **how)
 
         yield run
 
@@ -63,7 +71,7 @@ def assert_right(run: Run, log: SensorLog) -> int:
         x = log.truth.trajectory.interpolate(run.map.node_times[[e["i"], e["j"]]])
         r = SE3.log(SE3.between(SE3.between(x[0], x[1]), np.array(e["T_ij"])))
         assert r @ np.linalg.solve(np.array(e["covariance"]), r) < stats.chi2.ppf(0.9973, 6)
-        assert np.linalg.norm(r[3:]) < 0.5
+        assert e["gates"]["loose"] or np.linalg.norm(r[3:]) < 0.5  # along a corridor its σ says that it does not know
     return len(taken)
 
 
@@ -74,6 +82,36 @@ def test_loops_between_clouds_close_the_map(finished: Run, go: Callable[..., Run
     assert finished.metric("path_rmse_aligned") < 0.3 * open_chain.metric("path_rmse_aligned")
     assert finished.metric("map_entropy") < 0.95 * finished.metric("map_entropy_open_chain")
     assert finished.metric("converged") == 1
+
+
+class Listener(Observer):
+    """Submaps in the graph and loops accepted, in the order in which they came."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+
+    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+        self.told.append(submap.key)
+
+    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+        if decision.verdict == "accepted":
+            assert decision.factor_id in graph.records
+            self.told.append((decision.submap_i, decision.submap_j))
+
+
+def test_loops_enter_while_the_run_goes_on(go: Callable[..., Run], log: SensorLog) -> None:
+    heard, late = Listener(), Listener()
+    now = go(every=1, observers=[heard])
+    end = go(every=0, observers=[late])
+    last = [s.key for s in now.submaps][-1]
+    for n, x in enumerate(heard.told):
+        if isinstance(x, tuple):
+            assert set(x) <= set(heard.told[:n]) | {last}
+    first = next(n for n, x in enumerate(heard.told) if isinstance(x, tuple))
+    assert last in heard.told[first:], "no loop was there before the last submap"
+    assert last not in late.told[next(n for n, x in enumerate(late.told) if isinstance(x, tuple)) :]
+    assert assert_right(now, log) >= assert_right(end, log)
+    assert now.metric("path_rmse_aligned") < 1.5 * end.metric("path_rmse_aligned")
 
 
 def test_points_alone_are_not_matched_where_they_do_not_fit_whole(go: Callable[..., Run], log: SensorLog) -> None:

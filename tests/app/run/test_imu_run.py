@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from graphslam.app.run import pipeline
 from graphslam.app.run.config import RunConfig
+from graphslam.backend.back_end import Observer
 from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
 from graphslam.core.imu import Imu
@@ -149,3 +151,34 @@ def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):
             replace(log, streams={**log.streams, "imu": wrong}), frontend="segslam", seed=2, config=options,
             progress=False,
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("longest", [10.0, 1.0], ids=["ways", "gravity"])
+def test_it_enters_while_the_run_goes_on_and_ends_where_it_would(longest, monkeypatch, tmp_path):
+    """After every submap, after every third, or at the end: the same factors, and the same optimum."""
+    log, submaps = made()
+    seen: list[int] = []
+
+    class Count(Observer):
+        def submap_added(self, submap: Submap, graph: Any) -> None:
+            seen.append(sum(getattr(r, "stream", "") == "imu" for r in graph.records.values()))
+
+    runs = {}
+    for every in (0, 3, 1):
+        config = {"imu": {"use": "auto", "longest": longest}, "backend": {"look_every": every}}
+        seen.clear()
+        runs[every] = solved(log, submaps, monkeypatch, config=config, observers=[Count()])
+        steps = np.diff([0, *seen])
+        assert np.all((steps > 0) == (np.arange(1, 9) % every == 0 if every else np.zeros(8, bool)))
+
+    def kinds(r: Any) -> Counter[Any]:
+        return Counter(
+            (type(x).__name__, *(v for v in x.variables() if v.startswith("x"))) for x in r.graph.records.values()
+        )
+
+    a = runs[0]
+    for b in (runs[3], runs[1]):
+        assert kinds(b) == kinds(a)
+        assert [e for e in b.events if e["event"] == "imu"] == [e for e in a.events if e["event"] == "imu"]
+        assert b.solution.objective == pytest.approx(a.solution.objective, rel=1e-4)
+        np.testing.assert_allclose(b.map.node_poses, a.map.node_poses, atol=1e-3)

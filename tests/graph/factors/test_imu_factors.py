@@ -199,6 +199,26 @@ def test_online_is_offline(rng):
     assert g.objective().total == pytest.approx(whole.objective().total, rel=1e-4)
 
 
+def test_the_last_node_waits_for_the_submap_that_begins_there(rng):
+    """A far node would see gravity; with the next submap it begins a way, and readings are spent once."""
+    made = ring(rng, submaps=3, seconds=6.0)
+    spacings = (None, 3.0, None)  # far, near, far
+    config = ImuConfig(longest=4.0)
+    whole, g = PoseGraph(3), PoseGraph(3)
+    for k, (s, spacing) in enumerate(zip(made.submaps, spacings)):
+        whole.add_submap(s, spacing=spacing)
+        g.add_submap(s, spacing=spacing)
+        g.add_imu(made.imu.take(slice(None) if k == 0 else slice(0, 0)), config=config, more=k < 2)
+    whole.add_imu(made.imu, config=config)
+
+    def told(graph: PoseGraph) -> list[tuple[str, ...]]:
+        return sorted((type(r).__name__, *(v for v in r.variables() if v[0] == "x")) for r in graph.records.values())
+
+    assert told(g) == told(whole)
+    assert ImuRecord in kinds(g)
+    assert [e for e in g.events if e["event"] == "imu"] == [e for e in whole.events if e["event"] == "imu"]
+
+
 def test_recentring_leaves_what_is_right(rng):
     made = ring(rng, submaps=2, noise=replace(NOISE, gyro_bias=0.05))
     g = chain(made, spacing=None)

@@ -67,9 +67,12 @@ def plan_of(
     gravity: list[int] = []
     last = -np.inf
     for n, place in sorted(places.items(), key=lambda item: item[1].time):
-        if not (cfg.gravity and cfg.accelerometer) or n in near or n in heard:
+        if not (cfg.gravity and cfg.accelerometer) or n in near:
             continue
         begin, end = window_of(place.time, cfg)
+        if n in heard:
+            last = end
+            continue
         if not (t[0] <= begin and end <= t[-1]):
             dropped["gravity outside the readings"] += 1
         elif longest_pause(t, np.array([begin]), np.array([end]))[0] > pause:
