@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factors.batch import FactorBatch
@@ -57,6 +58,34 @@ def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGra
         W = whiteners(network.observation_information)
         batches.append(SightingBatch.of_arrays(network.observations, network.observation_values, polar, W, layout))
     return FlatGraph((), layout, batches)
+
+
+def network_of(flat: FlatGraph, values: Values) -> PoseNetwork:
+    """A problem of relative poses as a network: for what knows nothing else (chordal starts, the certificate).
+
+    Raises
+    ------
+    SolverError
+        The problem holds factors of other kinds, which are named, or robust kernels.
+    """
+    others = sorted({name for f in flat.batches if not isinstance(f, BetweenBatch) for name, _ in f.classes()})
+    if others or flat.has_kernels:
+        what = f"factors of other kinds ({', '.join(others)})" if others else "robust kernels"
+        raise SolverError(f"only relative poses are part of the relaxation, and the graph holds {what}")
+    edges = [f for f in flat.batches if isinstance(f, BetweenBatch)]
+    size, d = values.group.size, values.group.dof
+    W = np.concatenate([np.zeros((0, d, d)), *(f.whiteners for f in edges)])
+    return PoseNetwork(
+        dim=flat.layout.dim,
+        ids=np.arange(flat.layout.nodes),
+        poses=values.poses,
+        has_initial=np.ones(flat.layout.nodes, dtype=bool),
+        edges=np.concatenate([np.zeros((0, 2), dtype=np.intp), *(f.ends for f in edges)]),
+        measurements=np.concatenate([np.zeros((0, size)), *(f.measured for f in edges)]),
+        information=np.swapaxes(W, 1, 2) @ W,
+        fixed=np.isin(np.arange(flat.layout.nodes), flat.layout.fixed),
+        source="graph",
+    )
 
 
 def to_network(graph: PoseGraph) -> PoseNetwork:

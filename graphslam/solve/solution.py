@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import GeometryError, MissingDataError
+from graphslam.core.errors import GeometryError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import Markup, element, join
 from graphslam.core.poses import group_of
@@ -17,10 +18,14 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.flat import FlatGraph
+from graphslam.graph.network import network_of
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
 from graphslam.graph.score import Score, score
 from graphslam.graph.variables import Values, vector_form
 from graphslam.solve.descent import Optimum
+
+if TYPE_CHECKING:
+    from graphslam.solve.network.certificate import Certificate
 
 
 @dataclass(frozen=True)
@@ -154,6 +159,19 @@ class Solution:
             raise GeometryError("poses in space have no covariance as vectors", wanted="joint_marginal")
         P = self.covariance.columns(np.arange(lay.stop("l")))
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
+
+    def certificate(self) -> Certificate:
+        """Whether this is proved to be the global optimum; "not known", with the reason, where that cannot be told.
+
+        The proof covers relative poses: with GPS, an IMU, landmarks, kernels … it does not apply, and says so.
+        """
+        from graphslam.solve.network.certificate import Certificate, certify
+
+        try:
+            network = network_of(self._flat, self.values)
+        except SolverError as error:
+            return Certificate("not known", str(error))
+        return certify(network, self.poses, self.objective)
 
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
         """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory of its own.

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from graphslam.app.solve_file import solve_file
+from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.network import values_of
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
+from graphslam.solve.batch import BatchSolver
 from graphslam.solve.descent import polish
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.certificate import (
@@ -99,6 +102,28 @@ def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
     assert str(refused) == f"not certified (λ_min = {refused.smallest_eigenvalue:.3g})"
     straight = solve_network(net, certificate=True)
     assert str(straight.certificate) == "certified"
+
+
+def test_a_graph_of_a_run_is_judged_and_started_elsewhere_too(rng: np.random.Generator) -> None:
+    net, wound = twisted_ring(20, 1)
+    graph = PoseGraph(2)
+    cov = np.linalg.inv(net.information)
+    graph.add_betweens(net.edges, net.measurements, cov, poses=wound[1:], evidence="shared-scan")
+    solver = BatchSolver(graph)
+    solver.solve_to_optimum()
+    assert solver.solution().converged
+    assert solver.solution().objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
+    assert solver.solution().certificate().verdict == "not certified"
+    assert solver.solve_from() == "chordal"
+    assert solver.solution().objective < 1e-12
+    assert solver.solution().certificate().verdict == "certified"
+    with pytest.raises(UnknownNameError, match="unknown start 'hope'"):
+        solver.solve_from("hope")
+    # with factors of other kinds neither applies, and both say so
+    graph.add_range(2, 9, 4.0, 0.3, evidence="shared-scan")
+    assert "other kinds (range)" in str(solver.solution().certificate())
+    with pytest.raises(SolverError, match=r"other kinds \(range\)"):
+        solver.solve_from()
 
 
 def test_what_cannot_be_judged_says_why(rng: np.random.Generator) -> None:
