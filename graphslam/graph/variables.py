@@ -278,10 +278,6 @@ class Values:
         """Independent copy."""
         return Values(self.dim, {w: r.array.copy() for w, r in self._rows.items()}, self.landmark_ids.copy())
 
-    def having(self, **blocks: Array) -> Values:
-        """The same values with other rows of some kinds (by word)."""
-        return Values(self.dim, {w: r.array for w, r in self._rows.items()} | blocks, self.landmark_ids)
-
     def layout(self) -> Layout:
         """Columns of these variables."""
         return Layout(self.dim, tuple(self.count(w) for w in KINDS), self.landmark_ids)

@@ -14,8 +14,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graphslam.association.compatibility import distance2, joint_limits, most_pairings, nearest, search
@@ -233,32 +231,3 @@ class CandidatePairs:
             persistent=True,
         )  # fmt: skip
         return found.of(int(np.lexsort((found.cost, -found.count))[0]))
-
-
-def merge_close(ids: npt.ArrayLike, positions: npt.ArrayLike, radius: float) -> npt.NDArray[np.int64]:
-    """New ids under which landmarks closer than ``radius`` are one.
-
-    Duplicates a few decimetres apart slip through every Mahalanobis test where covariances are slightly small or both
-    entries stand in one submap; things that are known to stand further apart than ``radius`` can be merged by distance.
-
-    Parameters
-    ----------
-    ids : (L,) int64
-    positions : (L, 2)
-    radius : float
-        [m]
-
-    Returns
-    -------
-    (L,) int64
-        The smallest id of the cluster that each landmark belongs to (clusters are chains of close landmarks).
-    """
-    ids, points = np.asarray(ids, dtype=np.int64), np.asarray(positions, dtype=np.float64).reshape(-1, 2)
-    if len(ids) == 0:
-        return ids.copy()
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(ids), len(ids)))
-    _, cluster = connected_components(graph, directed=False)
-    smallest = np.full(cluster.max() + 1, np.iinfo(np.int64).max)
-    np.minimum.at(smallest, cluster, ids)
-    return smallest[cluster]

@@ -123,30 +123,6 @@ class Isam2Solver:
         finally:
             self.seconds += time.perf_counter() - t0
 
-    def relinearize(self, *, max_passes: int = 50, tolerance: float = 1e-9) -> int:
-        """Linearise everything anew where it stands until nothing moves by more than ``tolerance``.
-
-        Each pass is one Gauss–Newton step of the whole problem, made by building iSAM2 again from the graph's record:
-        GTSAM's own ``force_relinearize`` only overrides the skip and still passes over every variable within its
-        threshold.
-
-        Returns
-        -------
-        int
-            Passes made.
-        """
-        self.update()
-        t0 = time.perf_counter()
-        passes = 0
-        while passes < max_passes:
-            passes += 1
-            before = self.graph.values
-            self._rebuild([], [])
-            if before.distance(self.graph.values) <= tolerance:
-                break
-        self.seconds += time.perf_counter() - t0
-        return passes
-
     def solve_to_optimum(self) -> None:
         """Go to the batch optimum reached from here, and linearise iSAM2 there."""
         self.update()

@@ -16,9 +16,10 @@ from graphslam.graph.variables import gtsam_key
 from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import solve_submaps
-from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
+from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.graph_chain import make_chain, make_gps
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
 def build(rng, *, gps: bool, robust: Robust, update=lambda g: None) -> PoseGraph:

@@ -14,11 +14,12 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.network import problem_of_network, values_of
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
+from graphslam.solve.batch import BatchSolver
 from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.registry import make_solver
 from tests.reference.grid_world import grid_world
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
 def arrays(rng, dim, n=300):

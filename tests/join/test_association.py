@@ -13,7 +13,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join import association
-from graphslam.join.association import Association, CandidatePairs, associate, merge_close
+from graphslam.join.association import Association, CandidatePairs, associate
 from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinedMap
@@ -189,11 +189,3 @@ def test_innovation_covariance_is_right_by_monte_carlo(rng: np.random.Generator)
 def test_impossible_options_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
         Association(**bad)
-
-
-def test_merging_by_distance_makes_chains_one() -> None:
-    ids = np.array([9, 4, 7, 2, 30])
-    points = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [5.0, 0.0], [5.0, 0.71]])
-    assert list(merge_close(ids, points, 0.7)) == [4, 4, 4, 2, 30]
-    assert list(merge_close(ids, points, 0.72)) == [4, 4, 4, 2, 2]
-    assert len(merge_close([], np.zeros((0, 2)), 1.0)) == 0

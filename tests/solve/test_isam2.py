@@ -92,16 +92,6 @@ def test_lazy_isam2_reports_its_gap_and_gets_to_the_optimum_on_demand(rng):
     assert "at the optimum" in after._repr_html_()
 
 
-def test_relinearize_gets_there_too(rng):
-    chain = make_chain(rng, m=20, landmarks=30, laps=2.0, sigma=0.15)
-    _, solver = grown(chain, relinearize_threshold=1e3, relinearize_angle=1e3)
-    assert solver.gap() > 1e-6
-    passes = solver.relinearize()
-    assert 1 < passes < 50
-    assert solver.gap() == pytest.approx(0.0, abs=1e-7)
-    assert solver.solution().converged
-
-
 def test_a_bad_factor_is_rolled_back_named_and_removed(rng):
     chain = make_chain(rng, m=10, landmarks=20)
     g, solver = grown(chain, upto=7)

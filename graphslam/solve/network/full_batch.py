@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array, ArrayLike, rotation2, se2_adjoint, se2_compose, se2_inverse
-from graphslam.core.network import PoseNetwork
 from graphslam.core.records import LandmarkObservations
-from graphslam.graph.network import problem_of_network, values_of
-from graphslam.linear.symmetric_factor import SymmetricFactor
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.between import BetweenBatch
+from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.flat import FlatGraph
+from graphslam.graph.noise import whiteners
+from graphslam.graph.variables import Values
 from graphslam.solve.descent import limits_of, polish
 from graphslam.solve.sparse import SparseProblem
 
@@ -40,8 +42,8 @@ class FullBatch:
         Σ rᵀ Ω r at the optimum.
     dof : int
         Measured minus free scalars.
-    information : csc_matrix
-        Of [right tangents of poses 1 … n, landmarks]; the poses are those of the *sensor* where it is not at the base.
+    covariance : JointCovariance
+        The poses are those of the *sensor* where it is not at the base.
     iterations : int
     converged : bool
     seconds : float
@@ -52,22 +54,18 @@ class FullBatch:
     landmarks: Array
     objective: float
     dof: int
-    information: sp.csc_matrix
+    covariance: JointCovariance
     iterations: int
     converged: bool
     seconds: float
     sensor: Array
-    _cache: dict[str, SymmetricFactor] = field(default_factory=dict, repr=False, compare=False)
-
-    def _factor(self) -> SymmetricFactor:
-        return self._cache.setdefault("factor", SymmetricFactor(self.information))
 
     def pose_covariances(self, indices: ArrayLike) -> Array:
         """Covariances ``(k, 3, 3)`` of bases ``indices`` ``(k,)`` ≥ 1, as plain vectors x, y, θ of the first frame."""
         k = np.atleast_1d(np.asarray(indices, dtype=np.intp))
         if np.any(k < 1) or np.any(k >= len(self.poses)):
             raise DataError("no such free pose", got=k.tolist(), wanted=f"1 … {len(self.poses) - 1}")
-        P = self._factor().inverse_diagonal_blocks(3 * (k - 1), 3)
+        P = np.array([self.covariance.marginal(f"x{i}") for i in k])
         R = np.zeros((len(k), 3, 3))
         R[:, :2, :2], R[:, 2, 2] = rotation2(self.poses[k, 2]), 1.0
         G = R @ se2_adjoint(self.sensor)  # tangent at the sensor → tangent at the base → plain vector
@@ -75,8 +73,8 @@ class FullBatch:
 
     def landmark_covariance(self) -> Array:
         """Joint covariance ``(2 l, 2 l)`` of all landmarks."""
-        first = 3 * (len(self.poses) - 1)
-        return self._factor().inverse_block(first + np.arange(2 * len(self.landmarks)))
+        lay = self.covariance.layout
+        return self.covariance.columns(np.arange(lay.start("l"), lay.stop("l")))
 
 
 def full_batch(
@@ -126,51 +124,35 @@ def full_batch(
     missing = [int(i) for i in ids if int(i) not in initial_landmarks]
     if missing:
         raise DataError(f"{len(missing)} landmarks have no start", got=missing[:5], wanted="an initial position each")
-    # The network sees from its vertices, so its vertices are the sensor's poses: x_s = x ∘ T_base_sensor.
+    # Landmarks are seen from the nodes, so the nodes are the sensor's poses: x_s = x ∘ T_base_sensor.
     sensor = observations.T_base_sensor
     back = se2_adjoint(se2_inverse(sensor))
     measured = se2_compose(se2_inverse(sensor), se2_compose(u, sensor))
-    poses = se2_compose(np.vstack([np.zeros((1, 3)), x0]), sensor)
-    network = PoseNetwork(
-        dim=2,
-        ids=np.arange(n + 1),
-        poses=poses,
-        has_initial=np.ones(n + 1, dtype=bool),
-        edges=np.column_stack([np.arange(n), np.arange(1, n + 1)]),
-        measurements=measured,
-        information=np.asarray(np.linalg.inv(back @ Q @ back.T), dtype=np.float64),
-        fixed=np.arange(n + 1) == 0,
-        landmark_ids=n + 1 + np.arange(len(ids)),
-        landmarks=np.array([initial_landmarks[int(i)] for i in ids], dtype=np.float64).reshape(-1, 2),
-        has_landmark=np.ones(len(ids), dtype=bool),
-        observations=np.column_stack([scan + 1, landmark]),
-        observation_values=np.column_stack([observations.bearings[rows], observations.ranges[rows]]),
-        observation_information=_diagonal(1.0 / observations.sigmas[rows, ::-1] ** 2),
-        observation_kind="bearing-range",
-        source="full batch",
-    )
-    problem = SparseProblem(problem_of_network(network))
-    best = polish(problem, values_of(network, network.poses, network.landmarks), max_iterations=max_iterations)
+    marks = np.array([initial_landmarks[int(i)] for i in ids], dtype=np.float64).reshape(-1, 2)
+    values = Values(2, {"x": se2_compose(np.vstack([np.zeros((1, 3)), x0]), sensor), "l": marks}, ids.astype(np.int64))
+    layout, steps = values.layout(), np.arange(n)
+    z = np.column_stack([observations.bearings[rows], observations.ranges[rows]])
+    sigma = observations.sigmas[rows, ::-1]
+    seen = np.column_stack([scan + 1, landmark])
+    W = whiteners(np.asarray(np.linalg.inv(back @ Q @ back.T), dtype=np.float64))
+    batches = [
+        BetweenBatch.of_arrays(np.column_stack([steps, steps + 1]), measured, W, layout),
+        SightingBatch.of_arrays(seen, z, True, (1.0 / sigma)[:, :, None] * np.eye(2), layout),
+    ]
+    flat = FlatGraph((), layout, batches)
+    problem = SparseProblem(flat)
+    best = polish(problem, values, max_iterations=max_iterations)
     if not np.isfinite(best.objective):
         raise SolverError(f"full batch diverged: objective {best.objective}; wanted a finite one")
-    flat = problem_of_network(network, ordered=False)
     return FullBatch(
         poses=se2_compose(best.values.poses, se2_inverse(sensor)),
         landmark_ids=ids,
         landmarks=best.values.landmarks,
         objective=best.objective,
-        dof=network.residuals - network.states,
-        information=sp.csc_matrix(flat.evaluate(best.values, dense=False).A),
+        dof=flat.measurements - layout.size,
+        covariance=JointCovariance(layout, flat.evaluate(best.values).A),
         iterations=best.iterations,
-        converged=limits_of(network.residuals).reached(best.objective, problem.decrement(best.values)),
+        converged=limits_of(flat.measurements).reached(best.objective, problem.decrement(best.values)),
         seconds=time.perf_counter() - start,
         sensor=np.asarray(sensor, dtype=np.float64),
     )
-
-
-def _diagonal(values: Array) -> Array:
-    """Diagonal matrices ``(m, d, d)`` of the rows of ``(m, d)``."""
-    out = np.zeros((*values.shape, values.shape[1]))
-    k = np.arange(values.shape[1])
-    out[:, k, k] = values
-    return out

@@ -11,7 +11,7 @@ group by group (:mod:`~graphslam.solve.network.settle`), with the file's own lim
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -26,12 +26,12 @@ from graphslam.core.network import PoseNetwork
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.network import values_of
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import Optimum, polish
+from graphslam.solve.descent import polish
 from graphslam.solve.gnc import truncation_weights
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network.diagnose import check_determined
-from graphslam.solve.network.settle import FEW, Settled, settle
+from graphslam.solve.network.settle import FEW, Robust, settle
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start
 
 log = logging.getLogger(__name__)
@@ -52,40 +52,6 @@ TRIM_STEPS = 6
 FINAL_STEPS = 200
 # Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
 START_STEPS = 40
-
-
-@dataclass(frozen=True, slots=True)
-class Robust:
-    """Inliers and the solution of their least-squares problem.
-
-    Parameters
-    ----------
-    inliers : (m + k,) bool
-        Edges, then observations.
-    problem : BatchProblem
-        Of the inliers alone.
-    end : Optimum
-        Its objective is that of the inliers.
-    truncated : float
-        Truncated cost here.
-    limit : (m + k,)
-        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
-    scale : float
-        True over stated variance of the edges, as estimated or given.
-    start : str
-        Which start led here.
-    reached : dict of str to float
-        Truncated cost by start.
-    """
-
-    inliers: Mask
-    problem: BatchProblem
-    end: Optimum
-    truncated: float
-    limit: Array
-    scale: float
-    start: str
-    reached: dict[str, float]
 
 
 def truncated_cost(flat: FlatGraph, values: Values, limit: Array) -> float:
@@ -156,7 +122,7 @@ def truncated_least_squares(
             starts["odometry"] = (begun, used)
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
-    found: list[tuple[str, Settled]] = []
+    found: list[tuple[str, Robust]] = []
     for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
         if name not in starts:
             continue
@@ -165,7 +131,7 @@ def truncated_least_squares(
         confirmed = (trimmed.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED
         if not (name == "consensus" and confirmed):
             weights, annealed = _anneal(problem, values, limit, believed)
-            trimmed = min(trimmed, _trim(problem, annealed, weights > 0.5, limit), key=lambda t: t.cost)
+            trimmed = min(trimmed, _trim(problem, annealed, weights > 0.5, limit), key=lambda t: t.truncated)
         best = settle(
             problem,
             trimmed.end.values,
@@ -187,7 +153,7 @@ def truncated_least_squares(
         reached[name] = min(cost, reached.get(name, np.inf))
     name, best = min(found, key=lambda f: reached[f[0]])
     final = _trim(problem, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
-    return Robust(final.inliers, final.problem, final.end, final.cost, best.limit, best.scale, name, reached)
+    return replace(final, scale=best.scale, rounds=best.rounds, start=name, reached=reached)
 
 
 def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
@@ -260,17 +226,9 @@ def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed:
     return weights, values
 
 
-@dataclass(frozen=True, slots=True)
-class _Trimmed:
-    inliers: Mask
-    problem: BatchProblem
-    end: Optimum
-    cost: float
-
-
 def _trim(
     problem: BatchProblem, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
-) -> _Trimmed:
+) -> Robust:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
     Neither step raises the truncated cost, so it ends.
@@ -283,4 +241,4 @@ def _trim(
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values
-    return _Trimmed(inliers, inner, end, float(np.where(inliers, costs, limit).sum()))
+    return Robust(inliers, inner, end, limit, float(np.where(inliers, costs, limit).sum()))

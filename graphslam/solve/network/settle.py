@@ -24,7 +24,7 @@ of the accepted D² is followed as far as it is populated (Hill 1975).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -69,8 +69,8 @@ HELD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
-    """Where accepting and refusing came to rest.
+class Robust:
+    """Inliers and the solution of their least-squares problem.
 
     Parameters
     ----------
@@ -79,20 +79,30 @@ class Settled:
     problem : BatchProblem
         Of the inliers alone.
     end : Optimum
+        Its objective is that of the inliers.
     limit : (m + k,)
-        What D² was compared with; infinite for trusted edges.
+        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
+    truncated : float
+        Truncated cost here.
     scale : float
-        True over stated variance of the edges, from the median D² of the accepted loops.
+        True over stated variance of the edges: estimated (from the median D² of the accepted loops), or given.
     rounds : int
-        Until nothing changed; ``ROUNDS`` if something still did.
+        Of settling until nothing changed; ``ROUNDS`` if something still did.
+    start : str
+        Which start led here.
+    reached : dict of str to float
+        Truncated cost by start.
     """
 
     inliers: Mask
     problem: BatchProblem
     end: Optimum
     limit: Array
-    scale: float
-    rounds: int
+    truncated: float = float("nan")
+    scale: float = 1.0
+    rounds: int = 0
+    start: str = ""
+    reached: dict[str, float] = field(default_factory=dict)
 
 
 def family_quantile(probability: float, count: int) -> float:
@@ -267,7 +277,7 @@ def settle(
     *,
     probability: float = QUANTILE,
     own_tail: bool = True,
-) -> Settled:
+) -> Robust:
     """Rounds of accepting and refusing by ``D²`` until nothing changes.
 
     Parameters
@@ -339,4 +349,4 @@ def settle(
             break
         back = fresh.tobytes() in seen
         inliers = fresh
-    return Settled(inliers, problem, end, limit, scale, rounds)
+    return Robust(inliers, problem, end, limit, scale=scale, rounds=rounds)

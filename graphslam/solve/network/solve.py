@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ from graphslam.solve.sparse import PcgProblem
 if TYPE_CHECKING:
     from graphslam.solve.network.batch import BatchProblem
     from graphslam.solve.network.certificate import Certificate
-    from graphslam.solve.network.robust import Robust
+    from graphslam.solve.network.settle import Robust
 
 # A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
 INLIER_PROBABILITY = 0.9999
@@ -154,7 +154,15 @@ class _Answer:
     inliers: npt.NDArray[np.bool_] | None = None
 
 
-Solver = Callable[[PoseNetwork, FlatGraph, Sequence[str] | None, dict[str, Any], bool], _Answer]
+class _Task(NamedTuple):
+    network: PoseNetwork
+    flat: FlatGraph
+    starts: Sequence[str] | None
+    options: dict[str, Any]
+    progress: bool
+
+
+Solver = Callable[[_Task], _Answer]
 
 
 def solve_network(
@@ -207,7 +215,7 @@ def solve_network(
     check_determined(network, flat)
     initial = canonical_start(network)
     check_full_rank(network, flat, initial)
-    answer = run(network, flat, starts, options, progress)
+    answer = run(_Task(network, flat, starts, options, progress))
     best = answer.optimum.best
     value = best.objective if answer.values is best.values else flat.objective(answer.end)
     gap = value - best.objective
@@ -253,20 +261,16 @@ def _certified(network: PoseNetwork, problem: Problem, end: Optimum) -> bool:
     return certify(network, poses, end.objective, eigenvalue=False).verdict == "certified"
 
 
-def _lm(
-    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
-) -> _Answer:
-    optimum = best_of_starts(network, starts, flat=flat, certified=_certified, progress=progress)
+def _lm(task: _Task) -> _Answer:
+    optimum = best_of_starts(task.network, task.starts, flat=task.flat, certified=_certified, progress=task.progress)
     best = optimum.best
     end = optimum.problem.unpack(best.values)
     return _Answer(best.values, end, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
 
 
-def _pcg(
-    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
-) -> _Answer:
-    problem = PcgProblem(flat, **options)
-    optimum = best_of_starts(network, starts, problem=problem, certified=_certified, progress=progress)
+def _pcg(task: _Task) -> _Answer:
+    problem = PcgProblem(task.flat, **task.options)
+    optimum = best_of_starts(task.network, task.starts, problem=problem, certified=_certified, progress=task.progress)
     best, report = optimum.best, problem.report
     details = {
         "doubt": optimum.doubt,
@@ -279,12 +283,11 @@ def _pcg(
     return _Answer(best.values, best.values, best.iterations, optimum, optimum.start, details)
 
 
-def _isam2(
-    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
-) -> _Answer:
+def _isam2(task: _Task) -> _Answer:
     from graphslam.solve.network.incremental import Isam2Options, run_isam2
 
-    options = dict(options)
+    network, flat, starts, given_options, progress = task
+    options = dict(given_options)
     close = bool(options.pop("relinearise", True))
     problem = _native(network, flat, "isam2")
     begin = time.perf_counter()
@@ -311,12 +314,11 @@ def _isam2(
     return _Answer(best.values, problem.unpack(best.values), best.iterations, optimum, optimum.start, details)
 
 
-def _gnc(
-    network: PoseNetwork, flat: FlatGraph, starts: Sequence[str] | None, options: dict[str, Any], progress: bool
-) -> _Answer:
+def _gnc(task: _Task) -> _Answer:
     from graphslam.solve.network.consensus import odometry_edges  # scipy's statistics take a second to load
     from graphslam.solve.network.robust import truncated_cost, truncated_least_squares
 
+    network, flat, starts, options, progress = task
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
     scale = options.get("noise_scale")
     problem = _native(network, flat, "gnc")

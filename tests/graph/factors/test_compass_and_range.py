@@ -19,8 +19,9 @@ from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.readings import CompassConfig, trilaterate
-from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
+from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 SIGMA = {2: np.array([0.05, 0.05, 0.02]), 3: np.array([0.002, 0.002, 0.02, 0.05, 0.05, 0.05])}
 KINDS = (CompassRecord, DeclinationRecord, DeviationPriorRecord, RangeRecord, BeaconRangeRecord)

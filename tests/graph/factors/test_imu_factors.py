@@ -21,8 +21,9 @@ from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key, key_name
-from graphslam.solve.batch import BatchSolver, optimise_with_gtsam
+from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 from tests.reference.imu_ring import MOUNT, NOISE, Ring, ring, true_readings
 
 EVERY = ("imu", "gyro", "imu-bias", "imu-gravity")
