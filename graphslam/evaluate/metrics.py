@@ -312,7 +312,7 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
 def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
     """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
     said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
-    for stream in graph.imus:
+    for stream in graph.imu.used:
         states = graph.imu_states(stream)
         mine = [e for e in said if e["stream"] == stream]
         for reason, n in (mine[-1]["dropped"] if mine else {}).items():
@@ -333,7 +333,7 @@ def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
 
 def _contradiction(graph: PoseGraph) -> None:
     """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
-    ways = class_consistency(graph).get("imu") if graph.imus else None
+    ways = class_consistency(graph).get("imu") if graph.imu.used else None
     if ways is None or not np.isfinite(ways.ratio):
         return
     high = two_sided(ways.ratio, ways.dof, 0.999)[1]

@@ -1,21 +1,29 @@
-"""GPS fixes before they are factors: how they enter, where they hang, and where the datum starts.
+"""GPS fixes until they are factors: how they enter, where they hang, and where the datum starts.
 
 The factor itself is in :mod:`graphslam.graph.factors.gps`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graphslam.core.config import spelled
-from graphslam.core.errors import ConfigError
+from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
+from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.noise import Robust
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
+from graphslam.graph.noise import Robust, whitener
+from graphslam.graph.submap_node import SubmapNode
+
+if TYPE_CHECKING:
+    from graphslam.graph.graph_record import GraphRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,3 +158,147 @@ def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
         d = np.linalg.norm(se2_transform(T, world) - fixes, axis=1)
         T = align_se2(world, fixes, w / (1.0 + (d / width) ** 2))
     return T
+
+
+class GpsFixes:
+    """The fixes of a graph: those that are not factors yet, and how they become so.
+
+    A fix at ``t`` belongs to the submap with ``t_start <= t < t_end``: exactly on a boundary it belongs to the later
+    one. The very last instant of a finished graph belongs to the last submap.
+
+    Parameters
+    ----------
+    graph : GraphRecord
+    """
+
+    def __init__(self, graph: GraphRecord) -> None:
+        self.graph = graph
+        self.config = GpsConfig()
+        self.waiting: list[Fix] = []  # for their submap, in the order of time
+        self.tied: list[TiedFix] = []  # for a datum
+        self.last_time = -np.inf
+
+    def add(self, gps: Gps, stream: str, config: GpsConfig | None) -> list[int]:
+        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_gps`."""
+        g = self.graph
+        if gps.positions.shape[1] != g.dim:
+            raise GeometryError("GPS fixes have the wrong dimension", got=gps.positions.shape, wanted=f"(n, {g.dim})")
+        self.config = config or self.config
+        for t in gps.times:
+            g.ledger.check(f"GPS fix at {t:.3f} s", [stream], (float(t), float(t)))
+        fixes = []
+        for t, p, s in zip(gps.times.tolist(), gps.positions, gps.sigma.tolist()):
+            fixes.append(Fix(g.next_factor(), t, p, s, gps.lever, self.config))
+            g.ledger.spend(fixes[-1].factor_id, f"GPS fix at {t:.3f} s", [stream], (t, t))
+        self.waiting = sorted([*self.waiting, *fixes], key=lambda f: f.time)
+        for s in g.submaps:
+            self.tie(s, more=s is not g.submaps[-1])
+        return [f.factor_id for f in fixes]
+
+    def finish(self) -> None:
+        """No more submaps will come."""
+        if self.graph.submaps:
+            self.tie(self.graph.submaps[-1], closed=True)
+        self._drop([(f.factor_id, "after the last submap") for f in self.waiting])
+        self.waiting = []
+
+    def tie(self, s: SubmapNode, *, closed: bool = False, more: bool = False) -> None:
+        """Give a submap its waiting fixes, ``closed`` that at its end too; with ``more`` to follow no datum starts."""
+        g = self.graph
+        dropped = self._queue(s, closed)
+        late = [f for f in self.waiting if f.time < s.interval[0] and not more and s is g.submaps[-1]]
+        self.waiting = [f for f in self.waiting if f not in late]
+        self._drop([*dropped, *((f.factor_id, "no submap covers it") for f in late)])
+        if more or not self.tied:
+            return
+        if g.gps_origin is None:
+            g.gps_origin = self.tied[0].fix.position.copy()
+        if not g.structure.count("datum"):
+            start = self._datum_if_ready(g.values.poses, g.gps_origin, self.tied[0].fix.config.baseline)
+            if start is None:
+                return
+            g.values.datum = start
+            g.note("datum", fixes=len(self.tied), T_gps_world=start.tolist())
+        for t in sorted(self.tied, key=lambda t: t.fix.time):
+            bias = self._bias_of(t.fix)
+            W = whitener(t.covariance, what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
+            z = t.fix.position - g.gps_origin
+            tilt = g.structure.count("tilt") > 0
+            g.insert(GpsRecord(t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, t.fix.config.robust, bias, tilt=tilt))
+        self.tied = []
+
+    def leave(self, s: SubmapNode) -> None:
+        """Take out the fixes of a submap that goes: their arms come from its trajectory."""
+        own = set(s.nodes[:-1])
+        inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
+        for fid in inside:
+            del self.graph.records[fid]
+        tied = [t.fix.factor_id for t in self.tied if t.node in own]
+        self.tied = [t for t in self.tied if t.node not in own]
+        self._drop([(i, "its submap was removed") for i in [*tied, *inside]])
+
+    def tidy(self) -> None:
+        """A datum that no fix holds any more goes, and the biases with it."""
+        g = self.graph
+        if g.structure.count("datum") and not any(isinstance(r, GpsRecord) for r in g.records.values()):
+            for fid in [k for k, r in g.records.items() if isinstance(r, BiasPriorRecord)]:
+                g.ledger.refund(fid)
+                del g.records[fid]
+            g.values.datum, g.values.biases = None, np.zeros((0, g.dim))
+            g.revision += 1
+
+    def _drop(self, dropped: Iterable[tuple[int, str]]) -> None:
+        for fid, reason in dropped:
+            self.graph.ledger.refund(fid)
+            self.graph.note("gps-dropped", factor_id=fid, reason=reason)
+
+    def _queue(self, s: SubmapNode, closed: bool) -> list[tuple[int, str]]:
+        """Move the fixes of one submap to its nodes; (factor_id, reason) of those that have no place."""
+        t0, t1 = s.interval
+        times = np.array([f.time for f in self.waiting])
+        inside = (times >= t0) & ((times <= t1) if closed else (times < t1))
+        mine = [f for f, m in zip(self.waiting, inside) if m]
+        self.waiting = [f for f, m in zip(self.waiting, inside) if not m]
+        dropped = []
+        if mine and s.trajectory is None:
+            return [(f.factor_id, "submap has no trajectory") for f in mine]
+        for f in mine:
+            t = np.array([f.time])
+            at = s.nearest(t)
+            try:
+                arm, cov = lever_arm(*s.local(t, at), f.lever)
+            except DataError:
+                dropped.append((f.factor_id, "outside the submap's trajectory"))
+                continue
+            sigma = f.sigma if f.config.sigma is None else f.config.sigma
+            covariance = sigma**2 * np.eye(len(f.lever)) + cov[0]
+            self.tied.append(TiedFix(f, s.nodes[int(at[0])], arm[0], covariance))
+        return dropped
+
+    def _datum_if_ready(self, poses: Array, origin: Array, baseline: float) -> Array | None:
+        """First ``T_gps_world`` from the tied fixes, once they span ``baseline`` on the ground and in the map."""
+        if len(self.tied) < 2:
+            return None
+        group = group_of(poses)
+        world = group.transform(poses[[t.node for t in self.tied]], np.array([t.arm for t in self.tied]))
+        fixes = np.array([t.fix.position for t in self.tied]) - origin
+        if min(spread(world[:, :2]), spread(fixes[:, :2])) < baseline:  # only a level way says where north is
+            return None
+        sigma = np.array([np.sqrt(t.covariance[0, 0]) for t in self.tied])
+        level = start_datum(world[:, :2], fixes[:, :2], sigma)
+        if group.dim == 2:
+            return level
+        return np.array([*level[:2], np.median(fixes[:, 2] - world[:, 2]), level[2]])
+
+    def _bias_of(self, fix: Fix) -> int | None:
+        cfg, previous = fix.config, self.last_time
+        self.last_time = fix.time
+        g = self.graph
+        if cfg.bias_sigma is None:
+            return None
+        if g.structure.count("bias") == 0 or fix.time - previous > cfg.segment_gap:
+            s = g.structure.append("bias", np.zeros(g.dim))
+            record = BiasPriorRecord(g.next_factor(), s, cfg.bias_sigma, dim=g.dim)
+            g.ledger.spend(record.factor_id, record.label(), ["-"], (fix.time, fix.time), "prior")
+            g.insert(record)
+        return g.structure.count("bias") - 1

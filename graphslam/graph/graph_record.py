@@ -17,11 +17,13 @@ from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
-from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
+from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.flat import FlatGraph
-from graphslam.graph.gps_queue import GpsQueue
+from graphslam.graph.gps import GpsFixes
+from graphslam.graph.imu import ImuUnits
 from graphslam.graph.ledger import Ledger
+from graphslam.graph.readings import Readings
 from graphslam.graph.score import Score, score
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Layout, Values
@@ -182,7 +184,7 @@ class GraphRecord:
         self.revision = 0
         self.submaps: list[SubmapNode] = []
         self._place: dict[int, int] = {}  # submap key -> place in submaps
-        self.gps = GpsQueue()
+        self.gps, self.imu, self.readings = GpsFixes(self), ImuUnits(self), Readings(self)
         self.gps_origin: Array | None = None
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
@@ -226,34 +228,36 @@ class GraphRecord:
     # ---------------------------------------------------------------- changing
 
     def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
-        """Take a factor out and give its evidence back; landmarks that nothing sees any more go with it.
+        """Take a factor out and give its evidence back; variables that nothing holds any more go with it.
 
-        Removing a submap also removes the GPS fixes inside it, whose arms come from its trajectory, and, if it is the
-        last one, its nodes. The factors of a chain are one submap: with one of them all go.
+        Removing a submap also removes what hangs on its path, GPS fixes, readings and what IMUs said inside it, and, if
+        it is the last one, its nodes. The factors of a chain are one submap: with one of them all go.
         """
         if factor_id not in self.records:
             raise DataError(f"factor {factor_id} is not in the graph", wanted="the id of a factor")
+        removed = self.records[factor_id]
         owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
+        if owner is not None:
+            self.readings.leave(owner)
+            self.imu.leave(owner)
         for fid in (factor_id,) if owner is None else owner.factor_ids:
             if fid in self.records:
-                self._take_out(fid, reason)
+                self.take_out(fid, reason)
         if owner is not None:
-            self._remove_fixes_of(owner)
+            self.gps.leave(owner)
             used = {n for r in self.records.values() for n in r.variables()}
             if owner is self.submaps[-1] and not any(f"x{n}" in used for n in owner.nodes[1:]):
                 self.values.poses = self.values.poses[: owner.node + 1].copy()
                 self._place.pop(self.submaps.pop().key)
-        if self.values.datum is not None and not any(isinstance(r, GpsRecord) for r in self.records.values()):
-            for fid in [k for k, r in self.records.items() if isinstance(r, BiasPriorRecord)]:
-                self.ledger.refund(fid)
-                del self.records[fid]
-            self.values.datum, self.values.biases = None, np.zeros((0, self.dim))
-            self.revision += 1
-        if self.values.tilt is not None and not any("tilt" in r.variables() for r in self.records.values()):
+        self.gps.tidy()
+        self.imu.tidy(removed)
+        self.readings.tidy()
+        if self.structure.count("tilt") and not any("tilt" in r.variables() for r in self.records.values()):
             self.values.tilt = None
             self.revision += 1
 
-    def _take_out(self, factor_id: int, reason: str) -> None:
+    def take_out(self, factor_id: int, reason: str) -> None:
+        """Take out one factor, its evidence, and landmarks that nothing sees any more."""
         block = self.records.block_of(factor_id)
         record = self.records.pop(factor_id)
         if isinstance(record, AttitudeRecord):
@@ -439,16 +443,11 @@ class GraphRecord:
             self._seen_in.pop(i, None)
             self._retired.add(i)
 
-    def _remove_fixes_of(self, s: SubmapNode) -> None:
-        own = set(s.nodes[:-1])
-        inside = [r for r in self.records.values() if isinstance(r, GpsRecord) and r.node in own]
-        for r in inside:
-            del self.records[r.factor_id]
-        tied = [t.fix.factor_id for t in self.gps.tied if t.node in own]
-        self.gps.tied = [t for t in self.gps.tied if t.node not in own]
-        self._drop_fixes([(i, "its submap was removed") for i in [*tied, *(r.factor_id for r in inside)]])
-
-    def _drop_fixes(self, dropped: Sequence[tuple[int, str]]) -> None:
-        for fid, reason in dropped:
-            self.ledger.refund(fid)
-            self._event("gps-dropped", factor_id=fid, reason=reason)
+    def start_tilt(self) -> None:
+        """Bring in the variable ``tilt``; fixes that took the z axis of the first base for up are turned by it."""
+        if not self.structure.count("tilt"):
+            self.structure.append("tilt", np.zeros(2))
+            for fid, r in self.records.items():
+                if isinstance(r, GpsRecord) and self.dim == 3:
+                    self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed
+            self.revision += 1

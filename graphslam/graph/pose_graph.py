@@ -34,26 +34,30 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
-from graphslam.core.records import Compass, LandmarkObservations
+from graphslam.core.imu import Imu
+from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.attitude_verbs import without_tilt
+from graphslam.graph.factors.attitude import DOWN, LEVELLED, AttitudeRecord, without_tilt
 from graphslam.graph.factors.batch import Record
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.imu.config import ImuConfig
+from graphslam.graph.factors.imu.states import ImuStates
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.range import RangeRecord
-from graphslam.graph.graph_record import BetweenBlock
-from graphslam.graph.imu_verbs import ImuVerbs
+from graphslam.graph.gps import GpsConfig
+from graphslam.graph.graph_record import BetweenBlock, GraphRecord
+from graphslam.graph.imu import RECENTRE
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners, whitener
-from graphslam.graph.readings import BeaconConfig, CompassConfig, Readings
+from graphslam.graph.readings import BeaconConfig, CompassConfig
 from graphslam.graph.submap_node import SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
 
 
-class PoseGraph(ImuVerbs):
+class PoseGraph(GraphRecord):
     """A graph of submaps, landmarks and GPS, in the plane or in space: the verbs that add factors.
 
     The first base is fixed at the origin. What the graph holds and what can be asked of it is in
@@ -64,10 +68,6 @@ class PoseGraph(ImuVerbs):
     dim : int
         2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
     """
-
-    def __init__(self, dim: int = 2) -> None:
-        super().__init__(dim)
-        self.readings = Readings(self)
 
     def add_submap(
         self,
@@ -153,7 +153,7 @@ class PoseGraph(ImuVerbs):
         ends = np.stack([np.zeros(3), submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
-        self._tie_fixes(self.submaps[-1])
+        self.gps.tie(self.submaps[-1])
         self.readings.tie(self.submaps[-1])
         return fid
 
@@ -184,7 +184,7 @@ class PoseGraph(ImuVerbs):
         self._event(
             "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
         )
-        self._tie_fixes(self.submaps[-1])
+        self.gps.tie(self.submaps[-1])
         self.readings.tie(self.submaps[-1])
         return fid
 
@@ -195,6 +195,12 @@ class PoseGraph(ImuVerbs):
             self._level(s.node, sigma, s.interval[0])
         fid = self._level(s.exit_node, sigma, s.interval[1])
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
+
+    def _level(self, node: int, sigma: float, time: float) -> int:
+        """A base that was levelled: a declared exception of the ledger, see :meth:`PoseGraph.add_submap`."""
+        return self.add_attitude(
+            node, DOWN, sigma, streams=["gravity"], interval=(time, time), evidence=LEVELLED, group=LEVELLED
+        )
 
     def _append(
         self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, *covariances: Array
@@ -226,6 +232,99 @@ class PoseGraph(ImuVerbs):
         )
         for record in records:
             self.insert(record)
+
+    def add_gps(self, gps: Gps, *, stream: str = "gps", config: GpsConfig | None = None) -> list[int]:
+        """Give the graph position fixes, at any time and in any portion; each finds its own submap.
+
+        Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts
+        by rigid alignment and all of them become factors. The map stays where it is then, however late that be: its
+        first base is fixed and the datum is solved for. Fixes that no submap covers are dropped and counted
+        (:attr:`events`, kind ``gps-dropped``). Each hangs on the node nearest in time, the base or an inner one.
+
+        Returns
+        -------
+        list of int
+            Factor ids, one a fix.
+
+        Raises
+        ------
+        EvidenceReusedError
+            A submap that holds the fix already used ``stream``, or the fix was given before. No fix is taken then.
+        """
+        return self.gps.add(gps, stream, config)
+
+    def finish_gps(self) -> None:
+        """No more submaps will come: the last instant belongs to the last submap, later fixes are dropped."""
+        self.gps.finish()
+
+    def add_imu(
+        self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False
+    ) -> list[int]:
+        """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
+
+        Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
+        preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
+        :mod:`graphslam.graph.factors.imu.batch`), inner nodes
+        included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
+        the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
+        pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The
+        first factor brings in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
+
+        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
+        are there stay. Everything left out is counted by reason (event ``imu``).
+
+        Parameters
+        ----------
+        imu : Imu
+            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
+        stream : str
+            Its name in the ledger.
+        config : ImuConfig, optional
+            By default that of the call before.
+        more : bool
+            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
+            not checked, nor what is left out counted.
+
+        Returns
+        -------
+        list of int
+            Ids of the new factors.
+
+        Raises
+        ------
+        EvidenceReusedError
+            A submap, or another factor, spent the stream over an overlapping interval. Nothing is changed then.
+        DataError
+            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
+        GeometryError
+            In the plane.
+        ConfigError, CovarianceError
+        """
+        return self.imu.add(imu, stream=stream, config=config, more=more)
+
+    def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
+        """Hold the axes of an IMU against the paths of the submaps; returns what is wrong in words, or nothing.
+
+        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
+
+        Raises
+        ------
+        DataError
+            The mounting is contradicted and ``axes`` is ``"refuse"``.
+        """
+        return self.imu.check(imu, stream=stream, axes=axes)
+
+    def recentre_imu(self, *, limit: float = RECENTRE) -> int:
+        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
+
+        Ways know how they change with the biases to first order only. After solving, call this and solve again until
+        it returns nothing: twice is enough, most of the time.
+        """
+        return self.imu.recentre(limit=limit)
+
+    def imu_states(self, stream: str = "imu") -> ImuStates:
+        """Nodes, velocities and biases of an IMU, in order of time."""
+        return self.imu.states(stream)
 
     def add_compass(
         self, compass: Compass, *, stream: str = "compass", config: CompassConfig | None = None
@@ -274,18 +373,74 @@ class PoseGraph(ImuVerbs):
         """
         return self.readings.add_beacons(ranges, stream, config, None if lever is None else np.asarray(lever))
 
-    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
-        """See :meth:`~graphslam.graph.graph_record.GraphRecord.remove`; headings and distances go with a submap."""
-        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
-        if owner is not None and factor_id in self.records:
-            self.readings.leave(owner.nodes[:-1])
-        super().remove(factor_id, reason=reason)
-        if any(self.structure.count(word) for word in ("compass", "deviation", "beacon")):
-            self.readings.compact()
-
     def finish_readings(self) -> None:
         """No more submaps will come: headings and distances that still wait are dropped, and counted."""
         self.readings.finish()
+
+    def add_attitude(
+        self,
+        node: int,
+        direction: ArrayLike,
+        sigma: float,
+        *,
+        streams: Iterable[str] = (),
+        interval: tuple[float, float] | None = None,
+        evidence: str = EXCLUSIVE,
+        robust: Robust = NO_KERNEL,
+        group: str = "attitude",
+    ) -> int:
+        """Where gravity points, seen from a node: roll and pitch, and nothing of the heading.
+
+        The first one brings in the variable ``tilt``, where up is in the frame of the first base
+        (:mod:`graphslam.graph.factors.attitude`); what the first base itself saw of gravity goes to node 0.
+
+        Parameters
+        ----------
+        node : int
+        direction : (3,)
+            Of gravity (down) in the node's frame; any length but zero. ``(0, 0, -1)`` if the node is level.
+        sigma : float
+            Standard deviation of roll and of pitch [rad].
+        streams, interval
+            What it spends; an exclusive measurement must say both.
+        evidence : str
+            ``"measurement"``, or a kind declared in the ledger.
+        robust : Robust
+        group : str
+            Class under which :meth:`objective` reports it.
+
+        Returns
+        -------
+        int
+            Factor id.
+
+        Raises
+        ------
+        GeometryError
+            In the plane, or a direction without length.
+        ConfigError, DataError, EvidenceReusedError
+        """
+        if self.dim != 3:
+            raise GeometryError("gravity says nothing of poses in the plane", wanted="a graph in space")
+        if not 0 <= node < self.structure.count("x"):
+            raise DataError(
+                "attitude of a node that is not there", got=node, wanted=f"x0 … x{self.structure.count('x') - 1}"
+            )
+        d = np.asarray(direction, dtype=np.float64)
+        length = float(np.linalg.norm(d)) if d.shape == (3,) else float("nan")
+        if not (np.isfinite(length) and length > 0):
+            raise GeometryError(f"direction of gravity at x{node} is not usable", got=direction, wanted="three numbers")
+        if not (np.isfinite(sigma) and sigma > 0):
+            raise ConfigError(f"attitude of x{node} needs a positive sigma, got {sigma}")
+        names = list(streams)
+        if evidence == EXCLUSIVE and (not names or interval is None):
+            raise ConfigError(f"attitude of x{node} must name the streams and the interval that it spends")
+        record = AttitudeRecord(self.next_factor(), node, d / length, np.eye(2) / sigma, robust, group)
+        self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
+        self.start_tilt()
+        self.insert(record)
+        self._event("attitude", factor_id=record.factor_id, node=node, sigma=sigma, evidence=evidence, group=group)
+        return record.factor_id
 
     def add_range(
         self,

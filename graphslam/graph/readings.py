@@ -10,7 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,10 +22,12 @@ from graphslam.core.se3 import quat_rotate
 from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, DeviationPriorRecord
 from graphslam.graph.factors.range import BeaconRangeRecord
 from graphslam.graph.gps import lever_arm
-from graphslam.graph.graph_record import GraphRecord
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.submap_node import SubmapNode
+
+if TYPE_CHECKING:
+    from graphslam.graph.graph_record import GraphRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,16 +259,18 @@ class Readings:
 
     # ---------------------------------------------------------------- taking out
 
-    def leave(self, nodes: Iterable[int]) -> None:
-        """Take out what hangs on nodes that go."""
-        inside = set(nodes)
+    def leave(self, s: SubmapNode) -> None:
+        """Take out what hangs on a submap that goes."""
+        inside = set(s.nodes[:-1])
         for fid, r in list(self.graph.records.items()):
             if isinstance(r, (CompassRecord, BeaconRangeRecord)) and r.node in inside:
                 self._take_out(fid)
 
-    def compact(self) -> None:
+    def tidy(self) -> None:
         """Variables that no reading holds any more go, and what was said of them; the others move up."""
         g = self.graph
+        if not any(g.structure.count(word) for word in ("compass", "deviation", "beacon")):
+            return
         readings = [r for r in g.records.values() if isinstance(r, CompassRecord)]
         if not g.structure.count("datum"):
             self._take_out(*(f for f, r in g.records.items() if isinstance(r, DeclinationRecord)))

@@ -28,6 +28,23 @@ from graphslam.graph.variables import gtsam_key
 DOWN = np.array([0.0, 0.0, -1.0])
 """Direction of gravity in a level frame."""
 
+LEVELLED = "levelled"
+"""Ledger kind and class of the attitudes of levelled bases."""
+
+GIVEN_UP = 1.0
+"""Standard deviation [rad] of relative roll and pitch where a submap gave them up for absolute ones."""
+
+
+def without_tilt(covariance: Array) -> Array:
+    """An exit's covariance ``(6, 6)`` that knows nothing of roll and pitch any more.
+
+    Adding a large variance to two components leaves the marginal of the others as it was: only what the exit said of
+    relative roll and pitch is gone.
+    """
+    out = covariance.copy()
+    out[[0, 1], [0, 1]] += GIVEN_UP**2
+    return out
+
 
 def across(direction: ArrayLike) -> Array:
     """Two orthonormal columns ``(..., 3, 2)`` across unit vectors ``(..., 3)``; for :data:`DOWN` the axes x and y."""

@@ -79,7 +79,7 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     short = replace(log, streams={"imu": log["imu"].take(log["imu"].times > 1.0)})
     run = solved(short, submaps, monkeypatch, tmp_path / "run", config={"imu": {"use": "auto"}}, solver="batch")
     monkeypatch.undo()
-    assert run.graph.imus
+    assert run.graph.imu.used
     remade(tmp_path / "run")
     settings = build(cfg.RunConfig, {"imu": {"use": "auto"}})
     back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(imus_of(short), settings.imu))

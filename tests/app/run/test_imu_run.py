@@ -75,7 +75,7 @@ def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
 def test_what_the_front_end_used_is_not_used_again(monkeypatch):
     log, submaps = made(frozenset({"laser", "imu"}))
     r = solved(log, submaps, monkeypatch, config={"imu": {"use": "auto"}})
-    assert not r.graph.imus
+    assert not r.graph.imu.used
     with pytest.raises(EvidenceReusedError, match=r"'imu' .* a second time: submap 0"):
         solved(log, submaps, monkeypatch, config={"imu": {"use": "imu"}})
     with pytest.raises(MissingDataError, match=r"imu.use names no IMU .* got imu7"):

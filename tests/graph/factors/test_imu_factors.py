@@ -249,7 +249,7 @@ def test_a_submap_that_used_it_refuses_it(rng):
     with pytest.raises(EvidenceReusedError, match=r"spend stream 'imu' .* a second time: submap 1"):
         g.add_imu(made.imu)
     assert (len(g.records), len(g.ledger), g.values.layout()) == before
-    assert not g.imus
+    assert not g.imu.used
     g.add_imu(made.imu, stream="other")
 
 

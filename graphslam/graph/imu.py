@@ -1,4 +1,4 @@
-"""Verbs of a graph in space that take an IMU: ways between near nodes, gravity at far ones, biases.
+"""What a graph in space makes of IMUs: ways between near nodes, gravity at far ones, biases.
 
 Everything about the states of an IMU can be read off the factors: which velocity and which bias are a node's, and in
 which order the biases follow each other. So that is where it is kept, and removing factors needs no other book.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
-from graphslam.graph.attitude_verbs import LEVELLED, AttitudeVerbs, without_tilt
-from graphslam.graph.factors.attitude import AttitudeRecord, up_turn
+from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, up_turn, without_tilt
+from graphslam.graph.factors.batch import Record
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.axes import check_imu_axes
 from graphslam.graph.factors.imu.batch import GYRO_ROWS, XI, XJ, Ways, way_terms
@@ -27,6 +28,10 @@ from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.factors.imu.states import ImuStates, compacted, links_wanted
 from graphslam.graph.noise import whitener
+from graphslam.graph.submap_node import SubmapNode
+
+if TYPE_CHECKING:
+    from graphslam.graph.graph_record import GraphRecord
 
 logger = logging.getLogger(__name__)
 
@@ -42,105 +47,61 @@ class ImuUse:
     config: ImuConfig
 
 
-class ImuVerbs(AttitudeVerbs):
-    """The part of a :class:`~graphslam.graph.pose_graph.PoseGraph` that takes inertial readings."""
+class ImuUnits:
+    """The IMUs of a graph in space.
 
-    def __init__(self, dim: int = 2) -> None:
-        super().__init__(dim)
-        self.imus: dict[str, ImuUse] = {}
+    Parameters
+    ----------
+    graph : GraphRecord
+    """
 
-    def add_imu(
-        self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False
-    ) -> list[int]:
-        """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
+    def __init__(self, graph: GraphRecord) -> None:
+        self.graph = graph
+        self.used: dict[str, ImuUse] = {}
 
-        Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
-        preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
-        :mod:`graphslam.graph.factors.imu.batch`), inner nodes
-        included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
-        the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
-        pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The
-        first factor brings in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
-
-        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
-        are there stay. Everything left out is counted by reason (event ``imu``).
-
-        Parameters
-        ----------
-        imu : Imu
-            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
-        stream : str
-            Its name in the ledger.
-        config : ImuConfig, optional
-            By default that of the call before.
-        more : bool
-            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
-            not checked, nor what is left out counted.
-
-        Returns
-        -------
-        list of int
-            Ids of the new factors.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap, or another factor, spent the stream over an overlapping interval. Nothing is changed then.
-        DataError
-            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
-        GeometryError
-            In the plane.
-        ConfigError, CovarianceError
-        """
-        if self.dim != 3:
+    def add(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False) -> list[int]:
+        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_imu`."""
+        if self.graph.dim != 3:
             raise GeometryError("an IMU says little of poses in the plane", where=stream, wanted="a graph in space")
-        known = self.imus.get(stream)
+        known = self.used.get(stream)
         cfg = config or (ImuConfig() if known is None else known.config)
         imu = imu if known is None else joined(known.imu, imu, stream)
         if len(imu.times) < 2:
             raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
         bias_sigma(imu.noise)
-        places = places_of(self.submaps, cfg.window)
-        if more and self.submaps:
-            places.pop(self.submaps[-1].exit_node, None)
-        plan = plan_of(self.submaps, self.records.values(), imu, stream, cfg, places)
+        places = places_of(self.graph.submaps, cfg.window)
+        if more and self.graph.submaps:
+            places.pop(self.graph.submaps[-1].exit_node, None)
+        plan = plan_of(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places)
         for a, b in plan.pairs:
-            self.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
+            self.graph.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
         for n in plan.gravity:
-            self.ledger.check(f"gravity seen by {stream} at x{n}", [stream], window_of(places[n].time, cfg))
+            self.graph.ledger.check(f"gravity seen by {stream} at x{n}", [stream], window_of(places[n].time, cfg))
         if not more:
-            self.check_imu(imu, stream=stream, axes=cfg.axes)
-        self.imus[stream] = ImuUse(imu, cfg)
+            self.check(imu, stream=stream, axes=cfg.axes)
+        self.used[stream] = ImuUse(imu, cfg)
         ids = self._add_ways(imu, stream, cfg, places, plan.pairs)
         ids += self._add_forces(imu, stream, cfg, places, plan)
         ids += self._relink(stream)
         if not more:
-            mine = [r for r in self.records.values() if getattr(r, "stream", None) == stream]
-            self._event(
+            mine = [r for r in self.graph.records.values() if getattr(r, "stream", None) == stream]
+            self.graph.note(
                 "imu", stream=stream, factors=len(mine), ways=sum(isinstance(r, ImuRecord) for r in mine),
                 gravity=sum(isinstance(r, ForceRecord) for r in mine), dropped=dict(plan.dropped),
             )  # fmt: skip
         return ids
 
-    def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """Hold the axes of an IMU against the paths of the submaps; returns what is wrong in words, or nothing.
-
-        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
-
-        Raises
-        ------
-        DataError
-            The mounting is contradicted and ``axes`` is ``"refuse"``.
-        """
+    def check(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
+        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.check_imu`."""
         if axes == "ignore":
             return ""
         try:
-            found = check_imu_axes(imu, path_of(self.submaps, self.values))
+            found = check_imu_axes(imu, path_of(self.graph.submaps, self.graph.values))
         except DataError as error:
-            self._event("imu-axes", stream=stream, verdict="not checked", why=str(error))
+            self.graph.note("imu-axes", stream=stream, verdict="not checked", why=str(error))
             return ""
         words = found.words()
-        self._event(
+        self.graph.note(
             "imu-axes", stream=stream, verdict="wrong" if found.wrong else "as stated", words=words,
             excess=found.excess, alike=found.alike, windows=found.windows,
         )  # fmt: skip
@@ -150,16 +111,12 @@ class ImuVerbs(AttitudeVerbs):
             logger.warning("%s: the axes are not those that its mounting says: %s", stream, words)
         return words
 
-    def recentre_imu(self, *, limit: float = RECENTRE) -> int:
-        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
-
-        Ways know how they change with the biases to first order only. After solving, call this and solve again until
-        it returns nothing: twice is enough, most of the time.
-        """
+    def recentre(self, *, limit: float = RECENTRE) -> int:
+        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.recentre_imu`."""
         changed = 0
-        for stream, use in self.imus.items():
-            old = [r for r in self.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
-            now = np.array([self.values.imu_biases[r.biases[0]] for r in old]).reshape(-1, 6)
+        for stream, use in self.used.items():
+            old = [r for r in self.graph.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
+            now = np.array([self.graph.values.imu_biases[r.biases[0]] for r in old]).reshape(-1, 6)
             about = np.array([r.bias for r in old]).reshape(-1, 6)
             turned = np.linalg.norm((now - about)[:, :3], axis=1) * np.array([r.seconds for r in old])
             some = np.flatnonzero(turned > limit)
@@ -169,34 +126,29 @@ class ImuVerbs(AttitudeVerbs):
                 changed += len(some)
         return changed
 
-    def imu_states(self, stream: str = "imu") -> ImuStates:
-        """Nodes, velocities and biases of an IMU, in order of time."""
-        return ImuStates.of(self.records.values(), stream)
+    def states(self, stream: str = "imu") -> ImuStates:
+        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.imu_states`."""
+        return ImuStates.of(self.graph.records.values(), stream)
 
-    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
-        """See :meth:`~graphslam.graph.graph_record.GraphRecord.remove`; what an IMU said inside a submap goes with it.
+    def leave(self, s: SubmapNode) -> None:
+        """Take out what IMUs said inside a submap that goes."""
+        inside = set(s.nodes)
+        for fid, r in list(self.graph.records.items()):
+            way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
+            if way or (isinstance(r, ForceRecord) and r.node in inside):
+                self.graph.take_out(fid, "its submap was removed")
 
-        A bias that loses the way to the one before walks over the time between instead.
-        """
-        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
-        if owner is not None and factor_id in self.records:
-            inside = set(owner.nodes)
-            for fid, r in list(self.records.items()):
-                way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
-                if way or (isinstance(r, ForceRecord) and r.node in inside):
-                    self._take_out(fid, "its submap was removed")
-        alone = self.records.get(factor_id)
-        super().remove(factor_id, reason=reason)
-        if self.imus:
-            ways = {(r.i, r.j) for r in self.records.values() if isinstance(r, ImuRecord)}
-            if isinstance(alone, ImuRecord) and (alone.i, alone.j) not in ways:
-                self._level_inside([(alone.i, alone.j)], give_up=False)
-            for stream in self.imus:
-                self._relink(stream)
-            self._compact()
-            if self.values.tilt is not None and not any("tilt" in r.variables() for r in self.records.values()):
-                self.values.tilt = None
-                self.revision += 1
+    def tidy(self, removed: Record) -> None:
+        """Make good what a factor leaves that was removed: a bias that loses the way to the one before walks over the
+        time between instead; velocities and biases that nothing holds any more go."""
+        if not self.used:
+            return
+        ways = {(r.i, r.j) for r in self.graph.records.values() if isinstance(r, ImuRecord)}
+        if isinstance(removed, ImuRecord) and (removed.i, removed.j) not in ways:
+            self._level_inside([(removed.i, removed.j)], give_up=False)
+        for stream in self.used:
+            self._relink(stream)
+        self._compact()
 
     # ---------------------------------------------------------------- inside
 
@@ -206,26 +158,26 @@ class ImuVerbs(AttitudeVerbs):
         if not pairs:
             return []
         if cfg.accelerometer:
-            self._start_tilt()
+            self.graph.start_tilt()
         begin, end = (np.array([places[pair[k]].time for pair in pairs]) for k in (0, 1))
         unit = {n: places[n].unit(imu.T_base_imu) for pair in pairs for n in pair}
-        states = self.imu_states(stream)
+        states = self.states(stream)
         start = self._start_bias(states, preintegrate(imu, begin, end), pairs, unit)
         pim = preintegrate(imu, begin, end, start)
         velocities, biases = dict(states.velocity), dict(states.bias)
         kind = ImuRecord if cfg.accelerometer else GyroRecord
-        new_v, made = len(self.values.velocities), []
+        new_v, made = len(self.graph.values.velocities), []
         for k, (a, b) in enumerate(pairs):
             for n in (a, b):
                 if n not in biases:
-                    biases[n] = self.values.append("imubias", start)
+                    biases[n] = self.graph.values.append("imubias", start)
                 if cfg.accelerometer and n not in velocities:
-                    velocities[n] = self.values.append("velocity", np.full(3, np.nan))
+                    velocities[n] = self.graph.values.append("velocity", np.full(3, np.nan))
             va, vb = velocities.get(a, -1), velocities.get(b, -1)
             local = np.stack([unit[a][1], unit[b][1]])
             made.append(
                 kind(
-                    self._next_factor + k, stream, a, b, (begin[k], end[k]), (va, vb), (biases[a], biases[b]),
+                    self.graph.next_factor(), stream, a, b, (begin[k], end[k]), (va, vb), (biases[a], biases[b]),
                     unit[a][0], unit[b][0], pim.R[k], pim.p[k], pim.v[k], pim.J[k], pim.bias[k],
                     np.eye(15 if cfg.accelerometer else 9), local, cfg.robust,
                 )
@@ -233,7 +185,7 @@ class ImuVerbs(AttitudeVerbs):
         self._start_velocities(made, new_v)
         self._weigh(made, pim)
         for r in made:
-            self.ledger.spend(r.factor_id, r.label(), [stream], r.interval)
+            self.graph.ledger.spend(r.factor_id, r.label(), [stream], r.interval)
         self._level_inside(pairs, give_up=True)
         return [r.factor_id for r in made]
 
@@ -244,20 +196,20 @@ class ImuVerbs(AttitudeVerbs):
         grow, and marginals cannot say how alike they are at two nodes: increments between inner nodes then claim
         nearly exact turns (:mod:`graphslam.graph.inner_nodes`), which a gyro contradicts.
         """
-        levelled = {f for f, r in self.records.items() if isinstance(r, AttitudeRecord) and r.group == LEVELLED}
+        levelled = {f for f, r in self.graph.records.items() if isinstance(r, AttitudeRecord) and r.group == LEVELLED}
         chosen = set(pairs)
-        for k, s in enumerate(self.submaps):
+        for k, s in enumerate(self.graph.submaps):
             if not levelled.intersection(s.factor_ids) or len(s.nodes) < 3:
                 continue
             covariances = s.covariances.copy()
             for m, (pair, fid) in enumerate(zip(zip(s.nodes, s.nodes[1:]), s.factor_ids)):
-                old = self.records.get(fid)
+                old = self.graph.records.get(fid)
                 if pair not in chosen or m == len(covariances) - 1 or not isinstance(old, BetweenRecord):
                     continue  # the last one has given it up already
                 covariances[m] = without_tilt(s.stated[m]) if give_up else s.stated[m]
                 W = whitener(covariances[m], what=f"covariance of {old.label()}", dim=6)
-                self.insert(replace(old, whitener=W))
-            self.submaps[k] = replace(s, covariances=covariances)
+                self.graph.insert(replace(old, whitener=W))
+            self.graph.submaps[k] = replace(s, covariances=covariances)
 
     def _start_bias(
         self,
@@ -268,9 +220,12 @@ class ImuVerbs(AttitudeVerbs):
     ) -> Array:
         """Where biases start: at the last one known, or by how much faster the gyro turns than the nodes do."""
         if states.bias:
-            return self.values.imu_biases[states.bias[states.order[-1]]].copy()
+            return self.graph.values.imu_biases[states.bias[states.order[-1]]].copy()
         i, j = np.array(pairs).T
-        q = [quat_multiply(self.values.poses[n, 3:], np.array([unit[k][0][3:] for k in n.tolist()])) for n in (i, j)]
+        q = [
+            quat_multiply(self.graph.values.poses[n, 3:], np.array([unit[k][0][3:] for k in n.tolist()]))
+            for n in (i, j)
+        ]
         turn = quat_multiply(q[0] * [-1.0, -1.0, -1.0, 1.0], q[1])
         excess = np.swapaxes(quat_to_matrix(turn), 1, 2) @ pim.R
         w = so3_log(matrix_to_quat(excess)) / pim.seconds[:, None]
@@ -279,14 +234,14 @@ class ImuVerbs(AttitudeVerbs):
 
     def _start_velocities(self, ways: Sequence[ImuRecord], first: int) -> None:
         """Velocities from ``first`` on, by the ways (eq. 33 solved for them)."""
-        v = self.values.velocities
+        v = self.graph.values.velocities
         if len(v) == first:
             return
-        assert self.values.tilt is not None
-        up = GRAVITY * up_turn(self.values.tilt)[0][:, 2]
+        assert self.graph.values.tilt is not None
+        up = GRAVITY * up_turn(self.graph.values.tilt)[0][:, 2]
         for r in ways:
             a, b = r.velocities
-            X = se3_compose(self.values.poses[[r.i, r.j]], np.stack([r.T_i_imu, r.T_j_imu]))
+            X = se3_compose(self.graph.values.poses[[r.i, r.j]], np.stack([r.T_i_imu, r.T_j_imu]))
             T, R = r.seconds, quat_to_matrix(X[0, 3:])
             at_i = (X[1, :3] - X[0, :3] + 0.5 * up * T**2 - R @ r.p) / T
             if a >= first and not np.isfinite(v[a, 0]):
@@ -296,9 +251,9 @@ class ImuVerbs(AttitudeVerbs):
 
     def _weigh(self, records: Sequence[ImuRecord], pim: Preintegrated) -> None:
         """Put ways into the graph as preintegrated, with the covariance of where the unit is on the nodes."""
-        tilt = np.zeros(2) if self.values.tilt is None else self.values.tilt  # the gyro alone asks for none
-        v = np.vstack([self.values.velocities, np.zeros(3)])  # row -1: of ways by the gyro alone
-        b, x = self.values.imu_biases, self.values.poses
+        tilt = np.zeros(2) if self.graph.values.tilt is None else self.graph.values.tilt  # the gyro alone asks for none
+        v = np.vstack([self.graph.values.velocities, np.zeros(3)])  # row -1: of ways by the gyro alone
+        b, x = self.graph.values.imu_biases, self.graph.values.poses
         fresh = [replace(r, R=R, p=p, v=w, J=J, bias=c) for r, R, p, w, J, c in zip(
             records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
         i, j = (np.array([getattr(r, n) for r in fresh]) for n in "ij")
@@ -316,15 +271,15 @@ class ImuVerbs(AttitudeVerbs):
             gyro = isinstance(r, GyroRecord)
             Pk = Pk[np.ix_(GYRO_ROWS, GYRO_ROWS)] if gyro else Pk
             W = whitener(Pk, what=f"covariance of {r.label()}", dim=len(Pk))
-            self.insert(replace(r, whitener=W))
+            self.graph.insert(replace(r, whitener=W))
 
     def _add_forces(self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], plan: Plan) -> list[int]:
         if not plan.gravity:
             return []
-        self._start_tilt()
+        self.graph.start_tilt()
         at = np.array([places[n].time for n in plan.gravity])
         force, count, quiet = mean_force(imu, at, 0.5 * cfg.window)
-        states, ids = self.imu_states(stream), []
+        states, ids = self.states(stream), []
         known = states.bias
         for k, n in enumerate(plan.gravity):
             if count[k] < FEWEST:
@@ -338,39 +293,42 @@ class ImuVerbs(AttitudeVerbs):
             W = whitener(sigma**2 * np.eye(3) + tilted, what=f"specific force at x{n}", dim=3)
             row = known.get(n)
             if row is None:
-                last = self.values.imu_biases[-1:]
-                row = self.values.append("imubias", last if len(last) else np.zeros(6))
-            r = ForceRecord(self._next_factor, stream, n, float(at[k]), row, L, force[k], W, cfg.robust)
-            self.ledger.spend(r.factor_id, r.label(), [stream], window_of(at[k], cfg))
-            self.insert(r)
+                last = self.graph.values.imu_biases[-1:]
+                row = self.graph.values.append("imubias", last if len(last) else np.zeros(6))
+            r = ForceRecord(self.graph.next_factor(), stream, n, float(at[k]), row, L, force[k], W, cfg.robust)
+            self.graph.ledger.spend(r.factor_id, r.label(), [stream], window_of(at[k], cfg))
+            self.graph.insert(r)
             ids.append(r.factor_id)
         return ids
 
     def _relink(self, stream: str) -> list[int]:
         """The first bias starts, and each that no way ties to the one before walks on from it."""
-        noise = self.imus[stream].imu.noise
-        wanted = links_wanted(self.imu_states(stream), self.records.values(), stream, noise)
-        for fid, r in list(self.records.items()):
+        noise = self.used[stream].imu.noise
+        wanted = links_wanted(self.states(stream), self.graph.records.values(), stream, noise)
+        for fid, r in list(self.graph.records.items()):
             if isinstance(r, ImuBiasRecord) and r.stream == stream:
                 sigma = wanted.get((r.before, r.bias))
                 if sigma is None or not np.array_equal(sigma, r.sigma):
-                    self.records.pop(fid)
-                    self.ledger.refund(fid)
-                    self.revision += 1
+                    self.graph.records.pop(fid)
+                    self.graph.ledger.refund(fid)
+                    self.graph.revision += 1
                 else:
                     del wanted[(r.before, r.bias)]
         ids = []
         for (before, bias), sigma in wanted.items():
-            link = ImuBiasRecord(self._next_factor, stream, before, bias, sigma)
-            self.ledger.spend(link.factor_id, link.label(), ["-"], (0.0, 0.0), "prior")
-            self.insert(link)
+            link = ImuBiasRecord(self.graph.next_factor(), stream, before, bias, sigma)
+            self.graph.ledger.spend(link.factor_id, link.label(), ["-"], (0.0, 0.0), "prior")
+            self.graph.insert(link)
             ids.append(link.factor_id)
         return ids
 
     def _compact(self) -> None:
         """Velocities and biases that no factor holds any more go; the others move up."""
-        changed, v, b = compacted(self.records)
-        if changed or len(v) < len(self.values.velocities) or len(b) < len(self.values.imu_biases):
-            self.values.velocities, self.values.imu_biases = self.values.velocities[v], self.values.imu_biases[b]
-            self.records.update(changed)
-            self.revision += 1
+        changed, v, b = compacted(self.graph.records)
+        if changed or len(v) < len(self.graph.values.velocities) or len(b) < len(self.graph.values.imu_biases):
+            self.graph.values.velocities, self.graph.values.imu_biases = (
+                self.graph.values.velocities[v],
+                self.graph.values.imu_biases[b],
+            )
+            self.graph.records.update(changed)
+            self.graph.revision += 1
