@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -131,6 +132,7 @@ class BetweenBatch(UniformBatch):
         J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
         return r, np.concatenate([J_i, J_j], axis=2)
 
+    @cached_property
     def natives(self) -> list[gtsam.NonlinearFactor]:
         """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular."""
         make = gtsam.BetweenFactorPose2 if self.dim == 2 else gtsam.BetweenFactorPose3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -111,6 +112,7 @@ class SightingBatch(UniformBatch):
             J[k] = P @ J[k]
         return r, J
 
+    @cached_property
     def natives(self) -> list[gtsam.NonlinearFactor]:
         """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular.
 

@@ -28,7 +28,7 @@ def measured_factors(flat: FlatGraph) -> list[list[gtsam.NonlinearFactor]]:
     SolverError
         Cartesian observations: GTSAM has no native factor for them.
     """
-    found = [cast("BetweenBatch | SightingBatch", f).natives() for f in flat.batches]
+    found = [cast("BetweenBatch | SightingBatch", f).natives for f in flat.batches]
     return [found[0], found[1] if len(found) > 1 else []]
 
 

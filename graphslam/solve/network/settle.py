@@ -195,7 +195,9 @@ def loop_evidence(
     d, layout = flat.layout.pose_dof, flat.layout
     label = groups_of(edges.ends[at])
     order = np.argsort(label, kind="stable")
-    lu = factor(sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A))
+    H = sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A)
+    H.eliminate_zeros()  # what is refused would fill the factor
+    lu = factor(H)
     ordered = BetweenBatch.of_arrays(
         edges.ends[at[order]], edges.measured[at[order]], edges.whiteners[at[order]], layout
     )
