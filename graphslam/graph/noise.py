@@ -57,7 +57,9 @@ def whiteners(information: Array) -> Array:
         return np.asarray(np.swapaxes(np.linalg.cholesky(information), 1, 2))
     except np.linalg.LinAlgError:
         w, V = np.linalg.eigh(information)
-        return np.asarray(np.linalg.qr(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2), mode="r"))
+        R = np.linalg.qr(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2), mode="r")
+        # GTSAM takes a diagonal one for standard deviations, and refuses negative ones
+        return np.asarray(np.where(np.diagonal(R, axis1=1, axis2=2) < 0.0, -1.0, 1.0)[:, :, None] * R)
 
 
 # So many matrices are turned into whiteners at a time.

@@ -13,6 +13,7 @@ from graphslam.core import se3
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.factors.batch import shared_noise
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import problem_of_network, values_of
 from graphslam.graph.noise import whiteners
@@ -147,7 +148,10 @@ def test_g2o_residual_of_one_edge_by_hand() -> None:
 def test_square_root_of_semidefinite_information(rng: np.random.Generator) -> None:
     A = rng.standard_normal((5, 3, 2))
     omega = A @ np.swapaxes(A, 1, 2)
+    omega[0], omega[1] = np.diag([4.0, 9.0, 0.0]), np.diag([1.0, 0.25, 16.0])
     R = whiteners(omega)
+    assert (np.diagonal(R, axis1=1, axis2=2) >= 0.0).all()  # GTSAM takes a diagonal one for standard deviations
+    assert len(shared_noise(R)) == len(R)
     assert np.allclose(np.tril(R, -1), 0.0, atol=1e-15)  # GTSAM wants it upper triangular
     assert np.allclose(np.swapaxes(R, 1, 2) @ R, omega, atol=1e-12)
 
