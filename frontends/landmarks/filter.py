@@ -9,7 +9,14 @@ from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, se2_transform, wrap_angle
 from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam.frontends.landmarks.config import FilterConfig
-from graphslam.frontends.landmarks.kernels import CFG_LENGTH, IGNORED, fastslam_step
+from graphslam.frontends.landmarks.kernels import (
+    CFG_LENGTH,
+    IGNORED,
+    MotionArrays,
+    ParticleArrays,
+    ScanArrays,
+    fastslam_step,
+)
 from graphslam.frontends.landmarks.range_only import Start, WaitingRanges
 
 Ints = npt.NDArray[np.int64]
@@ -113,11 +120,12 @@ class ParticleSet:
         highest = int(known.max()) + 1 if n_obs else 0
         self._grow_slots(max(n_obs, highest - int(self.count.max())))
         self._grow_history(n_obs)
-        fastslam_step(
-            self.pose, self.log_weight, self.mean, self.cov, self.hits, self.misses, self.born, self.count, self.assoc,
-            self.scans, self._column(), observations, known, u, Q,
-            self.rng.standard_normal((len(self.pose), 3)), self.sensor, self._cfg,
-        )  # fmt: skip
+        particles = ParticleArrays(
+            self.pose, self.log_weight, self.mean, self.cov, self.hits, self.misses, self.born, self.count, self.assoc
+        )
+        motion = MotionArrays(u, Q, self.rng.standard_normal((len(self.pose), 3)))
+        scan = ScanArrays(self.scans, self._column(), observations, known)
+        fastslam_step(particles, scan, motion, self.sensor, self._cfg)
         if np.isinf(observations[:, 3]).any():
             self._wait_or_start(observations, known)
         self._record(n_obs)

@@ -13,6 +13,7 @@ updates a landmark but cannot found one; what waits for that is in :mod:`graphsl
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -48,15 +49,83 @@ def _of_channels(vb, two, one):
     return one if math.isinf(vb) else two
 
 
+class ParticleArrays(NamedTuple):
+    """Of n particles with up to M landmarks each; hits 0 = free slot."""
+
+    pose: Any
+    """(n, 3)"""
+    log_weight: Any
+    """(n,)"""
+    mean: Any
+    """(n, M, 2)"""
+    cov: Any
+    """(n, M, 3): xx xy yy"""
+    hits: Any
+    """(n, M) int32"""
+    misses: Any
+    born: Any
+    count: Any
+    """(n,) int64: slots in use."""
+    assoc: Any
+    """(n, Q) int32"""
+
+
+class ScanArrays(NamedTuple):
+    """One scan."""
+
+    number: Any
+    """In the submap."""
+    first: Any
+    """Unique index (B4) of its first observation."""
+    obs: Any
+    """(q, 4): range, bearing, variance of each."""
+    known: Any
+    """(q,) int64: slot per observation, or -1: decide by likelihood."""
+
+
+class MotionArrays(NamedTuple):
+    """The motion before a scan."""
+
+    u: Any
+    """(3,): increment."""
+    Q: Any
+    """(3, 3): its covariance, right tangent."""
+    normals: Any
+    """(n, 3)"""
+
+
+class _Landmarks(NamedTuple):
+    """Of one particle."""
+
+    mean: Any
+    cov: Any
+    hits: Any
+    count: Any
+
+
+class _Pairing(NamedTuple):
+    """Answers of an association, and room for it."""
+
+    match: Any
+    nearest: Any
+    polar: Any
+    head: Any
+    link: Any
+    pair_o: Any
+    pair_s: Any
+    pair_d: Any
+    pair_c: Any
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _associate(
-    m, P, mean, cov, hits, count, obs, sensor, cfg, match, nearest, polar, head, link, pair_o, pair_s, pair_d, pair_c
-):
+def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     """Maximum-likelihood association of one particle, exclusive (B4, step 2): fills match[o] with a slot or -1.
 
     nearest[o] is the least Mahalanobis distance² of any landmark to observation o (inf if none is near).
     polar[j] = predicted (range, bearing) of slot j, range < 0 where it is out of view.
     """
+    mean, cov, hits, count = landmarks
+    match, nearest, polar, head, link, pair_o, pair_s, pair_d, pair_c = pairing
     n_obs = len(obs)
     h = np.empty(12)
     sxy = math.sqrt(max(P[0, 0] + P[1, 1], 0.0))
@@ -139,35 +208,24 @@ def _associate(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fastslam_step(
-    pose,
-    log_weight,
-    mean,
-    cov,
-    hits,
-    misses,
-    born,
-    count,
-    assoc,
-    scan,
-    first_obs,
-    obs,
-    known,
-    u,
-    Q,
-    normals,
-    sensor,
-    cfg,
-):
+def fastslam_step(particles, scan, motion, sensor, cfg):
     """Advance every particle by one scan.
 
-    pose (n, 3), log_weight (n,), mean (n, M, 2), cov (n, M, 3: xx xy yy), hits/misses/born (n, M) int32 (hits 0 = free
-    slot), count (n,) int64 slots in use, assoc (n, Q) int32.
-    scan : index of this scan in the submap; first_obs : unique index (B4) of its first observation.
-    obs (q, 4) : range, bearing, variance of each. known (q,) int64 : slot per observation, or -1: decide by likelihood;
-    in known-association mode ``known[o] >= 0`` for all o and an empty slot is filled, unless by a range alone.
-    u (3,), Q (3, 3) : motion increment and its right-tangent covariance. normals (n, 3). sensor (3,) T_base_sensor.
+    In known-association mode ``known[o] >= 0`` for all o and an empty slot is filled, unless by a range alone.
+
+    Parameters
+    ----------
+    particles : ParticleArrays
+        Changed in place.
+    scan : ScanArrays
+    motion : MotionArrays
+    sensor : (3,)
+        ``T_base_sensor``.
+    cfg : (CFG_LENGTH,)
     """
+    pose, log_weight, mean, cov, hits, misses, born, count, assoc = particles
+    number, first_obs, obs, known = scan
+    u, Q, normals = motion
     n, n_obs, slots = pose.shape[0], obs.shape[0], mean.shape[1]
     h = np.empty(12)
     m = np.empty(3)
@@ -181,6 +239,7 @@ def fastslam_step(
     room = max(64, 24 * n_obs)
     pair_o, pair_s = np.empty(room, np.int64), np.empty(room, np.int64)
     pair_d, pair_c = np.empty(room), np.empty(room)
+    pairing = _Pairing(match, nearest, polar, head, link, pair_o, pair_s, pair_d, pair_c)
     by_identity = n_obs > 0 and known[0] >= 0
     for i in range(n):
         # motion: x_t = x_{t-1} ∘ u (mean of the prior)
@@ -199,26 +258,7 @@ def fastslam_step(
             for j in range(count[i]):
                 polar[j, 0] = -1.0
         else:
-            _associate(
-                m,
-                P,
-                mean[i],
-                cov[i],
-                hits[i],
-                count[i],
-                obs,
-                sensor,
-                cfg,
-                match,
-                nearest,
-                polar,
-                head,
-                link,
-                pair_o,
-                pair_s,
-                pair_d,
-                pair_c,
-            )
+            _associate(m, P, _Landmarks(mean[i], cov[i], hits[i], count[i]), obs, sensor, cfg, pairing)
         # proposal and weight: sequential over features; the product of the innovations' likelihoods is exact
         # for the linearised model
         for o in range(n_obs):
@@ -294,7 +334,7 @@ def fastslam_step(
                 cov[i, j, 2] = st * st * vr + ct * ct * q
                 hits[i, j] = 1
                 misses[i, j] = 0
-                born[i, j] = scan
+                born[i, j] = number
                 assoc[i, first_obs + o] = j
                 if not by_identity:
                     polar[j, 0] = -1.0
@@ -304,7 +344,7 @@ def fastslam_step(
             continue
         # spurious features: provisional ones that should have been seen again and were not
         for j in range(count[i]):
-            if hits[i, j] > 0 and hits[i, j] < cfg[CFG_CONFIRM] and born[i, j] < scan:
+            if hits[i, j] > 0 and hits[i, j] < cfg[CFG_CONFIRM] and born[i, j] < number:
                 in_view = (
                     polar[j, 0] > 0.0
                     and polar[j, 0] < cfg[CFG_MISS_RANGE]
@@ -317,7 +357,7 @@ def fastslam_step(
                         seen = True
                 if in_view and not seen:
                     misses[i, j] += 1
-                if misses[i, j] >= cfg[CFG_MISSES] or scan - born[i, j] >= cfg[CFG_SCANS]:
+                if misses[i, j] >= cfg[CFG_MISSES] or number - born[i, j] >= cfg[CFG_SCANS]:
                     hits[i, j] = 0
                     for k in range(first_obs + n_obs):
                         if assoc[i, k] == j:

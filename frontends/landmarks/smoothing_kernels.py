@@ -8,11 +8,48 @@ marginal that the submap hands over. Cost is poses × landmarks²; nothing of si
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
+
+
+class Evidence(NamedTuple):
+    """What is known of T poses and L landmarks."""
+
+    u: Any
+    """(T, 3): odometry increments."""
+    W: Any
+    """(T, 3, 3): their information."""
+    ob_pose: Any
+    """(q,): pose of each observation."""
+    ob_lm: Any
+    """(q,): its landmark."""
+    ob: Any
+    """(q, 4): range, bearing and their variances."""
+    weight: Any
+    """(q,)"""
+    sensor: Any
+    """(3,): T_base_sensor."""
+
+
+class Normal(NamedTuple):
+    """Normal equations."""
+
+    A: Any
+    """(T, 3, 3)"""
+    B: Any
+    """(T, 3, 3), coupling k to k + 1."""
+    C: Any
+    """(T, 3, 2 L)"""
+    H: Any
+    """(2 L, 2 L)"""
+    g: Any
+    """(T, 3): right-hand side of the poses."""
+    gl: Any
+    """(2 L,): that of the landmarks."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -46,8 +83,9 @@ def _odometry_residual(a, b, u, e):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts):
+def smoothing_cost(poses, landmarks, evidence, d2, parts):
     """Objective Σ rᵀ Σ⁻¹ r; fills d2 per observation and parts = (odometry, range, bearing) shares."""
+    u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
     e = np.empty(6)
     h = np.empty(12)
     base = np.zeros(3)
@@ -73,8 +111,10 @@ def smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl):
-    """Normal equations: A (T,3,3), B (T,3,3) coupling k to k+1, C (T,3,2L), H (2L,2L), right-hand sides g, gl."""
+def _linearise(poses, landmarks, evidence, normal):
+    """Fill the normal equations."""
+    u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
+    A, B, C, H, g, gl = normal
     A[:] = 0.0
     B[:] = 0.0
     C[:] = 0.0
@@ -132,8 +172,9 @@ def _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B,
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _eliminate(A, B, C, H, g, gl, last_seen, Ainv):
+def _eliminate(normal, last_seen, Ainv):
     """Eliminate poses 0 … T-2 forwards. Columns of C beyond ``last_seen[k]`` are still zero at pose k."""
+    A, B, C, H, g, gl = normal
     T, n = len(A), H.shape[0]
     G = np.empty((3, n))
     for k in range(T - 1):
@@ -171,24 +212,24 @@ def _reduced(A, C, H):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def smooth_kernel(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, max_iterations, tolerance):
+def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
     """Damped Gauss-Newton over poses (T,3) and landmarks (L,2), both changed in place; base pose fixed at identity.
 
-    u (T,3), W (T,3,3): odometry increments and their information. ob_pose, ob_lm (q,), ob (q,4), weight (q,).
     Returns (objective, iterations, converged). Converged: relative decrease below ``tolerance``.
     """
     T, n = len(poses), 2 * len(landmarks)
     A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
     H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
-    last_seen = seen_columns(T, n, ob_pose, ob_lm)
-    d2, parts = np.empty(len(ob)), np.empty(3)
-    cost = smoothing_cost(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts)
+    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
+    normal = Normal(A, B, C, H, g, gl)
+    d2, parts = np.empty(len(evidence.ob)), np.empty(3)
+    cost = smoothing_cost(poses, landmarks, evidence, d2, parts)
     new_poses, new_lm = np.empty_like(poses), np.empty_like(landmarks)
     step = np.empty((T, 3))
     rhs = np.empty(3 + n)
     for iteration in range(max_iterations):
-        _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl)
-        _eliminate(A, B, C, H, g, gl, last_seen, Ainv)
+        _linearise(poses, landmarks, evidence, normal)
+        _eliminate(normal, last_seen, Ainv)
         rhs[:3] = g[T - 1]
         rhs[3:] = gl
         x = np.linalg.solve(_reduced(A, C, H), rhs)
@@ -210,7 +251,7 @@ def smooth_kernel(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, ma
             for j in range(len(landmarks)):
                 new_lm[j, 0] = landmarks[j, 0] + scale * x[3 + 2 * j]
                 new_lm[j, 1] = landmarks[j, 1] + scale * x[4 + 2 * j]
-            new_cost = smoothing_cost(new_poses, new_lm, u, W, ob_pose, ob_lm, ob, weight, sensor, d2, parts)
+            new_cost = smoothing_cost(new_poses, new_lm, evidence, d2, parts)
             if new_cost <= cost * (1.0 + 1e-12):
                 break
             scale *= 0.5
@@ -240,7 +281,7 @@ def seen_columns(T, n, ob_pose, ob_lm):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def smoothed_covariances(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor):
+def smoothed_covariances(poses, landmarks, evidence):
     """Laplace covariances at the optimum, Gauss-Newton Hessian.
 
     Returns the joint covariance (3 + 2L, …) of {exit pose (right tangent), landmarks} and the marginal covariances
@@ -249,9 +290,10 @@ def smoothed_covariances(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sen
     T, n = len(poses), 2 * len(landmarks)
     A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
     H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
-    last_seen = seen_columns(T, n, ob_pose, ob_lm)
-    _linearise(poses, landmarks, u, W, ob_pose, ob_lm, ob, weight, sensor, A, B, C, H, g, gl)
-    _eliminate(A, B, C, H, g, gl, last_seen, Ainv)
+    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
+    normal = Normal(A, B, C, H, g, gl)
+    _linearise(poses, landmarks, evidence, normal)
+    _eliminate(normal, last_seen, Ainv)
     joint = np.linalg.inv(_reduced(A, C, H))
     joint = 0.5 * (joint + joint.T)
     marginal = np.empty((T, 3, 3))

@@ -16,7 +16,12 @@ from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.smoothing_kernels import smooth_kernel, smoothed_covariances, smoothing_cost
+from graphslam.frontends.landmarks.smoothing_kernels import (
+    Evidence,
+    smooth_kernel,
+    smoothed_covariances,
+    smoothing_cost,
+)
 
 Ints = npt.NDArray[np.int64]
 _HUBER2 = 1.345**2
@@ -261,12 +266,12 @@ def smooth(
     d2, parts = np.zeros(len(observations)), np.zeros(3)
     args = (increments, W, ob_pose, ob_landmark, observations)
     if trim > 0.0 and len(observations):
-        smooth_kernel(p, l, *args, weight, sensor, 6, 1e-3)
+        smooth_kernel(p, l, Evidence(*args, weight, sensor), 6, 1e-3)
         for _ in range(3):  # Huber by reweighting; few passes, it only has to unmask the outliers
-            smoothing_cost(p, l, *args, weight, sensor, d2, parts)
+            smoothing_cost(p, l, Evidence(*args, weight, sensor), d2, parts)
             weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
-            smooth_kernel(p, l, *args, weight, sensor, 3, 1e-3)
-        smoothing_cost(p, l, *args, weight, sensor, d2, parts)
+            smooth_kernel(p, l, Evidence(*args, weight, sensor), 3, 1e-3)
+        smoothing_cost(p, l, Evidence(*args, weight, sensor), d2, parts)
         gates = np.where(np.isinf(observations[:, 3]), equal_tail_gate(trim, 2, 1), trim)
         weight = (d2 <= gates).astype(np.float64)
     left = np.bincount(ob_landmark, weights=weight, minlength=len(l)) >= min_hits
@@ -275,9 +280,10 @@ def smooth(
     args = (increments, W, ob_pose[kept], (np.cumsum(left) - 1)[ob_landmark[kept]], observations[kept])
     weight = np.ones(int(kept.sum()))
     d2 = np.zeros(len(weight))
-    chi2, _, converged = smooth_kernel(p, l, *args, weight, sensor, max_iterations, 1e-9)
-    joint, marginals = smoothed_covariances(p, l, *args, weight, sensor)
-    smoothing_cost(p, l, *args, weight, sensor, d2, parts)
+    evidence = Evidence(*args, weight, sensor)
+    chi2, _, converged = smooth_kernel(p, l, evidence, max_iterations, 1e-9)
+    joint, marginals = smoothed_covariances(p, l, evidence)
+    smoothing_cost(p, l, evidence, d2, parts)
     if not np.all(np.isfinite(joint)):
         raise CovarianceError(
             "smoothed submap is singular", got=f"{len(l)} landmarks, {int(weight.sum())} observations"

@@ -33,7 +33,7 @@ from graphslam.core.geometry import (
     wrap_angle,
 )
 from graphslam.frontends.landmarks.prepare import Prepared
-from graphslam.frontends.landmarks.smoothing_kernels import smooth_kernel
+from graphslam.frontends.landmarks.smoothing_kernels import Evidence, smooth_kernel
 
 Ints = npt.NDArray[np.int64]
 PARAMETERS = (
@@ -125,7 +125,7 @@ def _window(
     sensor = np.ascontiguousarray(data.observations.T_base_sensor, dtype=np.float64)
     try:
         W = np.linalg.inv(Q)
-        smooth_kernel(x, l, u, W, pose, index, z, np.ones(len(z)), sensor, 20, 1e-6)
+        smooth_kernel(x, l, Evidence(u, W, pose, index, z, np.ones(len(z)), sensor), 20, 1e-6)
     except np.linalg.LinAlgError:
         return None
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(l))):
