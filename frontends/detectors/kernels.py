@@ -74,11 +74,12 @@ def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fit_circle(r, angles, a, b, step, max_range, sigma, rho, bearing, radius, out):  # type: ignore[no-untyped-def]
+def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-untyped-def]
     """Weighted least squares of (rho, bearing, radius) on both edge angles and the ranges of the inner beams.
 
     Fills ``out`` with rho, bearing, radius, var(rho), var(bearing); True if it converged on a believable circle.
     """
+    r, angles, step, max_range, sigma = beams_of
     edge_variance = step * step / 12.0
     half = math.asin(min(radius / rho, 0.99))
     centre = bearing
@@ -217,7 +218,7 @@ def detect(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-
             var_bearing = step * step / 24.0
             fitted = 0.0
             if beams >= parameters[P_FIT_BEAMS] and _fit_circle(
-                r, angles, a, b, step, max_range, sigma, rho, bearing, radius, fit
+                (r, angles, step, max_range, sigma), a, b, rho, bearing, radius, fit
             ):
                 rho, bearing, radius, var_range, var_bearing = fit
                 fitted = 1.0

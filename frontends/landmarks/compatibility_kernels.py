@@ -8,6 +8,7 @@ freedom, so that an observation without bearing is judged with one. Twin: ``test
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -16,13 +17,42 @@ from graphslam.frontends.landmarks.ekf_kernels import linearise
 from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
 
 
+class Joint(NamedTuple):
+    """A Gaussian over pose and landmarks."""
+
+    x: Any
+    """(3 + 2 nl,)"""
+    P: Any
+
+
+class Pairs(NamedTuple):
+    """Room for pairings (q · nl,)."""
+
+    o: Any
+    """Observation."""
+    k: Any
+    """Landmark."""
+    d2: Any
+    """Distance²."""
+
+
+class Counts(NamedTuple):
+    """Of landmarks, by slot."""
+
+    hits: Any
+    misses: Any
+    born: Any
+
+
 @numba.njit(cache=True, error_model="numpy")
-def candidates_kernel(x, P, alive, obs, sensor, gates, polar, nearest, pair_o, pair_k, pair_d2):
+def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
     """Individually compatible pairings, grouped by observation and sorted by distance within.
 
     alive (nl,) bool; polar (nl, 2) out: predicted range and bearing; nearest (q,) out: least distance² of any landmark
-    as a share of the gate (≤ 1 is inside). pair_o, pair_k, pair_d2 (q · nl,) out. Returns the number of pairs.
+    as a share of the gate (≤ 1 is inside). pairs: out. Returns their number.
     """
+    x, P = state
+    pair_o, pair_k, pair_d2 = pairs
     nl, q = len(alive), len(obs)
     h = np.empty(12)
     S = np.empty((nl, 3))
@@ -30,7 +60,7 @@ def candidates_kernel(x, P, alive, obs, sensor, gates, polar, nearest, pair_o, p
         if not alive[k]:
             continue
         c = 3 + 2 * k
-        observe(x[0], x[1], x[2], sensor[0], sensor[1], sensor[2], x[c], x[c + 1], h)
+        observe(x[0], x[1], x[2], sensor, x[c], x[c + 1], h)
         polar[k, 0], polar[k, 1] = h[0], h[1]
         t = np.zeros((2, 5))
         for r in range(2):
@@ -86,7 +116,7 @@ def nearest_kernel(pairs, pair_o, pair_k, cost, match):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def joint_kernel(x, P, obs, sensor, gates, pairs, pair_o, pair_k, max_nodes, match):
+def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     """Joint compatibility by branch and bound (Neira & Tardós 2001): most pairings, then least joint distance².
 
     Observations are interpreted in the order given, candidates nearest first, then "none". Every hypothesis on the way
@@ -96,20 +126,22 @@ def joint_kernel(x, P, obs, sensor, gates, pairs, pair_o, pair_k, max_nodes, mat
 
     Returns (nodes tested, 1 if ``max_nodes`` stopped the search, else 0, D² of the result).
     """
+    x, P = state
+    pair_o, pair_k = pairs.o, pairs.k
     match[:] = -1
     best_match = match.copy()
     # levels: observations with a candidate
     begin, end = np.empty(len(obs), np.int64), np.empty(len(obs), np.int64)
     levels = 0
-    for i in range(pairs):
+    for i in range(count):
         if i == 0 or pair_o[i] != pair_o[i - 1]:
             begin[levels] = i
             levels += 1
         end[levels - 1] = i + 1
-    H, nu, rows = np.empty((pairs, 2, 5)), np.empty((pairs, 2)), np.empty(pairs, np.int64)
+    H, nu, rows = np.empty((count, 2, 5)), np.empty((count, 2)), np.empty(count, np.int64)
     h = np.empty(12)
     last = 0
-    for i in range(pairs):
+    for i in range(count):
         rows[i] = linearise(x, pair_k[i], obs[pair_o[i]], sensor, h, H[i], nu[i])
         last = max(last, pair_k[i])
     used = np.zeros(last + 1, np.bool_)
@@ -202,12 +234,13 @@ def _cross(P, a, ca, b, cb):
 
 
 @numba.njit(cache=True)
-def misses_kernel(slots, scan, at, polar, hits, misses, born, limits, dropped):
+def misses_kernel(slots, scan, at, polar, counts, limits, dropped):
     """Provisional landmarks that should have been seen and were not: counts misses, marks those that go.
 
     slots (nl,) of the active landmarks; at (q,): active landmark of each observation or -1; limits: confirm hits,
-    misses, scans, range, least and greatest bearing. hits, misses, born are by slot; dropped (nl,) bool out.
+    misses, scans, range, least and greatest bearing; dropped (nl,) bool out.
     """
+    hits, misses, born = counts
     count = 0
     seen = np.zeros(len(slots), np.bool_)
     for o in range(len(at)):

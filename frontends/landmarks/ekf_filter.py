@@ -15,9 +15,11 @@ from scipy.linalg.blas import dsyrk
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array
 from graphslam.frontends.landmarks.compatibility import gates_by_dof, pair
-from graphslam.frontends.landmarks.compatibility_kernels import misses_kernel
+from graphslam.frontends.landmarks.compatibility_kernels import Counts, misses_kernel
 from graphslam.frontends.landmarks.ekf_config import EkfFilterConfig
 from graphslam.frontends.landmarks.ekf_kernels import (
+    Active,
+    Now,
     augment_kernel,
     gather_kernel,
     innovation_kernel,
@@ -147,9 +149,8 @@ class EkfMap:
         if self._rows + rows > len(self._V):
             self._compress(rows)
         n = 3 + 2 * len(self._active)
-        nis, used = update_kernel(
-            self._ax, self._aP, n, self._aPhi, self._n0, self._V, self._rows, self._theta, observations, at, self.sensor
-        )
+        active = Active(self._ax, self._aP, self._aPhi, self._V, self._theta)
+        nis, used = update_kernel(active, n, self._n0, self._rows, observations, at, self.sensor)
         if used < 0 or not np.isfinite(nis):
             raise CovarianceError(
                 f"innovation covariance of scan {self.scans} is not positive definite", wanted="finite motion and noise"
@@ -212,17 +213,16 @@ class EkfMap:
         new = gates_by_dof(self.config.gate_new, 2)
         weights = np.broadcast_to([1.0 / new[1], 1.0 / new[2]], (len(observations), 2))
         out = np.empty(len(slots))
-        passive_distance_kernel(
-            self._ax[:3], self._aP[:3, :3], cross[:3], cross[3], slots, self._x, self._P,
-            np.hstack([observations, weights]), self.sensor, out,
-        )  # fmt: skip
+        now = Now(self._ax[:3], self._aP[:3, :3], cross[:3], cross[3])
+        passive_distance_kernel(now, slots, self._x, self._P, np.hstack([observations, weights]), self.sensor, out)
         return out
 
     def _drop_spurious(self, at: Ints, polar: Array) -> None:
         k = len(polar)  # landmarks founded in this very scan are not judged
         dropped = np.zeros(k, dtype=np.bool_)
         slots = self._active[:k]
-        if misses_kernel(slots, self.scans, at, polar, self.hits, self.misses, self.born, self._limits, dropped):
+        counts = Counts(self.hits, self.misses, self.born)
+        if misses_kernel(slots, self.scans, at, polar, counts, self._limits, dropped):
             self.hits[slots[dropped]] = 0  # marginalised out: the row stays until the active part is chosen anew
 
     def _remember(self, q: int) -> int:

@@ -13,11 +13,35 @@ bearing, and the observation counts as one equation instead of two.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
+
+
+class Active(NamedTuple):
+    """What an update works on: the active state, and what passive landmarks will be told."""
+
+    x: Any
+    P: Any
+    Phi: Any
+    V: Any
+    theta: Any
+
+
+class Now(NamedTuple):
+    """The pose as it is, beside landmarks that are not up to date."""
+
+    pose: Any
+    """(3,)"""
+    Pvv: Any
+    """(3, 3)"""
+    cross: Any
+    """(3, N): P[pose, B]."""
+    shift: Any
+    """(N,): what B has moved since it was folded in."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -59,7 +83,7 @@ def linearise(x, k, row, sensor, h, H, nu):
 
     h (12,) is scratch.
     """
-    observe(x[0], x[1], x[2], sensor[0], sensor[1], sensor[2], x[3 + 2 * k], x[4 + 2 * k], h)
+    observe(x[0], x[1], x[2], sensor, x[3 + 2 * k], x[4 + 2 * k], h)
     nu[0] = row[0] - h[0]
     for r in range(2):  # range and bearing depend on l - p, so ∂/∂p = -∂/∂l in the same frame
         H[r, 0], H[r, 1], H[r, 2] = -h[8 + 2 * r], -h[9 + 2 * r], h[4 + 3 * r]
@@ -71,12 +95,13 @@ def linearise(x, k, row, sensor, h, H, nu):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def update_kernel(x, P, n, Phi, n0, V, first, theta, obs, at, sensor):
+def update_kernel(active, n, n0, first, obs, at, sensor):
     """Exact stacked update by all observations o with ``at[o]`` = active landmark ≥ 0, linearised at the prediction.
 
     With S = H P Hᵀ + R = L Lᵀ and W = L⁻¹ H P: x += Wᵀ L⁻¹ν, P -= Wᵀ W (square form). V gets the rows L⁻¹ H Φ from
     row ``first`` on. Returns (normalised innovation squared, rows); rows = -1 if S is not positive definite.
     """
+    x, P, Phi, V, theta = active
     q = len(obs)
     H, col, nu, var = np.empty((2 * q, 5)), np.empty(2 * q, np.int64), np.empty(2 * q), np.empty(2 * q)
     h, Hk, nk = np.empty(12), np.empty((2, 5)), np.empty(2)
@@ -175,18 +200,18 @@ def augment_kernel(x, P, n, Phi, n0, row, sensor):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def passive_distance_kernel(pose, Pvv, cross, shift, slots, x, P, obs, sensor, out):
+def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
     """Lower bound of the Mahalanobis distance² of every observation to each passive landmark, as a share of its gate.
 
-    pose (3,), Pvv (3, 3): now. cross (3, N) = P[pose, B] now and shift (N,) = what B has moved since it was folded in;
     x (N,), P (N, N; lower triangle): as last folded in. P[l, l] has only shrunk since, so the innovation covariance
     formed with it bounds the true one from above, and the distance from below. obs (q, 6): range, bearing, variances,
     weight of one and of two equations. out (len(slots),): least weighted distance².
     """
+    pose, Pvv, cross, shift = now
     h = np.empty(12)
     for i in range(len(slots)):
         b = 3 + 2 * slots[i]
-        observe(pose[0], pose[1], pose[2], sensor[0], sensor[1], sensor[2], x[b] + shift[b], x[b + 1] + shift[b + 1], h)
+        observe(pose[0], pose[1], pose[2], sensor, x[b] + shift[b], x[b + 1] + shift[b + 1], h)
         S00 = S01 = S11 = 0.0
         for r in range(2):
             g0, g1, g2, g3, g4 = -h[8 + 2 * r], -h[9 + 2 * r], h[4 + 3 * r], h[8 + 2 * r], h[9 + 2 * r]

@@ -148,7 +148,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     for j in range(count):
         polar[j, 0] = -1.0
         if hits[j] > 0 and (mean[j, 0] - m[0]) ** 2 + (mean[j, 1] - m[1]) ** 2 <= far2:
-            observe(m[0], m[1], m[2], sensor[0], sensor[1], sensor[2], mean[j, 0], mean[j, 1], h)
+            observe(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
             polar[j, 0], polar[j, 1] = h[0], h[1]
             b = int((h[1] + math.pi) / TWO_PI * BUCKETS) % BUCKETS
             link[j] = head[b]
@@ -174,7 +174,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
             j = head[b % BUCKETS]
             while j >= 0:
                 if abs(polar[j, 0] - r) <= rwin and abs(wrap(polar[j, 1] - be)) <= bwin:
-                    observe(m[0], m[1], m[2], sensor[0], sensor[1], sensor[2], mean[j, 0], mean[j, 1], h)
+                    observe(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
                     p00, p01, p11 = pose_block(h, P)
                     l00, l01, l11 = landmark_block(h, cov[j, 0], cov[j, 1], cov[j, 2])
                     s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
@@ -271,7 +271,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
                     gate = _of_channels(vb, cfg[CFG_GATE], cfg[CFG_GATE_1])
                     log_weight[i] -= 0.5 * gate + log_2pi + 0.5 * math.log(_of_channels(vb, vr * vb, vr))
                 continue
-            observe(m[0], m[1], m[2], sensor[0], sensor[1], sensor[2], mean[i, j, 0], mean[i, j, 1], h)
+            observe(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
             p00, p01, p11 = pose_block(h, P)
             l00, l01, l11 = landmark_block(h, cov[i, j, 0], cov[i, j, 1], cov[i, j, 2])
             s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
@@ -294,7 +294,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
             vr, vb = obs[o, 2], obs[o, 3]
             j = match[o]
             if j >= 0:
-                observe(m[0], m[1], m[2], sensor[0], sensor[1], sensor[2], mean[i, j, 0], mean[i, j, 1], h)
+                observe(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
                 c0, c1, c2 = cov[i, j, 0], cov[i, j, 1], cov[i, j, 2]
                 l00, l01, l11 = landmark_block(h, c0, c1, c2)
                 s00, s01, s11 = l00 + vr, l01, l11 + vb

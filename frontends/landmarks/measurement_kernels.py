@@ -23,11 +23,12 @@ def wrap(a):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def observe(x, y, th, ax, ay, ath, lx, ly, out):
-    """Range, bearing and their Jacobians for a landmark (lx, ly) seen from pose (x, y, th) with sensor (ax, ay, ath).
+def observe(x, y, th, sensor, lx, ly, out):
+    """Range, bearing and their Jacobians for a landmark (lx, ly) seen from pose (x, y, th) with ``sensor (3,)``.
 
     out[0:2] range, bearing; out[2:8] rows of ∂/∂ξ (right tangent of the pose); out[8:12] rows of ∂/∂l.
     """
+    ax, ay, ath = sensor[0], sensor[1], sensor[2]
     c, s = math.cos(th), math.sin(th)
     dx, dy = lx - (x + c * ax - s * ay), ly - (y + s * ax + c * ay)
     r = math.sqrt(dx * dx + dy * dy)

@@ -98,9 +98,7 @@ def smoothing_cost(poses, landmarks, evidence, d2, parts):
     total = parts[0]
     for o in range(len(ob)):
         k, j = ob_pose[o], ob_lm[o]
-        observe(
-            poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
-        )
+        observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
         n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
         a, b = n0 * n0 / ob[o, 2], n1 * n1 / ob[o, 3]
         d2[o] = a + b
@@ -152,9 +150,7 @@ def _linearise(poses, landmarks, evidence, normal):
         if weight[o] == 0.0:
             continue
         k, j = ob_pose[o], ob_lm[o]
-        observe(
-            poses[k, 0], poses[k, 1], poses[k, 2], sensor[0], sensor[1], sensor[2], landmarks[j, 0], landmarks[j, 1], h
-        )
+        observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
         n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for r_ in range(3):

@@ -306,9 +306,7 @@ def steering_odometry(controls: SteeringControls, times: Array, noise: MotionNoi
         raise ConfigError(f"unknown steering model {g.model!r}; known: {', '.join(models)}")
     if len(t) > 1:
         steering_increments_kernel(
-            dt,
-            controls.speed[active],
-            controls.steering[active],
+            np.stack([dt, controls.speed[active], controls.steering[active]]),
             first,
             models[g.model],
             g.wheelbase,

@@ -11,13 +11,14 @@ REAR_AXLE, FRONT_STEER = 0, 1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def steering_increments_kernel(dt, speed, steering, first, model, wheelbase, encoder_offset, noise, increments, covs):
+def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset, noise, increments, covs):
     """Compose the fine steps ``first[k]:first[k + 1]`` into increment k with its covariance.
 
-    dt, speed, steering : (s,) fine steps with constant controls.
+    controls : (3, s) lengths of fine steps, speed and steering, constant during each.
     noise : (8,) speed, speed fraction, steering, correlated flag, lateral per m, heading per m, floors xy and heading.
     increments : (n, 3) out; covs : (n, 3, 3) out, right tangent at the end of the increment.
     """
+    dt, speed, steering = controls[0], controls[1], controls[2]
     sv0, sv1, sa, correlated, lateral, heading = noise[0], noise[1], noise[2], noise[3] > 0.5, noise[4], noise[5]
     # Noise n on a steering angle shortens what is integrated: E cos(G + n) = cos(G) exp(-σ²/2), and the same for sin.
     # At 3° that is 1.4 mm per metre, systematic, and after a long loop more than the random part. Undone here.

@@ -13,8 +13,7 @@ from graphslam.core.geometry import Array
 def follow_route_kernel(
     route: Array,
     look_ahead: float,
-    speed: float,
-    dt: float,
+    stride: float,
     wheelbase: float,
     max_steering: float,
     max_step: float,
@@ -24,7 +23,7 @@ def follow_route_kernel(
     """Drive a front-steered vehicle after a carrot on a closed polyline.
 
     route : (m, 2) closed polyline (first point not repeated), densely sampled against ``look_ahead``.
-    max_step : steering rate times dt [rad].
+    stride : way of a step [m]. max_step : steering rate times dt [rad].
     poses : (n + 1, 3) out, poses[0] given; headings are left unwrapped.
     steering : (n,) out, held constant during step k.
     """
@@ -46,6 +45,6 @@ def follow_route_kernel(
         g = min(max(want, g - max_step), g + max_step)
         g = min(max(g, -max_steering), max_steering)
         steering[k] = g
-        poses[k + 1, 0] = x + speed * dt * math.cos(g + phi)
-        poses[k + 1, 1] = y + speed * dt * math.sin(g + phi)
-        poses[k + 1, 2] = phi + speed * dt * math.sin(g) / wheelbase
+        poses[k + 1, 0] = x + stride * math.cos(g + phi)
+        poses[k + 1, 1] = y + stride * math.sin(g + phi)
+        poses[k + 1, 2] = phi + stride * math.sin(g) / wheelbase

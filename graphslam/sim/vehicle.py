@@ -84,8 +84,7 @@ def follow_route(
     follow_route_kernel(
         np.ascontiguousarray(route),
         look_ahead,
-        speed,
-        dt,
+        speed * dt,
         wheelbase,
         max_steering,
         steering_rate * dt,

@@ -117,7 +117,7 @@ def test_step_equals_slow_twin(proposal, association, ranges_only, seed):
 def test_observation_jacobians_equal_finite_differences(seed):
     rng = np.random.default_rng(seed)
     pose, landmark, out = rng.normal(size=3), 5 * rng.normal(size=2) + 3, np.empty(12)
-    observe(*pose, *SENSOR, *landmark, out)
+    observe(*pose, np.asarray(SENSOR), *landmark, out)
     Hx, Hl = numeric_jacobians(pose, SENSOR, landmark)
     z = measure(pose, SENSOR, landmark)
     np.testing.assert_allclose([out[0], wrap_angle(out[1] - z[1])], [z[0], 0], atol=1e-12)
