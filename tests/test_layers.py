@@ -180,3 +180,35 @@ def test_importing_graphslam_imports_nothing_heavy() -> None:
     code = f"import sys, graphslam; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+MOST_ARGUMENTS = 8
+MORE_ARGUMENTS = {
+    "evidence/cast_kernels.py": {"cast_rays"},
+    "evidence/cube_kernels.py": {
+        *("fill_cube", "build_tree", "uniform_cube", "share_cubes", "add_brick", "make_path", "find_states"),
+        "settle_occupied",
+    },
+    "evidence/mark_kernels.py": {"mark_grids"},
+    "evidence/merge_kernels.py": {"sample_bricks"},
+    "evidence/octomap_kernels.py": {"write_tree", "look_at", "write_brick", "read_tree"},
+    "evidence/query_kernels.py": {"look_up", "count_private"},
+    "evidence/tree_kernels.py": {"write_bricks", "own_parent", "own_roots"},
+    "evidence/update_kernels.py": {"resolve_grids", "apply_grids", "settle_grids"},
+    "graph/normal_kernels.py": {"submap_blocks"},
+}
+"""Kernels that have more arguments still: the trees of evidence grids, and one of the graph. No others, please."""
+
+
+def test_kernels_group_their_arrays() -> None:
+    """No compiled function has more than eight arguments; arrays that belong together are one named tuple."""
+    found: dict[str, set[str]] = {}
+    for path in FILES:
+        if not path.name.endswith("kernels.py"):
+            continue
+        for n in ast.walk(ast.parse(path.read_text())):
+            if isinstance(n, ast.FunctionDef):
+                a = n.args
+                if len([*a.posonlyargs, *a.args, *a.kwonlyargs]) > MOST_ARGUMENTS:
+                    found.setdefault("/".join(path.parts[-2:]), set()).add(n.name)
+    assert found == MORE_ARGUMENTS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -17,20 +19,35 @@ def _mahalanobis(vx: float, vy: float, a: float, b: float, c: float) -> tuple[fl
     return (c * vx * vx - 2.0 * b * vx * vy + a * vy * vy) / det, det
 
 
+class Pairings(NamedTuple):
+    """Individually compatible pairings."""
+
+    observed: Index
+    """(p,): submap entry."""
+    target: Index
+    """(p,): graph candidate; each is used once."""
+    nu: Array
+    """(p, 2): innovations."""
+    C: Array
+    """(2p, 2p): their joint covariance."""
+
+
+class Accepted(NamedTuple):
+    """Accepted pairings of every start: out."""
+
+    pairs: Index
+    """(k, most): in order."""
+    count: Index
+    """(k,)"""
+    score: Array
+    """(k,): ``Σ (gate - d²)``."""
+    cost: Array
+    """(k,): ``Σ (d² + ln det)``."""
+
+
 @nb.njit(cache=True)
 def joint_compatibility(
-    observed: Index,
-    target: Index,
-    nu: Array,
-    C: Array,
-    seeds: Index,
-    gate: float,
-    joint_limit: Array,
-    persistent: bool,
-    out_pairs: Index,
-    out_count: Index,
-    out_score: Array,
-    out_cost: Array,
+    pairings: Pairings, seeds: Index, gate: float, joint_limit: Array, persistent: bool, accepted: Accepted
 ) -> None:
     """From every seed pairing, add the best compatible pairing, conditioned on those taken, until none is left.
 
@@ -39,10 +56,7 @@ def joint_compatibility(
 
     Parameters
     ----------
-    observed, target : (p,) int
-        Submap entry and graph candidate of each individually compatible pairing; each is used once.
-    nu : (p, 2); C : (2p, 2p)
-        Innovations and their joint covariance.
+    pairings : Pairings
     seeds : (k,) int
         First pairing of each start.
     gate : float
@@ -51,9 +65,10 @@ def joint_compatibility(
         χ² limit of the joint distance with 1, 2, … pairings (index = number of pairings).
     persistent : bool
         A pairing that would break the joint limit is passed over for the next likely one, instead of ending the start.
-    out_pairs : (k, most) int; out_count : (k,) int; out_score : (k,); out_cost : (k,)
-        Accepted pairings of each start in order, how many, ``Σ (gate - d²)``, and ``Σ (d² + ln det)``.
+    accepted : Accepted
     """
+    observed, target, nu, C = pairings
+    out_pairs, out_count, out_score, out_cost = accepted
     p = observed.shape[0]
     for s in range(seeds.shape[0]):
         v = nu.copy()

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.association.association_kernels import joint_compatibility
+from graphslam.association.association_kernels import Accepted, Pairings, joint_compatibility
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 
@@ -107,11 +107,12 @@ def search(
     starts, most = len(seeds), len(limits) - 1
     out = np.zeros((starts, most), dtype=np.int64)
     count, score, cost = np.zeros(starts, dtype=np.int64), np.zeros(starts), np.zeros(starts)
-    joint_compatibility(
+    pairings = Pairings(
         np.ascontiguousarray(i, dtype=np.int64), np.ascontiguousarray(j, dtype=np.int64),
-        np.ascontiguousarray(nu), np.ascontiguousarray(C), np.ascontiguousarray(seeds, dtype=np.int64),
-        gate, limits, persistent, out, count, score, cost,
+        np.ascontiguousarray(nu), np.ascontiguousarray(C),
     )  # fmt: skip
+    starts_at = np.ascontiguousarray(seeds, dtype=np.int64)
+    joint_compatibility(pairings, starts_at, gate, limits, persistent, Accepted(out, count, score, cost))
     return Searched(out, count, score, cost)
 
 

@@ -76,10 +76,8 @@ def _assemble(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[JoinedMap, npt.
     landmark_node[new] = N + m_b + np.arange(len(new))
     image[b.landmark_node] = landmark_node
     x, width, ptr, neighbours, block, values, gradient, news = kernels.join_blocks(
-        a.x, a.width, a.ptr, a.neighbours, a.block, a.values,
-        b.x, b.width, b.ptr, b.neighbours, b.block, b.values,
-        image, int(a.pose_node[-1]), _ROUNDING,
-    )  # fmt: skip
+        _blocks(a), _blocks(b), image, int(a.pose_node[-1]), _ROUNDING
+    )
     place = np.where(match >= 0, match, len(a.landmark_node) + np.cumsum(match < 0) - 1).astype(np.intp)
     came = image[b.order]
     rank = None
@@ -110,3 +108,7 @@ def _keep_order_sparse(joined: JoinedMap) -> None:
     if joined.rank is None and joined.symbolic().nnz / len(joined.values) > _STALE * joined.fill:
         owner = np.repeat(np.arange(len(joined.width)), np.diff(joined.ptr))
         joined.reorder(elimination_order(owner, joined.neighbours, len(joined.width)).astype(np.int64))
+
+
+def _blocks(m: JoinedMap) -> kernels.BlockMap:
+    return kernels.BlockMap(m.x, m.width, m.ptr, m.neighbours, m.block, m.values)

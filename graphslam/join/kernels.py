@@ -6,6 +6,8 @@ pair of neighbours is stored both ways, each with the rows of the node whose lis
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -14,33 +16,31 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+class BlockMap(NamedTuple):
+    """A map in information form."""
+
+    x: Array
+    """(n,): mean."""
+    width: Index
+    """(N,): of the nodes."""
+    ptr: Index
+    """(N + 1,): neighbour lists."""
+    idx: Index
+    block: Index
+    """Where the blocks of each list begin in ``value``; they stand one after the other."""
+    value: Array
+
+
 @nb.njit(cache=True)
 def join_blocks(
-    x: Array,
-    width: Index,
-    ptr: Index,
-    idx: Index,
-    block: Index,
-    value: Array,
-    z: Array,
-    b_width: Index,
-    b_ptr: Index,
-    b_idx: Index,
-    b_block: Index,
-    b_value: Array,
-    image: Index,
-    start: int,
-    rounding: float,
+    a: BlockMap, b: BlockMap, image: Index, start: int, rounding: float
 ) -> tuple[Array, Index, Index, Index, Index, Array, Array, bool]:
     """Add map B, seen from node ``start`` of map A, to A (eq. 15–16).
 
     Parameters
     ----------
-    x, width, ptr, idx, block, value
-        Map A: mean ``(n,)``, node widths ``(N,)``, neighbour lists, where their blocks begin in ``value``; the blocks
-        of a list stand one after the other.
-    z, b_width, b_ptr, b_idx, b_block, b_value
-        Map B alike, in the frame of ``start``.
+    a, b : BlockMap
+        B in the frame of ``start``.
     image : (N_b,)
         Node of the joined map that each node of B is: a landmark of A, or N and above for what is new.
     start : int
@@ -57,6 +57,8 @@ def join_blocks(
     news : bool
         Whether it differs from zero.
     """
+    x, width, ptr, idx, block, value = a
+    z, b_width, b_ptr, b_idx, b_block, b_value = b
     N, NB = len(width), len(b_width)
     total = N
     for b in range(NB):

@@ -309,10 +309,10 @@ class SubmapProblem:
         r, poses = self.residual(x), self._split(x)[0]
         g, values = np.zeros(self.size), np.zeros(self.pattern.entries)
         pair_ptr, slots = self._slots
-        f = kernels.linearise(
-            poses, self.m, self._entry_ptr, self._node, self._node_at, self._row_ptr, self._z, self._omega,
-            self._omega_ptr, r, pair_ptr, slots, g, values,
-        )  # fmt: skip
+        submaps = kernels.SubmapArrays(
+            self._entry_ptr, self._node, self._row_ptr, self._z, self._omega, self._omega_ptr
+        )
+        f = kernels.linearise(poses, submaps, kernels.Slots(self._node_at, pair_ptr, slots), r, g, values)
         return float(f), g, values
 
 

@@ -7,6 +7,8 @@ the first starts at the fixed base, which is no node.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -165,23 +167,33 @@ def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -
         out[k] = total
 
 
+class SubmapArrays(NamedTuple):
+    """Submaps one after the other."""
+
+    entry_ptr: Index
+    entry_node: Index
+    row_ptr: Index
+    """(m + 1,): rows of each in ``z``."""
+    z: Array
+    """(rows,): measurements."""
+    omega: Array
+    """Information matrices, row-major …"""
+    omega_ptr: Index
+    """… and where they begin."""
+
+
+class Slots(NamedTuple):
+    """Where nodes and pairs stand in the system."""
+
+    node_at: Index
+    """(N,): first scalar of each node."""
+    pair_ptr: Index
+    slot: Index
+    """From :func:`entry_slots`."""
+
+
 @nb.njit(cache=True)
-def linearise(
-    poses: Array,
-    m: int,
-    entry_ptr: Index,
-    entry_node: Index,
-    node_at: Index,
-    row_ptr: Index,
-    z: Array,
-    omega: Array,
-    omega_ptr: Index,
-    r: Array,
-    pair_ptr: Index,
-    slot: Index,
-    g: Array,
-    value: Array,
-) -> float:
+def linearise(poses: Array, submaps: SubmapArrays, slots: Slots, r: Array, g: Array, value: Array) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
     A position is measured through ``Rᵀ``, so a block ``W`` of Ω enters as ``R W Rᵀ``; a heading as it is. The start
@@ -190,15 +202,16 @@ def linearise(
     Parameters
     ----------
     poses : (m, 3)
-    node_at : (N,)
-        First scalar of each node.
-    row_ptr : (m + 1,); z, r : (rows,)
-        Measurement and residual of every submap.
-    omega, omega_ptr
-        Information matrices, row-major.
-    pair_ptr, slot
-        From :func:`entry_slots`.
+    submaps : SubmapArrays
+    slots : Slots
+    r : (rows,)
+        Residual of every submap.
+    g, value
+        Out.
     """
+    entry_ptr, entry_node, row_ptr, z, omega, omega_ptr = submaps
+    node_at, pair_ptr, slot = slots
+    m = len(poses)
     f = 0.0
     most = 0
     for k in range(m):

@@ -89,7 +89,8 @@ class BlockSymbolic:
             If the matrix is not positive definite.
         """
         L = np.empty(self._entries)
-        bad = analysis.factorise(*self._parts, self._ptr, self._idx, block, value, damping, L)
+        matrix = analysis.Blocks(self._ptr, self._idx, block, value)
+        bad = analysis.factorise(analysis.Analysis(*self._parts), matrix, damping, L)
         if bad:
             node = int(self._post[bad - 1])
             raise IndeterminateError(
@@ -134,4 +135,5 @@ class BlockFactor:
         """
         s = self._symbolic
         begin = s._place[np.asarray(first, dtype=np.intp)]
-        return np.asarray(solving.inverse_diagonal(*s._solve, s._parent, s._panel_ptr, self._L, begin, width, s._most))
+        panels = solving.Panels(*s._solve, s._parent, s._panel_ptr, self._L)
+        return np.asarray(solving.inverse_diagonal(panels, begin, width, s._most))

@@ -11,6 +11,8 @@ order of elimination.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -262,34 +264,39 @@ def _eliminate(F: Array, w: int, r: int) -> int:
     return 0
 
 
+class Analysis(NamedTuple):
+    """From :func:`analyse`."""
+
+    order: Index
+    offset: Index
+    first: Index
+    parent: Index
+    row_ptr: Index
+    rows: Index
+    panel_ptr: Index
+    sizes: Index
+
+
+class Blocks(NamedTuple):
+    """A sparse matrix of blocks."""
+
+    ptr: Index
+    idx: Index
+    """Neighbours as given to :func:`analyse`; one at an earlier position is skipped (its own list has the pair)."""
+    block: Index
+    """(nb,): where each pair's block begins in ``value``: rows of the node, columns of the neighbour, row-major."""
+    value: Array
+    """(k,)"""
+
+
 @nb.njit(cache=True)
-def factorise(
-    order: Index,
-    offset: Index,
-    first: Index,
-    parent: Index,
-    row_ptr: Index,
-    rows: Index,
-    panel_ptr: Index,
-    sizes: Index,
-    ptr: Index,
-    idx: Index,
-    block: Index,
-    value: Array,
-    damping: float,
-    L: Array,
-) -> int:
+def factorise(analysis: Analysis, matrix: Blocks, damping: float, L: Array) -> int:
     """Numeric factorisation of ``A + damping · diag(A)`` into the panels ``L``.
 
     Parameters
     ----------
-    order … sizes
-        From :func:`analyse`.
-    ptr, idx
-        As given there; a neighbour at an earlier position is skipped (its own list has the pair).
-    block : (nb,)
-        Where the block of each pair begins in ``value``: rows of the node, columns of the neighbour, row-major.
-    value : (k,)
+    analysis : Analysis
+    matrix : Blocks
     damping : float
     L : (panel_ptr[-1],)
         Out. Column by column of every panel: all its rows, those above the diagonal are rubbish.
@@ -299,6 +306,8 @@ def factorise(
     int
         0, or 1 + the position of the node whose pivot is not positive.
     """
+    order, offset, first, parent, row_ptr, rows, panel_ptr, sizes = analysis
+    ptr, idx, block, value = matrix
     N, S = len(order), len(parent)
     position = np.empty(N, np.int64)
     for k in range(N):

@@ -5,6 +5,8 @@ Scalars are numbered in order of elimination; ``start`` and ``row`` say which of
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -87,18 +89,19 @@ def forward_units(
     return W, which
 
 
+class Panels(NamedTuple):
+    """A factor."""
+
+    own: Index
+    start: Index
+    row: Index
+    parent: Index
+    panel_ptr: Index
+    L: Array
+
+
 @nb.njit(cache=True, fastmath={"contract"})
-def inverse_diagonal(
-    own: Index,
-    start: Index,
-    row: Index,
-    parent: Index,
-    panel_ptr: Index,
-    L: Array,
-    begin: Index,
-    width: int,
-    most: int,
-) -> Array:
+def inverse_diagonal(panels: Panels, begin: Index, width: int, most: int) -> Array:
     """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
 
     With a panel's own scalars S and those below R, ``Y = L_RS L_SS⁻¹``: ``Z_RS = -Z_RR Y`` and
@@ -118,6 +121,7 @@ def inverse_diagonal(
     -------
     (k, width, width)
     """
+    own, start, row, parent, panel_ptr, L = panels
     S = len(own) - 1
     out = np.zeros((len(begin), width, width))
     by_super = np.argsort(begin)

@@ -83,9 +83,8 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
         rows = grid.packed_bricks()
         keys, new = np.ascontiguousarray(rows[:, 0]), pool.bricks[rows[:, 1]]
         difference = np.empty_like(new)
-        subtract_bricks(
-            keys, new, before.root, pool.levels, pool.children, pool.bricks, slack, grid.dim == 2, difference, counts
-        )
+        tree = before.root, pool.levels, pool.children, pool.bricks
+        subtract_bricks(keys, new, tree, slack, grid.dim == 2, difference, counts)
     some = (difference != UNKNOWN).any(axis=1)
     out = grid.empty()
     out.write_packed(keys[some], difference[some])

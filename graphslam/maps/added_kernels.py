@@ -9,14 +9,15 @@ from graphslam.evidence.tree_kernels import find_node
 
 
 @kernel()
-def subtract_bricks(keys, new, root, levels, children, bricks, slack, flat, out, counts):
-    """``out (n, 512)``: ``new (n, 512)`` less what the tree ``root`` says of the same voxels; unknown where nothing
-    changed.
+def subtract_bricks(keys, new, tree, slack, flat, out, counts):
+    """``out (n, 512)``: ``new (n, 512)`` less what a tree says of the same voxels; unknown where nothing changed.
 
+    ``tree`` is its root, its levels, and the children and bricks of its pool.
     Nothing changed where the tree has the very value, or knows the voxel and has the value within ``slack`` (0 or 1)
     voxels of it along each axis: ``new`` may have it from there. Adds to ``counts (3,)``: voxels with a difference,
     unchanged ones, and those that both know.
     """
+    root, levels, children, bricks = tree
     near = np.zeros((3, 3, 3), np.int64)
     edge = 1 << (2 * levels)
     up = 0 if flat else slack

@@ -8,15 +8,16 @@ from graphslam.evidence.kernels import kernel
 
 
 @kernel()
-def compare_pieces(coordinates, values, T, flat, table, lookup, occupied, free, slack, counts):
+def compare_pieces(one, T, flat, other, limits, slack, counts):
     """Look up every known voxel of one piece in another.
 
-    ``T (12,)`` takes the first one's voxels to those of the box around the second, divided by ``table (nz, ny, nx)``
-    into rows of ``lookup``. Adds to ``counts (5,)``: voxels both know; occupied ones of the first of which the second
-    has an occupied voxel within ``slack`` voxels along each axis; those where it is free instead; free ones of the
-    first that are free in the second; voxels of the first that are sure. Occupied is a value of at least ``occupied``,
-    free one of at most ``free``.
+    ``one`` are coordinates and values of its bricks. ``T (12,)`` takes its voxels to those of the box around the other,
+    which is divided by ``table (nz, ny, nx)`` into rows of ``lookup``: these two are ``other``. Adds to ``counts (5,)``
+    the voxels that both know; occupied ones of the first of which the second has an occupied voxel within ``slack``
+    voxels along each axis; those where it is free instead; free ones of the first that are free in the second; voxels
+    of the first that are sure. ``limits``: occupied is a value of at least the first, free one of at most the second.
     """
+    (coordinates, values), (table, lookup), (occupied, free) = one, other, limits
     nz, ny, nx = table.shape
     up = 0 if flat else slack
     layers = 1 if flat else 8

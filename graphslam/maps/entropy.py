@@ -203,7 +203,6 @@ def disagreement(
     ):
         into = pose_row(T, dim).copy()  # T_other_one
         into[9:] = into[9:] / one.voxel_size - BRICK_EDGE * other.first
-        compare_pieces(
-            one.coordinates, one.values, into, dim == 2, other.table, other.lookup, occupied, free, int(slack), counts
-        )
+        mine, theirs = (one.coordinates, one.values), (other.table, other.lookup)
+        compare_pieces(mine, into, dim == 2, theirs, (occupied, free), int(slack), counts)
     return Disagreement(*counts.tolist())

@@ -111,15 +111,17 @@ def find_bricks(root, keys, levels, children, ids):
 
 
 @kernel()
-def sum_bricks(starts, begins, ends, entries, low, high, ids, bricks, out, changed):
+def sum_bricks(ranges, entries, clamp, ids, bricks, out, changed):
     """Sum of the entries that touch each brick, clamped once at the end; returns how many bricks change.
 
-    Of brick k these are the ranges ``begins, ends [starts[k]:starts[k + 1]]`` of ``entries``. Unknown is what no entry
-    names. Where the sum is not what the map's brick ``ids[k]`` holds already, ``changed`` gets k, or ~k where nothing
-    is known any more, and ``out (n, 512)`` the values, from row 0 on.
+    ``ranges`` are ``starts, begins, ends``: those of brick k are ``begins, ends [starts[k]:starts[k + 1]]``, in
+    ``entries``. Unknown is what no entry names. Where the sum is not what the map's brick ``ids[k]`` holds already,
+    ``changed`` gets k, or ~k where nothing is known any more, and ``out (n, 512)`` the values, from row 0 on.
 
     A total counts its entries above its 32nd bit, so that 0 is unknown.
     """
+    starts, begins, ends = ranges
+    low, high = clamp
     total = np.zeros(512, np.int64)
     n = 0
     for k in range(ids.shape[0]):

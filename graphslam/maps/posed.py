@@ -143,6 +143,6 @@ class Poser:
         if len(self._sums) < len(keys) + 1:
             self._sums = np.empty((5 * len(keys) // 4 + 1, BRICK_VOXELS), np.int16)
         changed = np.empty(len(keys) + 1, np.int64)
-        n = sum_bricks(starts, begins, ends, self._sources, *clamp, ids, pool.bricks, self._sums, changed)
+        n = sum_bricks((starts, begins, ends), self._sources, clamp, ids, pool.bricks, self._sums, changed)
         empty = changed[:n] < 0
         return keys[np.where(empty, ~changed[:n], changed[:n])], self._sums[:n], int(empty.sum())

@@ -34,8 +34,9 @@ def _turn(w, R, J):
 
 
 @njit(cache=True)
-def _step(w, a, dt, noise, R, p, v, P, Phi):
+def _step(w, a, dt, noise, state):
     """One step of constant rate ``w`` and force ``a``, biases taken off, over ``dt``: everything in place."""
+    R, p, v, P, Phi = state
     half, J_half, whole, J_whole = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     _turn(0.5 * dt * w, half, J_half)
     _turn(dt * w, whole, J_whole)
@@ -118,7 +119,7 @@ def preintegrate_spans(times, rate, force, begin, end, bias, noise):
                     w1[c] = rate[i, c] + u1 * (rate[i + 1, c] - rate[i, c])
                     a0[c] = force[i, c] + u0 * (force[i + 1, c] - force[i, c])
                     a1[c] = force[i, c] + u1 * (force[i + 1, c] - force[i, c])
-                _step(0.5 * (w0 + w1) - bias[s, :3], 0.5 * (a0 + a1) - bias[s, 3:], dt, noise, R, p, v, P, Phi)
+                _step(0.5 * (w0 + w1) - bias[s, :3], 0.5 * (a0 + a1) - bias[s, 3:], dt, noise, (R, p, v, P, Phi))
             t = to
             i += 1
         R_out[s], p_out[s], v_out[s] = R, p, v
