@@ -37,8 +37,8 @@ class Accepted(NamedTuple):
 
     pairs: Index
     """(k, most): in order."""
-    count: Index
-    """(k,)"""
+    number: Index
+    """(k,): how many."""
     score: Array
     """(k,): ``Σ (gate - d²)``."""
     cost: Array

@@ -33,14 +33,14 @@ class BlockMap(NamedTuple):
 
 @nb.njit(cache=True)
 def join_blocks(
-    a: BlockMap, b: BlockMap, image: Index, start: int, rounding: float
+    known: BlockMap, new: BlockMap, image: Index, start: int, rounding: float
 ) -> tuple[Array, Index, Index, Index, Index, Array, Array, bool]:
     """Add map B, seen from node ``start`` of map A, to A (eq. 15–16).
 
     Parameters
     ----------
-    a, b : BlockMap
-        B in the frame of ``start``.
+    known, new : BlockMap
+        A, and B in the frame of ``start``.
     image : (N_b,)
         Node of the joined map that each node of B is: a landmark of A, or N and above for what is new.
     start : int
@@ -57,8 +57,8 @@ def join_blocks(
     news : bool
         Whether it differs from zero.
     """
-    x, width, ptr, idx, block, value = a
-    z, b_width, b_ptr, b_idx, b_block, b_value = b
+    x, width, ptr, idx, block, value = known
+    z, b_width, b_ptr, b_idx, b_block, b_value = new
     N, NB = len(width), len(b_width)
     total = N
     for b in range(NB):

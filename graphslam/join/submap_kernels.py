@@ -193,7 +193,7 @@ class Slots(NamedTuple):
 
 
 @nb.njit(cache=True)
-def linearise(poses: Array, submaps: SubmapArrays, slots: Slots, r: Array, g: Array, value: Array) -> float:
+def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Array, value: Array) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
     A position is measured through ``Rᵀ``, so a block ``W`` of Ω enters as ``R W Rᵀ``; a heading as it is. The start
@@ -203,14 +203,14 @@ def linearise(poses: Array, submaps: SubmapArrays, slots: Slots, r: Array, g: Ar
     ----------
     poses : (m, 3)
     submaps : SubmapArrays
-    slots : Slots
+    where : Slots
     r : (rows,)
         Residual of every submap.
     g, value
         Out.
     """
     entry_ptr, entry_node, row_ptr, z, omega, omega_ptr = submaps
-    node_at, pair_ptr, slot = slots
+    node_at, pair_ptr, slot = where
     m = len(poses)
     f = 0.0
     most = 0
