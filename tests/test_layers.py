@@ -195,9 +195,8 @@ MORE_ARGUMENTS = {
     "evidence/query_kernels.py": {"look_up", "count_private"},
     "evidence/tree_kernels.py": {"write_bricks", "own_parent", "own_roots"},
     "evidence/update_kernels.py": {"resolve_grids", "apply_grids", "settle_grids"},
-    "graph/normal_kernels.py": {"submap_blocks"},
 }
-"""Kernels that have more arguments still: the trees of evidence grids, and one of the graph. No others, please."""
+"""Kernels on the trees of evidence grids that have more arguments still; no others."""
 
 
 def test_kernels_group_their_arrays() -> None:

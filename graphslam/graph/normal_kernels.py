@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -10,24 +12,40 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+class SubmapArrays(NamedTuple):
+    """Landmark submaps one after the other."""
+
+    start: Index
+    """(S,): node of each."""
+    entry_offset: Index
+    """(S + 1,)"""
+    entry_row: Index
+    """(E,): rows of the points."""
+    z: Array
+    """Measurements, flat …"""
+    z_offset: Index
+    """… and where they begin."""
+    info: Array
+    """Information matrices, flat and row-major …"""
+    info_offset: Index
+    """… and where they begin."""
+
+
+class SubmapBlocks(NamedTuple):
+    """What is computed of them: out."""
+
+    H: Array
+    """Blocks ``(6 + 2n)²``, flat."""
+    H_offset: Index
+    g: Array
+    """Gradients ``6 + 2n``, flat."""
+    g_offset: Index
+    chi2: Array
+    """(S,)"""
+
+
 @nb.njit(cache=True)
-def submap_blocks(
-    poses: Array,
-    points: Array,
-    start: Index,
-    entry_offset: Index,
-    entry_row: Index,
-    z: Array,
-    z_offset: Index,
-    info: Array,
-    info_offset: Index,
-    hessian: bool,
-    H: Array,
-    H_offset: Index,
-    g: Array,
-    g_offset: Index,
-    chi2: Array,
-) -> None:
+def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: bool, out: SubmapBlocks) -> None:
     """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
 
     Local variables of submap s are ``[x_start (3), x_{start+1} (3), entry_1 (2), …]``; an entry that stands twice is
@@ -36,12 +54,13 @@ def submap_blocks(
     Parameters
     ----------
     poses : (m + 1, 3); points : (n, 2)
-    start : (S,) node of each submap
-    entry_offset : (S + 1,); entry_row : (E,) rows of ``points``
-    z, z_offset : flat measurements; info, info_offset : flat row-major information matrices
-    hessian : bool, fill H as well
-    H, H_offset : flat ``(6 + 2n)²`` blocks out; g, g_offset : flat ``6 + 2n`` gradients out; chi2 : (S,) out
+    submaps : SubmapArrays
+    hessian : bool
+        Fill H as well.
+    out : SubmapBlocks
     """
+    start, entry_offset, entry_row, z, z_offset, info, info_offset = submaps
+    H, H_offset, g, g_offset, chi2 = out
     for s in range(start.shape[0]):
         a, b = start[s], start[s] + 1
         e0, e1 = entry_offset[s], entry_offset[s + 1]

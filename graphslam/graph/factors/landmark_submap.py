@@ -98,15 +98,21 @@ class SubmapBatch(FactorBatch):
 
     def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
         """See :meth:`FactorBatch.blocks`."""
-        from graphslam.graph.normal_kernels import submap_blocks  # numba takes a third of a second to load
+        from graphslam.graph.normal_kernels import (
+            SubmapArrays,
+            SubmapBlocks,
+            submap_blocks,
+        )  # numba takes a third of a second to load
 
         chi2 = np.zeros(len(self))
         if len(self) == 0:
             return chi2
+        submaps = SubmapArrays(
+            self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset
+        )
         submap_blocks(
-            np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), self._start,
-            self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
-            hessian, H, H_offset, g, g_offset, chi2,
+            np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), submaps, hessian,
+            SubmapBlocks(H, H_offset, g, g_offset, chi2),
         )  # fmt: skip
         return chi2
 
