@@ -5,7 +5,6 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 from graphslam.core.geometry import se2_between
 from graphslam.graph.factors.batch import gtsam_factor
@@ -20,6 +19,7 @@ from graphslam.join.submap_solver import solve_submaps
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.graph_chain import make_chain, make_gps
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
 def build(rng, *, gps: bool, robust: Robust, update=lambda g: None) -> PoseGraph:

@@ -8,7 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.poses import SE2, SE3
@@ -20,6 +19,7 @@ from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.registry import make_solver
 from tests.reference.grid_world import grid_world
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
 def arrays(rng, dim, n=300):

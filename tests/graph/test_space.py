@@ -5,7 +5,6 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 from graphslam.core.errors import DataError, GeometryError, IndeterminateError
 from graphslam.core.gaussian import chi2_mean_bounds
@@ -27,6 +26,7 @@ from graphslam.graph.variables import Values, gtsam_key, key_name
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 from tests.reference.space_chain import DenseChain, dense_chain
 
 C = np.diag([1e-4, 2e-4, 4e-4, 1e-2, 2e-2, 3e-2])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError
 from graphslam.core.geometry import wrap_angle
@@ -22,6 +21,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.readings import CompassConfig, trilaterate
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 SIGMA = {2: np.array([0.05, 0.05, 0.02]), 3: np.array([0.002, 0.002, 0.02, 0.05, 0.05, 0.05])}
 KINDS = (CompassRecord, DeclinationRecord, DeviationPriorRecord, RangeRecord, BeaconRangeRecord)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
@@ -24,6 +23,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.gtsam_optimum import optimise_with_gtsam
 from tests.reference.imu_ring import MOUNT, NOISE, Ring, ring, true_readings
 
 EVERY = ("imu", "gyro", "imu-bias", "imu-gravity")
