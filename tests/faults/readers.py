@@ -175,7 +175,7 @@ def some_submaps() -> list[Submap]:
         pose = np.array([3.0, 0, 0])
         if key == 2:
             match = Match(target=0, T_target_here=np.zeros(3), covariance=0.01 * np.eye(3), fitness=0.9, support=0.8)
-            common |= {"matches": (match,), "cloud": r.normal(size=(5, 3))}
+            common |= {"matches": (match,), "cloud": r.normal(size=(5, 2))}
             out.append(Submap(key=key, exit_pose=pose, exit_covariance=0.01 * np.eye(3), **common))
             continue
         whole = {"covariance": P} if key == 0 else {"information": sp.csc_matrix(np.linalg.inv(P))}
