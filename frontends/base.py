@@ -9,6 +9,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import Submap
+from graphslam.frontends.odometry.steps import Steps
 
 Watch: TypeAlias = Callable[[Any], None]
 """Takes the progress of a front end, of its own kind (``segslam``: `graphslam.frontends.segslam.progress.Progress`)."""
@@ -47,6 +48,10 @@ class FrontEnd(Protocol):
             Called with the front end's own progress after every step that it can show; changes nothing.
         """
         ...
+
+    def steps(self, log: SensorLog) -> Steps | None:
+        """The steps that it made of the log, for a refinement by scans; None where it works on no scans."""
+        return None
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
         """Name of the stream of landmarks that it reads, and the observations in it; None where it tells none.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -14,6 +14,7 @@ from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
 from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.segslam.config import SegSlamConfig
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segslam import run_segslam
@@ -44,6 +45,7 @@ class SegSlam(FrontEnd):
     """
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
+    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "segslam"
 
     def submaps(
@@ -63,12 +65,19 @@ class SegSlam(FrontEnd):
             if after is None or submap.key > after.key:
                 yield submap
 
+    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
+        """The steps of a log; those of the last one are kept."""
+        if not (self._made and self._made[0] is log):
+            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
+        made: Steps = self._made[1]
+        return made
+
     def result(
         self, log: SensorLog, *, seed: SeedTree, drops: DropCounter | None = None, watch: Watch | None = None
     ) -> SegSlamResult:
         """The SegMap with all particles, of which :meth:`submaps` hands over the best one's chain."""
         c = self.config
-        return run_segslam(checked_steps(log, c.steps, drops), c.filter, c.segslam, seed.child(0), watch=watch)
+        return run_segslam(self.steps(log, drops=drops), c.filter, c.segslam, seed.child(0), watch=watch)
 
 
 def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:

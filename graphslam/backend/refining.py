@@ -1,0 +1,155 @@
+"""The refinement at the end of a run: from the solved map to the refined one, or why it stays as it is."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.errors import GraphSlamError
+from graphslam.core.findings import Finding
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.global_map import GlobalMap
+from graphslam.maps.refined import base_frames, refined_map, refined_submaps
+from graphslam.refine.config import RefineConfig
+from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.scans import Scans
+
+logger = logging.getLogger(__name__)
+
+CONTRADICTED = 3.0
+"""χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
+NAMED = {
+    "scale": (0.03, "distances of the odometry are {v:.1%} too long (scale of the wheels)", 1.0),
+    "side": (0.009, "the scanner looks {v:.2f}° to the side of the way that the odometry tells (its mounting)", 57.29578),
+    "rise": (0.009, "the scanner looks {v:.2f}° above the way that the odometry tells (its mounting)", 57.29578),
+    "clock": (0.02, "the clock of the motion is {v:.0f} ms ahead of that of the scans", 1e3),
+}
+"""Lasting errors that are named: beyond which size, in which words, in multiples of their unit."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What a refinement made of a run.
+
+    Parameters
+    ----------
+    refinement : Refinement
+    map : GlobalMap
+        With the refined path and nodes.
+    submaps : list of Submap
+        Along the refined path; empty where the run's have no grids.
+    bases : GlobalMap
+        Of the refined submaps: their frames alone are its nodes.
+    graph_path : Trajectory
+        Path of the graph, where the refinement began.
+    """
+
+    refinement: Refinement
+    map: GlobalMap
+    submaps: list[Submap]
+    bases: GlobalMap
+    graph_path: Trajectory
+
+
+def refine_run(
+    config: RefineConfig,
+    scans: Scans | None,
+    submaps: Sequence[Submap],
+    m: GlobalMap,
+    *,
+    gps: bool = False,
+    progress: Callable[[str], Any] | None = None,
+) -> tuple[Refined | None, list[Finding]]:
+    """Refine the solved map of a run, and say what was found.
+
+    Parameters
+    ----------
+    config : RefineConfig
+    scans : Scans or None
+        None: the front end works on no scans.
+    submaps : sequence of Submap
+    m : GlobalMap
+        Solved.
+    gps : bool
+        Fixes are in the graph.
+
+    Returns
+    -------
+    refined : Refined or None
+        None where the path of the graph stays the result.
+    findings : list of Finding
+        Lines of the verdict.
+    """
+    if not config.use or scans is None:
+        return None, []
+    if gps:
+        text = "The path was not refined by its scans: the refinement does not hold GPS yet, which the graph used."
+        return None, [Finding("look", "refine-left-out", text)]
+    path = m.trajectory
+    try:
+        start = path.interpolate(np.clip(scans.times, path.times[0], path.times[-1]))
+        found = refine(scans, start, config, progress=progress)
+        if not found.better:
+            text = (
+                "The path was not refined by its scans: they agree less at the refined path "
+                f"({found.agreement[1]:.0%}) than at the graph's ({found.agreement[0]:.0%}), so the graph's stays."
+            )
+            return None, [Finding("look", "refine-refused", text)]
+        refined = refined_map(m, found, submaps)
+        grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
+        frames = base_frames(refined)
+        bases = GlobalMap(
+            trajectory=refined.trajectory,
+            node_times=refined.base_times,
+            node_poses=frames,
+            node_covariances=refined.node_covariances if refined.base_nodes is None
+            else refined.node_covariances[refined.base_nodes],
+            landmark_ids=refined.landmark_ids,
+            landmarks=refined.landmarks,
+            landmark_covariances=refined.landmark_covariances,
+            landmark_hits=refined.landmark_hits,
+        )  # fmt: skip
+        drawn = refined_submaps(submaps, refined, found, scans) if grids else []
+    except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
+        logger.warning("the path is not refined: %s", error)
+        return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
+    return Refined(found, refined, drawn, bases, path), findings_of(found)
+
+
+def findings_of(r: Refinement) -> list[Finding]:
+    """What a refinement says of the run, as lines of the verdict."""
+    last = r.rounds[-1]
+    text = (
+        f"The path was refined by its scans: {last.pairs} points on surfaces of other steps, {last.passes} of them of "
+        f"other passes, with a spread of {1e3 * last.spread:.0f} mm; scans agree in {r.agreement[1]:.0%} of the points "
+        f"(before: {r.agreement[0]:.0%})."
+    )
+    out = [Finding("good", "refined", text)]
+    if len(r.refused):
+        a, b = r.times[r.refused].T
+        some = "; ".join(f"{x:.0f} s and {y:.0f} s" for x, y in list(zip(a, b))[:4])
+        text = (
+            f"{len(r.refused)} pairs of places that the graph drew together contradict the scans between them and were "
+            f"left apart ({some}): look at the loops there."
+        )
+        out.append(Finding("look", "refine-contradicted", text))
+    if r.motion > CONTRADICTED:
+        text = (
+            f"Scans of other passes bend the motion more than the gyro can (χ²/dof {r.motion:.1f}): a place was taken "
+            "for another one, or the sensor moved on the robot. The refined path and its covariance are not to be "
+            "trusted."
+        )
+        out.append(Finding("bad", "refine-motion", text))
+    for name, (limit, words, unit) in NAMED.items():
+        if name in r.constants:
+            v, sigma = r.constants[name]
+            if abs(v) > limit and abs(v) > 5.0 * sigma:
+                what = words.format(v=v * unit)
+                out.append(Finding("look", f"refine-{name}", f"Scans and motion differ all along: {what}."))
+    return out

@@ -1,0 +1,164 @@
+"""A refined path as the map of a run: path, nodes, and the submaps' grids drawn anew along it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, level
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.global_map import GlobalMap
+from graphslam.refine.refine import Refinement
+from graphslam.refine.scans import Scans
+
+Index = npt.NDArray[np.int64]
+
+KNOTS = 5
+"""Places along a submap at which the covariance of its path is computed; between them it is interpolated."""
+SAME = 1e-3
+"""Stamps of a step and of a node that differ by less are one [s]."""
+
+
+def steps_at(refinement: Refinement, times: Array) -> Index:
+    """Numbers ``(k,)`` of the steps at some times.
+
+    Raises
+    ------
+    DataError
+        There is none at one of them.
+    """
+    t = refinement.times
+    j = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+    j = np.where(times - t[j - 1] < t[j] - times, j - 1, j)
+    bad = np.flatnonzero(np.abs(t[j] - times) > SAME)
+    if len(bad):
+        raise DataError(
+            "a node of the graph is at no step", got=f"{times[bad[0]]:.3f} s", wanted=f"{t[j[bad[0]]]:.3f} s"
+        )
+    return j.astype(np.int64)
+
+
+def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap]) -> GlobalMap:
+    """The solved map with the refined path in place of the graph's.
+
+    Nodes keep their places relative to the body: a base may stand level beside it.
+
+    Raises
+    ------
+    DataError
+        Nodes that are at no step.
+    """
+    g = group_of(refinement.poses)
+    at = steps_at(refinement, m.node_times)
+    beside = np.tile(g.identity, (len(at), 1))  # T_body_node
+    bases = np.arange(len(at)) if m.base_nodes is None else m.base_nodes
+    for s, row in zip(submaps, bases):
+        if s.trajectory is not None and len(s.trajectory):
+            beside[row] = g.inverse(s.trajectory.poses[0])
+    last = submaps[-1]
+    if last.trajectory is not None and len(last.trajectory):
+        beside[-1] = g.between(last.trajectory.poses[-1], last.exit_pose)
+    ad = g.adjoint(g.inverse(beside))
+    C = ad @ refinement.covariances[at] @ np.swapaxes(ad, 1, 2)
+    return replace(
+        m,
+        trajectory=Trajectory(refinement.times, refinement.poses, refinement.covariances),
+        node_poses=g.compose(refinement.poses[at], beside),
+        node_covariances=0.5 * (C + np.swapaxes(C, 1, 2)),
+    )
+
+
+def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinement, scans: Scans) -> list[Submap]:
+    """The same submaps along the refined path: exits, paths and grids, each with its own scans alone.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        With evidence grids, whose model is kept.
+    m : GlobalMap
+        Refined (:func:`refined_map`).
+    refinement : Refinement
+    scans : Scans
+
+    Raises
+    ------
+    DataError
+        Submaps that begin or end at no step, or have no grid.
+    """
+    bases = base_frames(m)
+    g = group_of(bases)
+    ends = steps_at(refinement, m.base_times)
+    out = []
+    for k, s in enumerate(submaps):
+        if not isinstance(s.grid, EvidenceGrid):
+            raise DataError(f"submap {s.key} has no evidence grid to draw anew", wanted="a grid")
+        a, b = int(ends[k]), int(ends[k + 1])
+        poses = g.between(np.broadcast_to(bases[k], (b - a + 1, g.size)), refinement.poses[a : b + 1])
+        exit_pose = g.between(bases[k], bases[k + 1])
+        C = _relative(refinement, a, b)
+        turn = g.adjoint(g.between(exit_pose, poses[-1]))  # from the body at the end to the frame of the exit
+        P = turn @ C[-1] @ turn.T
+        out.append(
+            replace(
+                s,
+                exit_pose=exit_pose,
+                exit_covariance=0.5 * (P + P.T),
+                trajectory=Trajectory(refinement.times[a : b + 1], poses, C),
+                grid=_drawn(s.grid, scans, np.arange(a + (k > 0), b + 1), poses[int(k > 0) :]),
+                matches=(),
+                report={**s.report, "refined": True},
+            )
+        )
+    return out
+
+
+def base_frames(m: GlobalMap) -> Array:
+    """Frames ``(k + 1, 7|3)`` of the refined submaps: their bases, level in space where those of the run are."""
+    bases = m.base_poses
+    if m.dim == 2:
+        return bases
+    g = group_of(bases)
+    lean = np.linalg.norm(g.log(g.between(level(bases), bases))[:, :2], axis=1)
+    return level(bases) if np.all(lean < MOST_TILT) else bases
+
+
+MOST_TILT = 0.1
+"""Bases that lean by more are not meant to stand level [rad]."""
+
+
+def _relative(refinement: Refinement, a: int, b: int) -> Array:
+    """Covariances ``(b - a + 1, d, d)`` of steps a to b relative to step a, right tangents, interpolated."""
+    g = group_of(refinement.poses)
+    knots = np.unique(np.linspace(a, b, min(KNOTS, b - a + 1)).round().astype(np.int64))
+    d = g.dof
+    P = refinement.joint(knots)
+    out = np.zeros((len(knots), d, d))
+    for i, k in enumerate(knots[1:], start=1):
+        A = -g.adjoint(g.between(refinement.poses[k], refinement.poses[a]))
+        J = np.concatenate([A, np.eye(d)], axis=1)
+        rows = np.concatenate([np.arange(d), i * d + np.arange(d)])
+        out[i] = J @ P[np.ix_(rows, rows)] @ J.T
+    steps = np.arange(a, b + 1)
+    j = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, max(len(knots) - 2, 0))
+    if len(knots) == 1:
+        return np.tile(1e-12 * np.eye(d), (1, 1, 1))
+    u = ((steps - knots[j]) / (knots[j + 1] - knots[j]))[:, None, None]
+    C = (1.0 - u) * out[j] + u * out[j + 1] + 1e-12 * np.eye(d)
+    return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
+
+
+def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> EvidenceGrid:
+    """A grid of the same kind with the beams of some steps, at ``T_grid_body`` ``(k, 7|3)``."""
+    drawn = grid.empty()
+    for k, T in zip(steps.tolist(), poses):
+        points, origins, returns = scans.scan(k)
+        if len(points):
+            drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
+    return drawn

@@ -1,0 +1,48 @@
+"""Configuration of the refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError
+from graphslam.refine.surfaces import SurfaceConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefineConfig:
+    """How the solved path is refined by the scans themselves."""
+
+    use: bool = True
+    """Refine the solved path of runs whose front end works on scans; false: the path of the graph is the result."""
+    chunk_length: float = 3.0
+    """Way over which the points of steps are searched together [m]."""
+    chunk_time: float = 10.0
+    """Longest time of such a chunk, for robots that stand still [s]."""
+    reach: float = 10.0
+    """Chunks whose centres are nearer than this may see the same surfaces [m]."""
+    distances: tuple[float, ...] = (1.0, 0.7, 0.5, 0.4, 0.3)
+    """Greatest distance of a pair in each round over all passes [m]."""
+    every: int = 2
+    """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
+    most_points: int = 400_000
+    """Of so many points in the log at most; more are thinned evenly."""
+    spent: float = 1.7
+    """σ of a pair in multiples of the spread of the residuals: pairs share targets and normals, and are worth less than
+    if they did not. From simulated robots of drawn noise."""
+    knot: float = 30.0
+    """Time between the knots of the yaw bias [s]."""
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    """What counts as a surface."""
+
+    def __post_init__(self) -> None:
+        for name in ("chunk_length", "chunk_time", "reach", "spent", "knot"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"refine: {name} = {value}; wanted > 0")
+        if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
+            raise ConfigError(f"refine: distances = {self.distances}; wanted at least one, all > 0 m")
+        for name in ("every", "most_points"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"refine: {name} = {getattr(self, name)}; wanted ≥ 1")

@@ -1,0 +1,244 @@
+"""What the motion of the steps and gravity say of the refined path, errors that last being unknowns of their own.
+
+Increments of odometry are compared with the path, roll and pitch with gravity. Errors that do not fade within a step
+would be promised away many times over if they were taken for white, so they are states: the bias of the yaw rate, which
+may walk; the scale of distances; the direction in which the body is said to move (a scanner that is mounted askew
+against the odometry); the offset between the clocks of motion and scans; the constant part of gravity's roll and pitch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.geometry import Array
+from graphslam.core.poses import Group, group_of
+from graphslam.refine.scans import Scans
+
+Index = npt.NDArray[np.int64]
+
+SCALE, SIDE, RISE, CLOCK, ROLL, PITCH = range(6)
+"""Places of the constant states: scale of distances; direction of motion, to the side and upwards [rad]; clock of the
+motion ahead of the scans [s]; gravity's constant roll and pitch [rad]. In 2-D there are the first, second and fourth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """Whitened residuals of one kind of factor, with what they depend on.
+
+    Parameters
+    ----------
+    r : (f, m)
+    J : (f, m, Σ widths)
+    nodes : (f, s) int
+        Of each slot of columns.
+    widths : (s,) int
+    name : str
+    """
+
+    r: Array
+    J: Array
+    nodes: Index
+    widths: tuple[int, ...]
+    name: str
+
+
+class MotionModel:
+    """Odometry and gravity of steps as factors on the nodes of a refinement.
+
+    Nodes are the n steps, then the knots of the yaw bias, then one node with all constant states.
+
+    Parameters
+    ----------
+    steps : Scans
+    knot : float
+        Time between knots of the yaw bias [s].
+    """
+
+    def __init__(self, steps: Scans, *, knot: float = 30.0) -> None:
+        self.steps = steps
+        self.group: Group = group_of(steps.odometry.increments)
+        self.sigmas = steps.lasting
+        n = len(steps)
+        t = steps.times
+        d = self.group.dim
+        span = float(t[-1] - t[0]) if n > 1 else 0.0
+        self.knots = np.linspace(t[0], t[-1], max(2, int(np.ceil(span / knot)) + 1))
+        self.constants = 6 if d == 3 else 3
+        self.at = np.array([SCALE, SIDE, RISE, CLOCK, ROLL, PITCH] if d == 3 else [0, 1, -1, 2, -1, -1])
+        self.widths = np.concatenate([np.full(n, self.group.dof), np.ones(len(self.knots)), [self.constants]]).astype(
+            np.int64
+        )
+        self.gravity = d == 3 and steps.tilt is not None
+        u = steps.odometry.increments[1:]
+        self.dt = np.diff(t)
+        a = np.clip(np.searchsorted(self.knots, 0.5 * (t[1:] + t[:-1]), side="right") - 1, 0, len(self.knots) - 2)
+        share = (0.5 * (t[1:] + t[:-1]) - self.knots[a]) / np.maximum(self.knots[a + 1] - self.knots[a], 1e-12)
+        g = self.group
+        xi = g.log(u)
+        twist = xi / self.dt[:, None] if len(xi) else xi
+        edge = np.zeros((n, g.dof))  # rate at each stamp: the mean of its two sides
+        if n > 2:
+            edge[1:-1] = 0.5 * (twist[1:] + twist[:-1])
+            edge[0], edge[-1] = twist[0], twist[-1]
+        move = u[:, :d]
+        B = np.zeros((n - 1, g.dof, 2 + self.constants))  # d e / d (two knots, constants)
+        B[:, g.heading, 0] = -self.dt * (1.0 - share)
+        B[:, g.heading, 1] = -self.dt * share
+        P = np.arange(g.dof)[g.position]
+        # odometry is measured = true × (1 + s), turned by the direction, ahead by the clock
+        B[:, P, 2 + self.at[SCALE]] = -move
+        B[:, P[0], 2 + self.at[SIDE]] = move[:, 1]
+        B[:, P[1], 2 + self.at[SIDE]] = -move[:, 0]
+        if d == 3:
+            B[:, P[0], 2 + self.at[RISE]] = -move[:, 2]
+            B[:, P[2], 2 + self.at[RISE]] = move[:, 0]
+        B[:, :, 2 + self.at[CLOCK]] = -(edge[1:] - edge[:-1])
+        keep = np.arange(g.dof)
+        if self.gravity:  # roll and pitch of the increments are gravity's own: they are read there
+            keep = keep[2:]
+        self.keep = keep
+        C = steps.odometry.covariances[1:][:, keep][:, :, keep]
+        self.covariances = C
+        self.B = B
+        self.scales = np.ones(len(keep))
+        self.nodes = np.column_stack(
+            [np.arange(n - 1), np.arange(1, n), n + a, n + a + 1, np.full(n - 1, n + len(self.knots))]
+        ).astype(np.int64)
+
+    @property
+    def steps_count(self) -> int:
+        """Number of step nodes."""
+        return len(self.steps)
+
+    def whiteners(self) -> Array:
+        """``W`` ``(n - 1, m, m)`` with ``Wᵀ W`` = information of the increments, at their present scales."""
+        s = self.scales
+        L = np.linalg.cholesky(self.covariances * s[:, None] * s[None, :])
+        return np.asarray(np.linalg.inv(L))
+
+    def _state_rows(self, states: tuple[Array, Array]) -> Array:
+        bias, constants = states
+        a = self.nodes[:, 2] - len(self.steps)
+        return np.column_stack([bias[a], bias[a + 1], np.tile(constants, (len(a), 1))])
+
+    def terms(self, poses: Array, states: tuple[Array, Array]) -> list[Terms]:
+        """All factors at a path ``(n, 7|3)`` and states (yaw bias at the knots ``(k,)``, constants ``(c,)``)."""
+        out = [self._odometry(poses, states), *self._priors(states)]
+        if self.gravity:
+            out += self._gravity(poses, states)
+        return out
+
+    def _odometry(self, poses: Array, states: tuple[Array, Array]) -> Terms:
+        g = self.group
+        step = g.between(poses[:-1], poses[1:])
+        raw = g.log(g.between(self.steps.odometry.increments[1:], step))
+        e = raw - np.einsum("kij,kj->ki", self.B, self._state_rows(states))
+        Jr = np.linalg.inv(g.right_jacobian(raw))
+        J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
+        W = self.whiteners()
+        k = self.keep
+        return Terms(
+            np.einsum("kij,kj->ki", W, e[:, k]),
+            W @ J[:, k],
+            self.nodes,
+            (g.dof, g.dof, 1, 1, self.constants),
+            "odometry",
+        )
+
+    def _priors(self, states: tuple[Array, Array]) -> list[Terms]:
+        bias, constants = states
+        s, n, K = self.sigmas, len(self.steps), len(self.knots)
+        first = Terms(
+            np.array([[bias[0] / s.yaw_bias]]), np.array([[[1.0 / s.yaw_bias]]]), np.array([[n]]), (1,), "yaw bias"
+        )
+        q = s.yaw_walk * np.sqrt(np.diff(self.knots))
+        q = np.maximum(q, 1e-12)
+        walk = Terms(
+            (np.diff(bias) / q)[:, None],
+            np.stack([-1.0 / q, 1.0 / q], axis=1)[:, None, :],
+            np.column_stack([n + np.arange(K - 1), n + np.arange(1, K)]),
+            (1, 1),
+            "yaw bias walk",
+        )
+        sigma = np.zeros(self.constants)
+        for place, value in zip(
+            (SCALE, SIDE, RISE, CLOCK, ROLL, PITCH), (s.scale, s.direction, s.direction, s.clock, s.tilt, s.tilt)
+        ):
+            if self.at[place] >= 0:
+                sigma[self.at[place]] = value
+        fixed = Terms(
+            (constants / sigma)[None], np.diag(1.0 / sigma)[None], np.array([[n + K]]), (self.constants,), "constants"
+        )
+        return [first, walk, fixed]
+
+    def _gravity(self, poses: Array, states: tuple[Array, Array]) -> list[Terms]:
+        """Errors of roll and pitch are an Ornstein–Uhlenbeck process: each is new only in so far as it is not the last.
+
+        So every reading is spent once, be it as an absolute one or as the change since the one before.
+        """
+        steps, n = self.steps, len(self.steps)
+        assert steps.tilt is not None
+        seen, D = tilt_of(poses)
+        e = steps.tilt - seen - states[1][[ROLL, PITCH]]
+        sigma = max(steps.tilt_sigma, 1e-5)
+        phi = np.exp(-self.dt / max(steps.tilt_time, 1e-6))
+        new = np.maximum(sigma * np.sqrt(1.0 - phi**2), 1e-6)
+        const = n + len(self.knots)
+        E = np.zeros((2, self.constants))
+        E[0, ROLL] = E[1, PITCH] = 1.0
+        first = Terms(
+            e[:1] / sigma, np.concatenate([-D[:1], -E[None]], axis=2) / sigma, np.array([[0, const]]), (6, self.constants),
+            "gravity",
+        )  # fmt: skip
+        J = (
+            np.concatenate([phi[:, None, None] * D[:-1], -D[1:], -(1.0 - phi)[:, None, None] * E[None]], axis=2)
+            / new[:, None, None]
+        )
+        later = Terms(
+            (e[1:] - phi[:, None] * e[:-1]) / new[:, None],
+            J,
+            np.column_stack([np.arange(n - 1), np.arange(1, n), np.full(n - 1, const)]),
+            (6, 6, self.constants),
+            "gravity",
+        )
+        return [first, later]
+
+    def gauge(self, poses: Array, held: Array) -> Terms:
+        """Position and heading of the first pose held at ``held``; with gravity its roll and pitch are free."""
+        g = self.group
+        e = g.log(g.between(held, poses[0]))
+        if self.gravity:
+            up = se3.quat_to_matrix(poses[0, 3:])[2]
+            J = np.zeros((4, 6))
+            J[0, :3] = up
+            J[1:, 3:] = np.eye(3)
+            r = np.concatenate([[up @ e[:3]], e[3:]])
+        else:
+            J, r = np.eye(g.dof), e
+        return Terms((r / HELD)[None], (J / HELD)[None], np.array([[0]]), (g.dof,), "gauge")
+
+
+HELD = 1e-5
+"""σ of the gauge [m, rad]: far below what anything else says."""
+
+
+def tilt_of(poses: Array) -> tuple[Array, Array]:
+    """Roll and pitch ``(n, 2)`` [rad] and their derivatives by the right tangent ``(n, 2, 6)``."""
+    up = se3.quat_to_matrix(poses[:, 3:])[:, 2, :]  # e_z of the world in the body
+    x, y, z = up.T
+    roll, pitch = np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))
+    # R Exp(w): up moves by up × w
+    n = len(poses)
+    U = np.zeros((n, 3, 3))
+    U[:, 0, 1], U[:, 0, 2] = -z, y
+    U[:, 1, 0], U[:, 1, 2] = z, -x
+    U[:, 2, 0], U[:, 2, 1] = -y, x
+    D = np.zeros((n, 2, 6))
+    flat = np.maximum(y**2 + z**2, 1e-12)
+    D[:, 0, :3] = (z[:, None] * U[:, 1] - y[:, None] * U[:, 2]) / flat[:, None]
+    D[:, 1, :3] = -U[:, 0] / np.sqrt(np.maximum(1.0 - x**2, 1e-12))[:, None]
+    return np.column_stack([roll, pitch]), D

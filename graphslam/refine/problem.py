@@ -1,0 +1,179 @@
+"""The joint problem of a refinement: its blocks, its Gauss–Newton steps, its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
+from graphslam.linear.symmetric_factor import elimination_order
+from graphslam.refine.kernels import Pairs, plane_blocks, plane_residuals
+from graphslam.refine.motion import MotionModel, Terms
+from graphslam.refine.surfaces import Cloud, Surfaces, rotations
+
+Index = npt.NDArray[np.int64]
+States = tuple[Array, Array]
+
+
+class Pattern:
+    """Which nodes of a refinement share a block, and where the blocks stand in one flat array.
+
+    Parameters
+    ----------
+    widths : (N,)
+    a, b : (k,)
+        Pairs of nodes, in any order, repeated at will.
+    """
+
+    def __init__(self, widths: Index, a: Index, b: Index) -> None:
+        N = len(widths)
+        order = elimination_order(a.astype(np.intp), b.astype(np.intp), N).astype(np.int64)
+        self.rank = np.empty(N, np.int64)
+        self.rank[order] = np.arange(N)
+        own = np.arange(N)
+        rows, columns = self._sorted(np.concatenate([own, a]), np.concatenate([own, b]))
+        self.N, self.widths = N, widths
+        self.keys = np.unique(rows * N + columns)
+        rows, columns = self.keys // N, self.keys % N
+        sizes = widths[rows] * widths[columns]
+        self.offset = (np.cumsum(sizes) - sizes).astype(np.int64)
+        self.size = int(sizes.sum())
+        self.begin = np.cumsum(widths) - widths
+        ptr = np.searchsorted(rows, np.arange(N + 1)).astype(np.int64)
+        self.symbolic = BlockSymbolic(order, widths, ptr, columns.astype(np.int64))
+
+    def _sorted(self, a: Index, b: Index) -> tuple[Index, Index]:
+        """Pairs with the node first that is eliminated first."""
+        earlier = self.rank[a] <= self.rank[b]
+        return np.where(earlier, a, b), np.where(earlier, b, a)
+
+    def at(self, a: Index, b: Index) -> Index:
+        """Where blocks begin; the rows are those of the node that is eliminated first."""
+        rows, columns = self._sorted(a, b)
+        return self.offset[np.searchsorted(self.keys, rows * self.N + columns)]
+
+    def add(self, terms: Terms, H: Array, g: Array) -> float:
+        """Add the blocks of a kind of factor to ``H`` and ``Jᵀ r`` to ``g``; the sum of squares."""
+        first = np.cumsum((0, *terms.widths))
+        JtJ = np.swapaxes(terms.J, 1, 2) @ terms.J
+        Jtr = np.einsum("kij,ki->kj", terms.J, terms.r)
+        for u, wu in enumerate(terms.widths):
+            nu = terms.nodes[:, u]
+            np.add.at(g, self.begin[nu][:, None] + np.arange(wu), Jtr[:, first[u] : first[u + 1]])
+            for v, wv in enumerate(terms.widths):
+                nv = terms.nodes[:, v]
+                some = self.rank[nu] <= self.rank[nv]  # the other triangle is its mirror
+                if not np.any(some):
+                    continue
+                block = JtJ[some, first[u] : first[u + 1], first[v] : first[v + 1]].reshape(-1, wu * wv)
+                np.add.at(H, self.at(nu[some], nv[some])[:, None] + np.arange(wu * wv), block)
+        return float(np.sum(terms.r**2))
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """One linearisation, factorised.
+
+    Parameters
+    ----------
+    pattern : Pattern
+    factor : BlockFactor
+    parts : dict of str to float
+        Objective by kind of factor, ``Σ rᵀ Λ r`` at the point of linearisation.
+    """
+
+    pattern: Pattern
+    factor: BlockFactor
+    parts: dict[str, float]
+
+
+def point_information(pairs: Pairs, residuals: Array, sigma: float, *, robust: float = 2.0) -> Array:
+    """Information of each pair: Geman–McClure weight at ``robust`` σ, over σ² and over the pairs of its source."""
+    w = 1.0 / (1.0 + (residuals / (robust * sigma)) ** 2) ** 2
+    return w * pairs.weight / sigma**2
+
+
+class Problem:
+    """Scans, motion and gravity on the nodes of a path.
+
+    Parameters
+    ----------
+    motion : MotionModel
+    cloud : Cloud
+    held : (7,) or (3,)
+        Where the first pose is held.
+    """
+
+    def __init__(self, motion: MotionModel, cloud: Cloud, held: Array) -> None:
+        self.motion, self.cloud, self.held = motion, cloud, held
+        self._key: object = None
+        self._pattern: Pattern | None = None
+
+    def residuals(self, pairs: Pairs, surfaces: Surfaces, poses: Array) -> Array:
+        """Distances of source points from their surfaces ``(k,)`` [m]."""
+        out = np.empty(len(pairs.source))
+        R, t = rotations(poses), np.ascontiguousarray(poses[:, : self.motion.group.dim])
+        plane_residuals(pairs, R, t, self.cloud.points, surfaces.normals, out)
+        return out
+
+    def _pattern_of(self, pairs: Pairs, extra: list[Terms]) -> Pattern:
+        key = (id(pairs.source), *(id(t.nodes) for t in extra))
+        if self._key != key:
+            n = self.motion.steps_count
+            nodes = self.motion.nodes
+            a, b = [pairs.i], [pairs.j]
+            for u in range(nodes.shape[1]):
+                for v in range(u):
+                    a.append(nodes[:, u])
+                    b.append(nodes[:, v])
+            K = len(self.motion.knots)
+            a += [n + np.arange(K), np.arange(n), n + np.arange(K - 1)]
+            b += [np.full(K, n + K), np.full(n, n + K), n + np.arange(1, K)]
+            for t in extra:
+                for u in range(len(t.widths)):
+                    for v in range(u):
+                        a.append(t.nodes[:, u])
+                        b.append(t.nodes[:, v])
+            self._pattern = Pattern(self.motion.widths, np.concatenate(a), np.concatenate(b))
+            self._key, self._held = key, (pairs.source, extra)  # held: an address is a name while it lives
+        assert self._pattern is not None
+        return self._pattern
+
+    def linearise(
+        self,
+        poses: Array,
+        states: States,
+        pairs: Pairs,
+        surfaces: Surfaces,
+        information: Array,
+        extra: list[Terms] | None = None,
+    ) -> tuple[Solved, Array]:
+        """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``."""
+        pattern, motion = self._pattern_of(pairs, extra or []), self.motion
+        n, w = motion.steps_count, motion.group.dof
+        H, g = np.zeros(pattern.size), np.zeros(pattern.widths.sum())
+        gp = np.zeros((n, w))
+        own = np.arange(n)
+        R, t = rotations(poses), np.ascontiguousarray(poses[:, : motion.group.dim])
+        parts = {
+            "scans": plane_blocks(
+                pairs, (R, t), (self.cloud.points, surfaces.normals), information,
+                (pattern.at(own, own), pattern.at(pairs.i, pairs.j), pattern.rank), H, gp,
+            )
+        }  # fmt: skip
+        g[: n * w] = gp.ravel()
+        for terms in [*motion.terms(poses, states), motion.gauge(poses, self.held), *(extra or [])]:
+            parts[terms.name] = parts.get(terms.name, 0.0) + pattern.add(terms, H, g)
+        factor = pattern.symbolic.factor(pattern.offset, H)
+        return Solved(pattern, factor, parts), -factor.solve(g)
+
+    def moved(self, poses: Array, states: States, step: Array) -> tuple[Array, States]:
+        """Path and states after a step."""
+        n, w = self.motion.steps_count, self.motion.group.dof
+        g = self.motion.group
+        K = len(self.motion.knots)
+        rest = step[n * w :]
+        return g.compose(poses, g.exp(step[: n * w].reshape(n, w))), (states[0] + rest[:K], states[1] + rest[K:])

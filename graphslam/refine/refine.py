@@ -1,0 +1,288 @@
+"""Refinement of a solved path by its own scans: rounds of association and Gauss–Newton, guarded.
+
+Nodes are the steps. The measurements are the points of the scans on surfaces that other steps saw, the increments of
+the odometry with lasting errors as unknowns, and gravity. Exits of submaps, matches and loops of the run are where the
+refinement starts, and enter no sum: they were made of the same scans.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.refine.config import RefineConfig
+from graphslam.refine.guides import ACCEPTED, find_guides
+from graphslam.refine.motion import MotionModel
+from graphslam.refine.scans import Scans
+from graphslam.refine.problem import Problem, Solved, States, point_information
+from graphslam.refine.surfaces import Cloud, Surfaces, associate, chunk_pairs, find_surfaces
+
+log = logging.getLogger(__name__)
+Index = npt.NDArray[np.int64]
+
+NEAR = ((1.0, 0.10), (0.7, 0.07))
+"""Distance and σ of the rounds over neighbours on the way [m]; the last is repeated until the path stands still."""
+STILL = 0.01, 1e-4
+"""A round moved the path by less than so much [m], or than this share of its length: it stands still."""
+MOST_ROUNDS = 10
+MOST_GATES = 6
+KEPT = 2
+"""Surfaces are found anew in so many rounds over all passes; then the steps about a point move no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One association and what followed.
+
+    Parameters
+    ----------
+    distance : float
+        Greatest distance of a pair [m].
+    sigma : float
+        Of a pair [m].
+    pairs, passes : int
+        Pairs of points, and how many of them between different passes.
+    spread : float
+        1.48 × the median absolute residual [m].
+    moved : float
+        RMS by which positions changed [m].
+    """
+
+    distance: float
+    sigma: float
+    pairs: int
+    passes: int
+    spread: float
+    moved: float
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A refined path with its uncertainty, and what was found on the way.
+
+    Parameters
+    ----------
+    times : (n,)
+    poses : (n, 7) or (n, 3)
+        In the frame of the start, whose first position and heading are held.
+    covariances : (n, d, d)
+        Right tangent, first position and heading held.
+    start : (n, 7) or (n, 3)
+    yaw_bias : (k, 2)
+        Time [s] and bias of the yaw rate [rad/s] at the knots.
+    constants : dict of str to (value, σ)
+        ``scale``, ``side``, ``rise``, ``clock``, ``roll``, ``pitch``.
+    rounds : tuple of Round
+    parts : dict of str to float
+        Objective by kind of factor at the end.
+    refused : (m, 2)
+        Steps that the start drew together although the scans between contradict it.
+    agreement : (start, refined)
+        Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
+    motion : float
+        χ² of the walk of the yaw bias by its degrees of freedom: far above 1 where the scans of passes and the motion
+        contradict each other.
+    solved : Solved
+        The last linearisation, for joint covariances.
+    """
+
+    times: Array
+    poses: Array
+    covariances: Array
+    start: Array
+    yaw_bias: Array
+    constants: dict[str, tuple[float, float]]
+    rounds: tuple[Round, ...]
+    parts: dict[str, float]
+    refused: Index
+    agreement: tuple[float, float]
+    motion: float
+    solved: Solved
+
+    @property
+    def better(self) -> bool:
+        """Do the scans agree with each other at the refined path at least as well as at the start?"""
+        return self.agreement[1] >= self.agreement[0]
+
+    def joint(self, steps: npt.ArrayLike) -> Array:
+        """Joint covariance of some steps ``(k·d, k·d)``."""
+        d = self.covariances.shape[1]
+        rows = (np.asarray(steps, np.int64)[:, None] * d + np.arange(d)).ravel()
+        return self.solved.factor.inverse_block(rows)
+
+
+def refine(
+    steps: Scans,
+    start: Array,
+    config: RefineConfig | None = None,
+    *,
+    progress: Callable[[str], Any] | None = None,
+) -> Refinement:
+    """Refine a path by the scans of its steps.
+
+    Parameters
+    ----------
+    steps : Scans
+    start : (n, 7) or (n, 3)
+        Poses of the base at the stamps of the steps; in space the frame is level.
+    config : RefineConfig, optional
+    progress : callable, optional
+        Told each round in words.
+
+    Raises
+    ------
+    GeometryError
+        The start does not fit the steps.
+    DataError
+        Too few steps or points to refine anything.
+    """
+    config = config or RefineConfig()
+    g = steps.group
+    if start.shape != (len(steps), g.size) or not np.all(np.isfinite(start)):
+        raise GeometryError(
+            "the start does not fit the steps", got=start.shape, wanted=f"({len(steps)}, {g.size}), finite"
+        )
+    if len(steps) < 3:
+        raise DataError("too few steps to refine", where=steps.name, got=len(steps), wanted="≥ 3")
+    work = _Work(steps, start, config, progress or (lambda _: None))
+    if not len(work.cloud.points):
+        raise DataError("no beam of the steps met anything", where=steps.name)
+    return work.run()
+
+
+class _Work:
+    """A refinement while it goes on."""
+
+    def __init__(self, steps: Scans, start: Array, config: RefineConfig, tell: Callable[[str], Any]) -> None:
+        self.steps, self.start, self.config, self.tell = steps, start, config, tell
+        self.group = group_of(start)
+        self.motion = MotionModel(steps, knot=config.knot)
+        self.cloud = Cloud.of(steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time)
+        self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
+        self.problem = Problem(self.motion, self.cloud, start[0].copy())
+        self.poses = start.copy()
+        self.states: States = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
+        self.rounds: list[Round] = []
+        self.surfaces: Surfaces | None = None
+        self.length = float(steps.path_length[-1])
+
+    def run(self) -> Refinement:
+        """All rounds."""
+        for distance, sigma in NEAR:
+            self.round(distance, sigma, passes=False, again=True)
+        while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
+            self.round(*NEAR[-1], passes=False, again=False)
+        refused = self.follow_guides()
+        for k, distance in enumerate(self.config.distances):
+            self.round(distance, None, passes=True, again=k < KEPT)
+        return self.result(refused)
+
+    def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool) -> None:
+        """Associate anew, and two Gauss–Newton steps; without a σ it comes from the spread of the residuals."""
+        if again or self.surfaces is None:
+            self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
+        self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
+        self.pairs, self.whose = associate(
+            self.cloud, self.surfaces, self.poses, self.chunks, distance=distance, every=self.every
+        )
+        before = self.poses
+        for _ in range(2):
+            r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
+            spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
+            s = sigma or max(self.config.spent * spread, 0.1 * distance)
+            self.step(point_information(self.pairs, r, s))
+        d = self.group.dim
+        moved = float(np.sqrt(np.mean(np.sum((self.poses[:, :d] - before[:, :d]) ** 2, axis=1))))
+        found = Round(distance, s, len(r), int(np.sum(self.chunks.passes[self.whose])), spread, moved)
+        self.rounds.append(found)
+        self.tell(f"round {len(self.rounds)}: {found.pairs} pairs within {distance:g} m, moved by {moved:.3f} m")
+        log.info("refine: %s", found)
+
+    def step(self, information: Array, extra: list[Any] | None = None) -> Solved:
+        """One Gauss–Newton step."""
+        assert self.surfaces is not None
+        solved, step = self.problem.linearise(
+            self.poses, self.states, self.pairs, self.surfaces, information, extra or []
+        )
+        self.poses, self.states = self.problem.moved(self.poses, self.states, step)
+        return solved
+
+    def follow_guides(self) -> Index:
+        """Bring passes together as the start has them where the scans between allow it; those that they do not."""
+        guides = find_guides(self.cloud, self.start, 0.5 * self.config.reach)
+        none = np.zeros((0, 2), np.int64)
+        if not len(guides):
+            return none
+        assert self.surfaces is not None
+        r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
+        information = point_information(self.pairs, r, NEAR[-1][1])
+        taken = np.zeros(len(guides), bool)
+        for _ in range(MOST_GATES):
+            w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
+            solved = self.step(information, [guides.terms(self.poses, w)])
+            for _ in range(2 * int(taken.any())):
+                w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
+                solved = self.step(information, [guides.terms(self.poses, w)])
+            fits = guides.distances(self.poses, solved, self.group.dof) < ACCEPTED
+            if np.array_equal(fits, taken):
+                break
+            taken = fits
+        away = ~taken
+        self.tell(f"{len(guides)} guides, {int(away.sum())} of them contradict the scans between")
+        return guides.steps[away]
+
+    def agreement(self, poses: Array) -> float:
+        """Share of the source points with a surface within reach that lie on it, to three times the final σ.
+
+        The pairs are found anew at this path, with surfaces made at this path: nothing is kept of how it came about.
+        """
+        surfaces = find_surfaces(self.cloud, poses, self.config.surface)
+        chunks = chunk_pairs(self.cloud, poses, self.config.reach, passes=True)
+        pairs, _ = associate(
+            self.cloud,
+            surfaces,
+            poses,
+            chunks,
+            distance=self.config.distances[0],
+            every=4 * self.every,
+            least_share=0.0,
+        )
+        r = self.problem.residuals(pairs, surfaces, poses)
+        near = np.maximum(1.0 - (r / (3.0 * self.rounds[-1].sigma)) ** 2, 0.0)
+        return float(np.sum(near * pairs.weight) / max(np.sum(pairs.weight), 1.0))
+
+    def result(self, refused: Index) -> Refinement:
+        """Covariances at the end, and all that was found."""
+        assert self.surfaces is not None
+        r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
+        solved = self.step(point_information(self.pairs, r, self.rounds[-1].sigma))
+        n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
+        C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
+        const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))
+        names = ("scale", "side", "rise", "clock", "roll", "pitch")
+        sigma = np.sqrt(np.diag(const))
+        at = self.motion.at
+        return Refinement(
+            times=self.steps.times,
+            poses=self.poses,
+            covariances=C,
+            start=self.start,
+            yaw_bias=np.column_stack([self.motion.knots, self.states[0]]),
+            constants={
+                name: (float(self.states[1][at[k]]), float(sigma[at[k]])) for k, name in enumerate(names) if at[k] >= 0
+            },
+            rounds=tuple(self.rounds),
+            parts=solved.parts,
+            refused=refused,
+            agreement=(self.agreement(self.start), self.agreement(self.poses)),
+            motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
+            solved=solved,
+        )

@@ -1,0 +1,213 @@
+"""Scans of steps, with motion and gravity: all that a refinement reads of a log, and its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.atomic import read_npz, write_npz
+from graphslam.core.errors import DataError, FormatError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.npz import Field, flags, floats, ints
+from graphslam.core.point_clouds import check_offsets
+from graphslam.core.poses import Group, group_of
+from graphslam.core.records import Odometry, check_times
+from graphslam.frontends.odometry.recorded import RecordedErrors
+from graphslam.frontends.odometry.reckoned import Reckoned
+from graphslam.frontends.odometry.steps import Steps
+
+SCANS_FORMAT = "graphslam.scans/1"
+FIELDS: dict[str, Field] = {
+    "times": floats("n"),
+    "increments": floats("n", "p"),
+    "covariances": floats("n", "d", "d"),
+    "offsets": ints("n+1"),
+    "points": floats("q", "c"),
+    "origins": floats("q", "c"),
+    "returns": flags("q"),
+    "scalars": floats("s"),
+    "tilt": floats("n", "t", optional=True),
+}
+"""``scalars``: max_range, tilt_sigma, tilt_time, then the lasting errors in their order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LastingSigmas:
+    """Prior σ of the errors that outlive a step."""
+
+    yaw_bias: float
+    """Of the yaw rate [rad/s]."""
+    yaw_walk: float
+    """Its walk [rad/s/√s]."""
+    scale: float
+    """Share of the distance."""
+    direction: float
+    """Between the way in which the odometry says the body moves, and that in which the scanner sees it move [rad]."""
+    clock: float
+    """Between the clocks of motion and scans [s]."""
+    tilt: float
+    """Constant part of gravity's roll and pitch [rad]."""
+
+
+LEAST = LastingSigmas(yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3)
+"""What no robot is known better to than from its own scans: consumer gyros, wheels under load, brackets, clocks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scans:
+    """Beams of n steps, the motion between them, and gravity.
+
+    Parameters
+    ----------
+    times : (n,)
+        Stamps [s].
+    odometry : Odometry
+        Increments at ``times``; the covariances hold what is new in each.
+    offsets : (n + 1,) int64
+        Beams of step k are rows ``offsets[k]:offsets[k + 1]``.
+    points, origins : (q, dim)
+        Ends and beginnings of the beams, frame of the base at the stamp of their step, in single precision [m].
+    returns : (q,) bool
+    max_range : float
+        [m]
+    tilt : (n, 2) or None
+        Roll and pitch by gravity [rad].
+    tilt_sigma, tilt_time : float
+        Of their fading error [rad], [s].
+    lasting : LastingSigmas
+    name : str
+    """
+
+    times: Array
+    odometry: Odometry
+    offsets: npt.NDArray[np.int64]
+    points: npt.NDArray[np.float32]
+    origins: npt.NDArray[np.float32]
+    returns: npt.NDArray[np.bool_]
+    max_range: float
+    lasting: LastingSigmas
+    tilt: Array | None = None
+    tilt_sigma: float = 0.0
+    tilt_time: float = 1.0
+    name: str = "scans"
+
+    @classmethod
+    def of(cls, steps: Steps) -> Scans:
+        """Those of steps, with σ of the lasting errors that their motion states, never less than :data:`LEAST`."""
+        return cls(
+            times=steps.times,
+            odometry=steps.odometry,
+            offsets=steps.offsets,
+            points=steps.points.astype(np.float32),
+            origins=steps.origins.astype(np.float32),
+            returns=steps.returns,
+            max_range=steps.max_range,
+            lasting=lasting_sigmas(steps),
+            tilt=steps.tilt,
+            tilt_sigma=steps.tilt_sigma,
+            tilt_time=steps.tilt_time,
+            name=steps.name,
+        )
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def group(self) -> Group:
+        """SE(2) or SE(3)."""
+        return group_of(self.odometry.increments)
+
+    @property
+    def path_length(self) -> Array:
+        """Metres driven until each step ``(n,)``, by the odometry."""
+        return np.cumsum(np.linalg.norm(self.odometry.increments[:, : self.group.dim], axis=1))
+
+    def scan(self, k: int) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Points ``(m, dim)``, origins ``(m, dim)`` and returns ``(m,)`` of step k."""
+        rows = slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+        return self.points[rows].astype(np.float64), self.origins[rows].astype(np.float64), self.returns[rows]
+
+    def save(self, file: Path) -> None:
+        """Write ``scans.npz``."""
+        l = self.lasting
+        lasting = [l.yaw_bias, l.yaw_walk, l.scale, l.direction, l.clock, l.tilt]
+        arrays: dict[str, Any] = {
+            "format": SCANS_FORMAT,
+            "times": self.times,
+            "increments": self.odometry.increments,
+            "covariances": self.odometry.covariances,
+            "offsets": self.offsets,
+            "points": self.points,
+            "origins": self.origins,
+            "returns": self.returns,
+            "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting]),
+        }
+        if self.tilt is not None:
+            arrays["tilt"] = self.tilt
+        write_npz(file, arrays)
+
+    @classmethod
+    def load(cls, file: Path, name: str = "scans") -> Scans:
+        """Read ``scans.npz``.
+
+        Raises
+        ------
+        MissingDataError, FormatError
+        """
+        a = read_npz(file, fmt=SCANS_FORMAT, fields=FIELDS)
+        s = a["scalars"]
+        try:
+            if len(s) != 9 or not np.all(s >= 0) or s[0] <= 0:
+                raise DataError("scalars are impossible", got=s.tolist(), wanted="9 numbers, ≥ 0, the range > 0")
+            d = {3: 2, 7: 3}.get(a["increments"].shape[1])
+            if d is None or a["points"].shape != a["origins"].shape or a["points"].shape[1] != d:
+                raise DataError("points and increments do not fit", got=(a["increments"].shape, a["points"].shape))
+            if len(a["returns"]) != len(a["points"]):
+                raise DataError("returns and points differ in number", got=len(a["returns"]), wanted=len(a["points"]))
+            times = check_times(a["times"])
+            return cls(
+                times=times,
+                odometry=Odometry(times=times, increments=a["increments"], covariances=a["covariances"]),
+                offsets=check_offsets(a["offsets"], len(a["points"]), where=str(file)),
+                points=a["points"],
+                origins=a["origins"],
+                returns=a["returns"],
+                max_range=float(s[0]),
+                tilt=a.get("tilt"),
+                tilt_sigma=float(s[1]),
+                tilt_time=float(s[2]),
+                lasting=LastingSigmas(
+                    yaw_bias=float(s[3]),
+                    yaw_walk=float(s[4]),
+                    scale=float(s[5]),
+                    direction=float(s[6]),
+                    clock=float(s[7]),
+                    tilt=float(s[8]),
+                ),
+                name=name,
+            )
+        except (DataError, GeometryError) as error:
+            raise FormatError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None
+
+
+def lasting_sigmas(steps: Steps) -> LastingSigmas:
+    """Prior σ of the lasting errors of steps: those that their motion states, never less than :data:`LEAST`."""
+    e, least = steps.errors, LEAST
+    bias, walk, scale, tilt = 0.0, 0.0, 0.0, steps.tilt_sigma
+    if isinstance(e, Reckoned):
+        bias, walk, scale = e.lasting.gyro_bias, e.lasting.gyro_walk, e.lasting.wheel_scale
+        tilt = e.lasting.attitude_bias
+    elif isinstance(e, RecordedErrors):
+        bias, scale = e.yaw_bias, e.scale
+    return LastingSigmas(
+        yaw_bias=max(bias, least.yaw_bias),
+        yaw_walk=max(walk, least.yaw_walk),
+        scale=max(scale, least.scale),
+        direction=least.direction,
+        clock=least.clock,
+        tilt=max(tilt, least.tilt),
+    )
