@@ -21,6 +21,7 @@ STOREY = {
     "graphslam.association": 3,
     "graphslam.solve": 4,
     "graphslam.join": 5,
+    "graphslam.refine": 5,
     "graphslam.loops": 5,
     "graphslam.maps": 6,
     "graphslam.evaluate": 7,

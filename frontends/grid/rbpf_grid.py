@@ -258,7 +258,15 @@ class RbpfGrid(FrontEnd):
     """
 
     config: RbpfGridConfig = field(default_factory=RbpfGridConfig)
+    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "rbpf-grid"
+
+    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
+        """The steps of a log; those of the last one are kept."""
+        if not (self._made and self._made[0] is log):
+            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
+        made: Steps = self._made[1]
+        return made
 
     def submaps(
         self,
@@ -271,7 +279,7 @@ class RbpfGrid(FrontEnd):
     ) -> Iterator[Submap]:
         """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
-            steps = checked_steps(log, self.config.steps, drops)
+            steps = self.steps(log, drops=drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))
             drift = replace(self.config.drift, dim=steps.dim)
             submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)

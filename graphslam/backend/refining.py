@@ -15,7 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.global_map import GlobalMap
-from graphslam.maps.refined import base_frames, refined_map, refined_submaps
+from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine
 from graphslam.refine.scans import Scans
@@ -26,7 +26,11 @@ CONTRADICTED = 3.0
 """χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
 NAMED = {
     "scale": (0.03, "distances of the odometry are {v:.1%} too long (scale of the wheels)", 1.0),
-    "side": (0.009, "the scanner looks {v:.2f}° to the side of the way that the odometry tells (its mounting)", 57.29578),
+    "side": (
+        0.009,
+        "the scanner looks {v:.2f}° to the side of the way that the odometry tells (its mounting)",
+        57.29578,
+    ),
     "rise": (0.009, "the scanner looks {v:.2f}° above the way that the odometry tells (its mounting)", 57.29578),
     "clock": (0.02, "the clock of the motion is {v:.0f} ms ahead of that of the scans", 1e3),
 }
@@ -44,8 +48,6 @@ class Refined:
         With the refined path and nodes.
     submaps : list of Submap
         Along the refined path; empty where the run's have no grids.
-    bases : GlobalMap
-        Of the refined submaps: their frames alone are its nodes.
     graph_path : Trajectory
         Path of the graph, where the refinement began.
     """
@@ -53,7 +55,6 @@ class Refined:
     refinement: Refinement
     map: GlobalMap
     submaps: list[Submap]
-    bases: GlobalMap
     graph_path: Trajectory
 
 
@@ -103,23 +104,11 @@ def refine_run(
             return None, [Finding("look", "refine-refused", text)]
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
-        frames = base_frames(refined)
-        bases = GlobalMap(
-            trajectory=refined.trajectory,
-            node_times=refined.base_times,
-            node_poses=frames,
-            node_covariances=refined.node_covariances if refined.base_nodes is None
-            else refined.node_covariances[refined.base_nodes],
-            landmark_ids=refined.landmark_ids,
-            landmarks=refined.landmarks,
-            landmark_covariances=refined.landmark_covariances,
-            landmark_hits=refined.landmark_hits,
-        )  # fmt: skip
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("the path is not refined: %s", error)
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
-    return Refined(found, refined, drawn, bases, path), findings_of(found)
+    return Refined(found, refined, drawn, path), findings_of(found)
 
 
 def findings_of(r: Refinement) -> list[Finding]:

@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.plan_view import plan_path, plan_pose
-from graphslam.core.poses import SE3, group_of
+from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -365,21 +365,31 @@ def truth_metrics_in_space(
     """
     i, j = match_ids(solution.submap_keys, truth.keys)
     nodes = solution.exit_nodes[i]
-    e = SE3.log(SE3.between(solution.poses[nodes], truth.exit_poses[j]))
-    out.add("pose_rmse", rms(e[:, BLOCKS["position"]]), "m", "lower")
-    out.add("heading_rmse", np.rad2deg(rms(e[:, BLOCKS["heading"]])), "deg", "lower")
-    out.add("level_rmse", np.rad2deg(rms(e[:, BLOCKS["level"]])), "deg", "lower")
+    P = solution.joint_marginal([f"x{n}" for n in nodes])
+    end_metrics(out, solution.poses[nodes], P, truth.exit_poses[j], solution.trajectory(covariances=False), path)
+
+
+def end_metrics(
+    out: Metrics, poses: Array, P: Array, true_poses: Array, estimate: Trajectory, path: Trajectory | None
+) -> None:
+    """RMSE and NEES of the ends of submaps ``(m, 7|3)`` with joint covariance ``P`` ``(m d, m d)``, and of a path."""
+    g = group_of(poses)
+    blocks = BLOCKS if g.dim == 3 else {"position": g.position, "heading": slice(2, 3)}
+    e = g.log(g.between(poses, true_poses))
+    out.add("pose_rmse", rms(e[:, blocks["position"]]), "m", "lower")
+    out.add("heading_rmse", np.rad2deg(rms(e[:, blocks["heading"]])), "deg", "lower")
+    if "level" in blocks:
+        out.add("level_rmse", np.rad2deg(rms(e[:, blocks["level"]])), "deg", "lower")
     if path is not None and len(path) >= 3:
         for name, alignment in (("path_rmse", "none"), ("path_rmse_aligned", "se")):
-            whole = ate(solution.trajectory(covariances=False), path, alignment=alignment)  # type: ignore[arg-type]
+            whole = ate(estimate, path, alignment=alignment)  # type: ignore[arg-type]
             out.add(name, whole.statistics.rmse, "m", "lower")
             out.add(name.replace("rmse", "max"), whole.statistics.maximum, "m", "lower")
-    P = solution.joint_marginal([f"x{n}" for n in nodes])
     nees = float(e.ravel() @ np.linalg.solve(P, e.ravel()))
     add_nees(out, "nees", nees, e.size)
-    k = np.arange(len(nodes))
-    marginals = P.reshape(len(k), 6, len(k), 6)[k, :, k, :]
-    for name, block in BLOCKS.items():
+    k = np.arange(len(poses))
+    marginals = P.reshape(len(k), g.dof, len(k), g.dof)[k, :, k, :]
+    for name, block in blocks.items():
         d = e[:, block]
         each = np.einsum("ki,kij,kj->k", d, np.linalg.inv(marginals[:, block, block]), d)
         out.add(f"anees_{name}_per_dof", float(np.mean(each)) / d.shape[1], "", "one")

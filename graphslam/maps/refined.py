@@ -129,6 +129,18 @@ def base_frames(m: GlobalMap) -> Array:
     return level(bases) if np.all(lean < MOST_TILT) else bases
 
 
+def map_of_frames(m: GlobalMap) -> GlobalMap:
+    """The refined map with the frames of the refined submaps as its only nodes: each submap is one piece."""
+    rows = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
+    return replace(
+        m,
+        node_times=m.node_times[rows],
+        node_poses=base_frames(m),
+        node_covariances=m.node_covariances[rows],
+        base_nodes=None,
+    )
+
+
 MOST_TILT = 0.1
 """Bases that lean by more are not meant to stand level [rad]."""
 

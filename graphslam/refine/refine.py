@@ -21,8 +21,8 @@ from graphslam.core.poses import group_of
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import ACCEPTED, find_guides
 from graphslam.refine.motion import MotionModel
-from graphslam.refine.scans import Scans
 from graphslam.refine.problem import Problem, Solved, States, point_information
+from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 
 log = logging.getLogger(__name__)

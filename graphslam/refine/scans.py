@@ -16,8 +16,8 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam.frontends.odometry.recorded import RecordedErrors
 from graphslam.frontends.odometry.reckoned import Reckoned
+from graphslam.frontends.odometry.recorded import RecordedErrors
 from graphslam.frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"

@@ -14,6 +14,7 @@ from typing import Any
 
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.maps.run_map import MapConfig
+from graphslam.refine.config import RefineConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +33,8 @@ class RunConfig:
     """Headings of compasses."""
     beacons: BeaconOptions = dataclasses.field(default_factory=BeaconOptions)
     """Distances to beacons."""
+    refine: RefineConfig = dataclasses.field(default_factory=RefineConfig)
+    """The path refined by its scans, of front ends that work on scans."""
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
     """The fused map."""
 

@@ -47,7 +47,7 @@ from graphslam.evaluate.without_truth import ClassConsistency
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
-from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
+from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_submaps, write_truth
 from graphslam.io.tum import read_tum, write_tum
 from graphslam.maps.global_map import GlobalMap
 
@@ -59,7 +59,19 @@ OF_THE_CLOCK = ("seconds", RESUMED)
 SAME_BYTES = (
     *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
+    *(
+        "scans.npz",
+        "trajectory_graph.tum",
+        "refined/*",
+        "gps_*.npz",
+        "fixes.npz",
+        "taken.npz",
+        "inputs/*",
+        "fused_map.json",
+        "map.ply",
+        "map.bt",
+        "cloud.ply",
+    ),
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
 )
@@ -68,6 +80,10 @@ runs of one configuration. The others hold times (``timings.json``, and the part
 were drawn on the way (``figures/progress.png``)."""
 _MADE_OF_MAP = ("map.grid.npz", "map.kml", "map.geojson", "clearest*", "alternatives/*", "*.kml", "*.geojson")
 """What other verbs made of a map, which stays where the map does."""
+
+
+REFINED = "refined"
+"""Folder of a run in which the submaps along the refined path lie."""
 
 
 def write_outputs(folder: Path, run: Run) -> Run:
@@ -109,6 +125,10 @@ def _write_files(new: Generation, run: Run) -> None:
     for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):
         if path is not None:
             write_tum(root / name, path)
+    if run.refined is not None:
+        write_tum(root / "trajectory_graph.tum", run.refined.graph_path)
+        if run.refined.submaps:
+            write_submaps(root / REFINED, run.refined.submaps)
     for name, r in run.gps.items():
         arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
         write_npz(root / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays, **mark})

@@ -29,6 +29,7 @@ from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
+from graphslam.backend.refining import refine_run
 from graphslam.backend.streams import ImuPart, beacons_of, compasses_of, imus_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
@@ -55,8 +56,10 @@ from graphslam.evaluate.metrics import (
     truth_path,
 )
 from graphslam.evaluate.reckoning import dead_reckoning
+from graphslam.evaluate.refined import heading_error, refined_truth_metrics, refinement_metrics, upright_truth
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
+from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.formats import load_npz
 from graphslam.frontends.base import FrontEnd
 from graphslam.io.catalog import load
@@ -64,7 +67,9 @@ from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
 from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
+from graphslam.refine.scans import Scans
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -171,7 +176,9 @@ def _made(
     submaps, work = front_to_back(log, front, back, tree, folder, drops, grids)
     if not submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
-    taken = take(log, drops.counts, reference_identities(log, front), noticed)
+    steps = front.steps(log) if settings.refine.use else None
+    scans = None if steps is None else Scans.of(steps)
+    taken = take(log, drops.counts, reference_identities(log, front), noticed, scans)
     result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
     return replace(result, log=log)
 
@@ -285,6 +292,7 @@ def effective_config(
         "imu": as_dict(settings.imu),
         "compass": as_dict(settings.compass),
         "beacons": as_dict(settings.beacons),
+        "refine": as_dict(settings.refine),
         "map": as_dict(settings.map),
     }
 
@@ -309,6 +317,20 @@ def _judge(
     solution_metrics(out, solution, len(global_map.landmarks))
     imu_metrics(out, back.graph, drops)
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
+    clock, graph_path = time.perf_counter(), global_map.trajectory
+    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=bool(back.graph.gps.segments))
+    if refined is not None:
+        global_map = refined.map
+        seconds["refine"] = time.perf_counter() - clock
+        seconds["total"] += seconds["refine"]
+        refinement_metrics(out, refined.refinement)
+        if fused is not None and refined.submaps:
+            before, (fused, why_not) = (
+                fused,
+                _fused_map(refined.submaps, map_of_frames(refined.map), settings.map, effective),
+            )
+            if fused is not None:
+                out.add("map_entropy_graph", before.fused.entropy(), f"nat {'m³' if before.fused.dim == 3 else 'm²'}")
     if fused is not None:
         for row in fused.metrics():
             out.add(*row)
@@ -329,7 +351,16 @@ def _judge(
     checks = check_without_truth(out, back.graph, identified, global_map.base_poses, gps, settings)
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
-        if back.graph.dim == 2:
+        if refined is not None:
+            base = true_first_base(log, submaps[0])
+            truth, true_path = upright_truth(truth, true_path, np.array(base))
+            refined_truth_metrics(out, global_map, refined.refinement, submaps, truth, path=true_path)
+            if true_path is not None and len(true_path) >= 3:
+                out.add("path_rmse_aligned_graph", ate(graph_path, true_path).statistics.rmse, "m")
+                out.add(
+                    "path_heading_rmse", np.rad2deg(heading_error(global_map.trajectory, true_path)), "deg", "lower"
+                )
+        elif back.graph.dim == 2:
             truth_metrics(out, solution, truth, identities=known, path=true_path)
         else:
             truth_metrics_in_space(out, solution, truth, path=true_path)
@@ -366,7 +397,7 @@ def _judge(
     reports = [s.report for s in submaps]
     seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
     report["verdict"] = verdict_json(
-        [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *verdict(figures)]
+        [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
     )
     return Run(
         name=log.name,
@@ -386,6 +417,7 @@ def _judge(
         graph=back.graph,
         checks=checks,
         fused=fused,
+        refined=refined,
     )
 
 

@@ -11,13 +11,14 @@ from graphslam.app.hypotheses import Clearest, clearest_of_choices, clearest_of_
 from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import REFINED, open_run
 from graphslam.app.run.run import Run
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps
+from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
 
 
@@ -125,7 +126,9 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     """
     run = open_run(path)
     root = Path(path)
-    submaps = read_submaps(root, load_grid=load_npz)
+    refined = outputs(root) / REFINED
+    frames = map_of_frames(run.map) if refined.is_dir() else run.map
+    submaps = read_submaps(refined if refined.is_dir() else root, load_grid=load_npz)
     if not has_maps(submaps):
         raise MissingDataError(
             f"{root}: the run has no evidence grids or clouds to make a map of",
@@ -135,5 +138,5 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
     config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")
-    made = make_run_map(submaps, run.map, reach=sensor_reach(values), config=config)
+    made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
     return replace(run, submaps=submaps, fused=made), made

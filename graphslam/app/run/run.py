@@ -24,6 +24,7 @@ from graphslam.maps.global_map import GlobalMap
 if TYPE_CHECKING:
     from graphslam.app.run.taken import Taken
     from graphslam.app.run.without_truth import WithoutTruth
+    from graphslam.backend.refining import Refined
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
@@ -66,6 +67,8 @@ class Run:
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
         Fused evidence grid of submaps that have grids. For a run read back from disk: ``remake_map.map_of_folder``.
+    refined : Refined or None
+        The path refined by its scans, and the path of the graph where that began; None for a run read back from disk.
 
     Examples
     --------
@@ -93,6 +96,7 @@ class Run:
     graph: PoseGraph | None = None
     checks: WithoutTruth | None = None
     fused: RunMap | None = None
+    refined: Refined | None = None
 
     def metric(self, key: str) -> float:
         """Value of one metric.

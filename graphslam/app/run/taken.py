@@ -32,9 +32,11 @@ from graphslam.core.records import (
 )
 from graphslam.evaluate.stream_checks import Noticed
 from graphslam.io.log_store import INDEX_NAME, load_log, save_log
+from graphslam.refine.scans import Scans
 
 TAKEN_FORMAT = "graphslam.taken/1"
 INPUTS = "inputs"
+SCANS = "scans.npz"
 KEPT = (Compass, Gps, Imu, LandmarkObservations, Odometry, SteeringControls, VelocityControls)
 
 
@@ -69,11 +71,14 @@ class Taken:
         Of the log's observations of landmarks, by a reference that the run never saw (−1 = none).
     noticed : tuple of Noticed
         What was seen in its streams before the run.
+    scans : Scans or None
+        What a refinement of the path reads; None where there is none.
     """
 
     log: SensorLog
     identities: npt.NDArray[np.int64] | None = None
     noticed: tuple[Noticed, ...] = ()
+    scans: Scans | None = None
 
 
 def take(
@@ -81,12 +86,13 @@ def take(
     dropped: Mapping[str, int],
     identities: npt.NDArray[np.int64] | None,
     noticed: Sequence[Noticed] = (),
+    scans: Scans | None = None,
 ) -> Taken:
     """What is kept of a log; ``dropped`` counts what its front end dropped."""
     streams: dict[str, Any] = {n: s if isinstance(s, KEPT) else Stamps(s.times) for n, s in log.streams.items()}
     read = dict(log.read) or {k: len(s.times) for k, s in log.streams.items()}
     return Taken(
-        replace(log, streams=streams, read=read, dropped={**log.dropped, **dropped}), identities, tuple(noticed)
+        replace(log, streams=streams, read=read, dropped={**log.dropped, **dropped}), identities, tuple(noticed), scans
     )
 
 
@@ -109,6 +115,8 @@ def write_taken(folder: Path, taken: Taken, generation: str) -> None:
     if taken.identities is not None:
         arrays["identities"] = taken.identities
     write_npz(folder / "taken.npz", arrays)
+    if taken.scans is not None:
+        taken.scans.save(folder / SCANS)
 
 
 def read_taken(folder: Path) -> tuple[Taken, str | None]:
@@ -136,4 +144,5 @@ def read_taken(folder: Path) -> tuple[Taken, str | None]:
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"stream or array {error} is missing", where=str(folder / "taken.npz")) from None
     noticed = tuple(Noticed(stream, finding) for stream, finding in rows if finding is not None)
-    return Taken(replace(log, streams=streams), a.get("identities"), noticed), generation_of(a)
+    scans = Scans.load(folder / SCANS, log.name) if (folder / SCANS).is_file() else None
+    return Taken(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)
