@@ -27,6 +27,8 @@ POSITION, ANGLE = 0.15, 0.015
 """σ of the start's relative pose of two passes [m], [rad]: what brings scans within the capture of the first round."""
 DOUBT = 4.0
 """Factor on the covariance of a path that scans of neighbours alone hold together."""
+FAR = 1.0, 0.1
+"""A guide that the refined path contradicts by more is a wrong loop of the start [m], [rad]."""
 ACCEPTED = 16.8
 """χ² of six degrees of freedom at 99 %: beyond it a guide contradicts the scans between."""
 
@@ -66,6 +68,17 @@ class Guides:
         a, b = self.steps.T
         e = g.log(g.between(self.poses, g.between(path[a], path[b])))
         return np.asarray(np.sum((e / _sigmas(g)) ** 2, axis=1))
+
+    def far(self, path: Array) -> Flags:
+        """Which are wrong by more than a path is ever bent within what it knows: more than a scan could bridge."""
+        g = group_of(path)
+        a, b = self.steps.T
+        e = g.log(g.between(self.poses, g.between(path[a], path[b])))
+        turn = np.delete(e, np.r_[g.position], axis=1)
+        return np.asarray(
+            (np.linalg.norm(e[:, g.position], axis=1) > FAR[0]) | (np.linalg.norm(turn, axis=1) > FAR[1]),
+            dtype=np.bool_,
+        )
 
     def distances(self, path: Array, solved: Solved, width: int) -> Array:
         """Mahalanobis distances ``(m,)``, squared, of the guides from a path whose covariance is known.

@@ -134,8 +134,8 @@ def plane_blocks(
     information : (k,)
         Of each residual, weights included.
     slots : (first, offset, rank)
-        ``first[n]`` is where the diagonal block of step n begins in ``H``, ``offset[k]`` where the block of the two steps
-        of pair k does; its rows are those of the step with the lower ``rank``.
+        ``first[n]`` is where the diagonal block of step n begins in ``H``, ``offset[k]`` where the block of the two
+        steps of pair k does; its rows are those of the step with the lower ``rank``.
     H : flat
         Blocks ``(w, w)``, row-major.
     g : (n, w)

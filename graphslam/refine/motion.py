@@ -22,7 +22,7 @@ Index = npt.NDArray[np.int64]
 
 SCALE, SIDE, RISE, CLOCK, ROLL, PITCH = range(6)
 """Places of the constant states: scale of distances; direction of motion, to the side and upwards [rad]; clock of the
-motion ahead of the scans [s]; gravity's constant roll and pitch [rad]. In 2-D there are the first, second and fourth."""
+motion ahead of the scans [s]; gravity's constant roll and pitch [rad]. In 2-D: the first, second and fourth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,10 +190,8 @@ class MotionModel:
         const = n + len(self.knots)
         E = np.zeros((2, self.constants))
         E[0, ROLL] = E[1, PITCH] = 1.0
-        first = Terms(
-            e[:1] / sigma, np.concatenate([-D[:1], -E[None]], axis=2) / sigma, np.array([[0, const]]), (6, self.constants),
-            "gravity",
-        )  # fmt: skip
+        D0 = np.concatenate([-D[:1], -E[None]], axis=2) / sigma
+        first = Terms(e[:1] / sigma, D0, np.array([[0, const]]), (6, self.constants), "gravity")
         J = (
             np.concatenate([phi[:, None, None] * D[:-1], -D[1:], -(1.0 - phi)[:, None, None] * E[None]], axis=2)
             / new[:, None, None]

@@ -19,7 +19,7 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.guides import ACCEPTED, find_guides
+from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel
 from graphslam.refine.problem import Problem, Solved, States, point_information
 from graphslam.refine.scans import Scans
@@ -180,10 +180,10 @@ class _Work:
             self.round(distance, sigma, passes=False, again=True)
         while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
             self.round(*NEAR[-1], passes=False, again=False)
-        refused = self.follow_guides()
+        guides, taken = self.follow_guides()
         for k, distance in enumerate(self.config.distances):
             self.round(distance, None, passes=True, again=k < KEPT)
-        return self.result(refused)
+        return self.result(guides.steps[~taken & guides.far(self.poses)])
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool) -> None:
         """Associate anew, and two Gauss–Newton steps; without a σ it comes from the spread of the residuals."""
@@ -215,12 +215,11 @@ class _Work:
         self.poses, self.states = self.problem.moved(self.poses, self.states, step)
         return solved
 
-    def follow_guides(self) -> Index:
-        """Bring passes together as the start has them where the scans between allow it; those that they do not."""
+    def follow_guides(self) -> tuple[Guides, npt.NDArray[np.bool_]]:
+        """Bring passes together as the start has them where the scans between allow it; which of the guides they do."""
         guides = find_guides(self.cloud, self.start, 0.5 * self.config.reach)
-        none = np.zeros((0, 2), np.int64)
         if not len(guides):
-            return none
+            return guides, np.zeros(0, bool)
         assert self.surfaces is not None
         r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
         information = point_information(self.pairs, r, NEAR[-1][1])
@@ -235,9 +234,8 @@ class _Work:
             if np.array_equal(fits, taken):
                 break
             taken = fits
-        away = ~taken
-        self.tell(f"{len(guides)} guides, {int(away.sum())} of them contradict the scans between")
-        return guides.steps[away]
+        self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
+        return guides, taken
 
     def agreement(self, poses: Array) -> float:
         """Share of the source points with a surface within reach that lie on it, to three times the final σ.

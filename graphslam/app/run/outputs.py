@@ -59,19 +59,8 @@ OF_THE_CLOCK = ("seconds", RESUMED)
 SAME_BYTES = (
     *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *(
-        "scans.npz",
-        "trajectory_graph.tum",
-        "refined/*",
-        "gps_*.npz",
-        "fixes.npz",
-        "taken.npz",
-        "inputs/*",
-        "fused_map.json",
-        "map.ply",
-        "map.bt",
-        "cloud.ply",
-    ),
+    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
+    *("scans.npz", "trajectory_graph.tum", "refined/*"),
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
 )

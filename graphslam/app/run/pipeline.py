@@ -318,7 +318,8 @@ def _judge(
     imu_metrics(out, back.graph, drops)
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     clock, graph_path = time.perf_counter(), global_map.trajectory
-    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=bool(back.graph.gps.segments))
+    with_gps = solution.T_gps_world is not None
+    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=with_gps)
     if refined is not None:
         global_map = refined.map
         seconds["refine"] = time.perf_counter() - clock
