@@ -230,6 +230,24 @@ def se3_right_jacobian(xi: ArrayLike) -> Array:
     return out
 
 
+def roll_pitch(poses: Array) -> tuple[Array, Array]:
+    """Roll and pitch ``(n, 2)`` [rad] and their derivatives by the right tangent ``(n, 2, 6)``."""
+    up = quat_to_matrix(poses[:, 3:])[:, 2, :]  # e_z of the world in the body
+    x, y, z = up.T
+    roll, pitch = np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))
+    # R Exp(w): up moves by up × w
+    n = len(poses)
+    U = np.zeros((n, 3, 3))
+    U[:, 0, 1], U[:, 0, 2] = -z, y
+    U[:, 1, 0], U[:, 1, 2] = z, -x
+    U[:, 2, 0], U[:, 2, 1] = -y, x
+    D = np.zeros((n, 2, 6))
+    flat = np.maximum(y**2 + z**2, 1e-12)
+    D[:, 0, :3] = (z[:, None] * U[:, 1] - y[:, None] * U[:, 2]) / flat[:, None]
+    D[:, 1, :3] = -U[:, 0] / np.sqrt(np.maximum(1.0 - x**2, 1e-12))[:, None]
+    return np.column_stack([roll, pitch]), D
+
+
 def pose_to_matrix(T: ArrayLike) -> Array:
     """Poses ``(..., 7)`` → homogeneous matrices ``(..., 4, 4)``."""
     p = np.asarray(T, dtype=np.float64)

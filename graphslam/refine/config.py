@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.refine.surfaces import SurfaceConfig
+from graphslam.registration.surfaces import SurfaceConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

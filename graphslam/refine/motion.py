@@ -182,7 +182,7 @@ class MotionModel:
         """
         steps, n = self.steps, len(self.steps)
         assert steps.tilt is not None
-        seen, D = tilt_of(poses)
+        seen, D = se3.roll_pitch(poses)
         e = steps.tilt - seen - states[1][[ROLL, PITCH]]
         sigma = max(steps.tilt_sigma, 1e-5)
         phi = np.exp(-self.dt / max(steps.tilt_time, 1e-6))
@@ -222,21 +222,3 @@ class MotionModel:
 
 HELD = 1e-5
 """σ of the gauge [m, rad]: far below what anything else says."""
-
-
-def tilt_of(poses: Array) -> tuple[Array, Array]:
-    """Roll and pitch ``(n, 2)`` [rad] and their derivatives by the right tangent ``(n, 2, 6)``."""
-    up = se3.quat_to_matrix(poses[:, 3:])[:, 2, :]  # e_z of the world in the body
-    x, y, z = up.T
-    roll, pitch = np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))
-    # R Exp(w): up moves by up × w
-    n = len(poses)
-    U = np.zeros((n, 3, 3))
-    U[:, 0, 1], U[:, 0, 2] = -z, y
-    U[:, 1, 0], U[:, 1, 2] = z, -x
-    U[:, 2, 0], U[:, 2, 1] = -y, x
-    D = np.zeros((n, 2, 6))
-    flat = np.maximum(y**2 + z**2, 1e-12)
-    D[:, 0, :3] = (z[:, None] * U[:, 1] - y[:, None] * U[:, 2]) / flat[:, None]
-    D[:, 1, :3] = -U[:, 0] / np.sqrt(np.maximum(1.0 - x**2, 1e-12))[:, None]
-    return np.column_stack([roll, pitch]), D

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
-from graphslam.refine.kernels import Pairs, plane_blocks, plane_residuals
 from graphslam.refine.motion import MotionModel, Terms
-from graphslam.refine.surfaces import Cloud, Surfaces, rotations
+from graphslam.refine.surfaces import Cloud, Surfaces
+from graphslam.registration.plane_kernels import Pairs, plane_blocks, plane_residuals
+from graphslam.registration.surfaces import rotations
 
 Index = npt.NDArray[np.int64]
 States = tuple[Array, Array]

@@ -16,8 +16,7 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam.frontends.odometry.reckoned import Reckoned
-from graphslam.frontends.odometry.recorded import RecordedErrors
+from graphslam.frontends.odometry.lasting import LastingSigmas, lasting_sigmas
 from graphslam.frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"
@@ -33,28 +32,6 @@ FIELDS: dict[str, Field] = {
     "tilt": floats("n", "t", optional=True),
 }
 """``scalars``: max_range, tilt_sigma, tilt_time, then the lasting errors in their order."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LastingSigmas:
-    """Prior σ of the errors that outlive a step."""
-
-    yaw_bias: float
-    """Of the yaw rate [rad/s]."""
-    yaw_walk: float
-    """Its walk [rad/s/√s]."""
-    scale: float
-    """Share of the distance."""
-    direction: float
-    """Between the way in which the odometry says the body moves, and that in which the scanner sees it move [rad]."""
-    clock: float
-    """Between the clocks of motion and scans [s]."""
-    tilt: float
-    """Constant part of gravity's roll and pitch [rad]."""
-
-
-LEAST = LastingSigmas(yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3)
-"""What no robot is known better to than from its own scans: consumer gyros, wheels under load, brackets, clocks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +74,8 @@ class Scans:
 
     @classmethod
     def of(cls, steps: Steps) -> Scans:
-        """Those of steps, with σ of the lasting errors that their motion states, never less than :data:`LEAST`."""
+        """Those of steps, with σ of the lasting errors that their motion states, never less
+        than :data:`~graphslam.frontends.odometry.lasting.LEAST`."""
         return cls(
             times=steps.times,
             odometry=steps.odometry,
@@ -192,22 +170,3 @@ class Scans:
             )
         except (DataError, GeometryError) as error:
             raise FormatError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None
-
-
-def lasting_sigmas(steps: Steps) -> LastingSigmas:
-    """Prior σ of the lasting errors of steps: those that their motion states, never less than :data:`LEAST`."""
-    e, least = steps.errors, LEAST
-    bias, walk, scale, tilt = 0.0, 0.0, 0.0, steps.tilt_sigma
-    if isinstance(e, Reckoned):
-        bias, walk, scale = e.lasting.gyro_bias, e.lasting.gyro_walk, e.lasting.wheel_scale
-        tilt = e.lasting.attitude_bias
-    elif isinstance(e, RecordedErrors):
-        bias, scale = e.yaw_bias, e.scale
-    return LastingSigmas(
-        yaw_bias=max(bias, least.yaw_bias),
-        yaw_walk=max(walk, least.yaw_walk),
-        scale=max(scale, least.scale),
-        direction=least.direction,
-        clock=least.clock,
-        tilt=max(tilt, least.tilt),
-    )

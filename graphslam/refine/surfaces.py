@@ -8,18 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from graphslam.core.geometry import Array, rotation2
-from graphslam.core.se3 import quat_to_matrix
-from graphslam.refine.kernels import Pairs, fit_surfaces
+from graphslam.core.geometry import Array
 from graphslam.refine.scans import Scans
+from graphslam.registration.plane_kernels import Pairs
+from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations, thin_places
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-
-
-def rotations(poses: Array) -> Array:
-    """Rotation matrices ``(n, d, d)`` of poses ``(n, 7|3)``."""
-    return quat_to_matrix(poses[:, 3:]) if poses.shape[1] == 7 else rotation2(poses[:, 2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,24 +90,6 @@ class Surfaces:
     stands: Index
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SurfaceConfig:
-    """What counts as a surface."""
-
-    radius: float = 0.8
-    """Of neighbourhoods [m]."""
-    spacing: float = 0.1
-    """Points of one chunk nearer together than this are one place [m]."""
-    neighbours: int = 12
-    """Places that a surface is fitted to at most."""
-    thickness: float = 0.06
-    """Greatest RMS distance from the plane [m]."""
-    flatness: float = 0.15
-    """Greatest ratio of the smallest eigenvalue to the middle one (in 2-D: to the greatest)."""
-    extent: float = 0.045
-    """Least RMS extent along the middle axis [m]."""
-
-
 def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:
     """Surfaces of all places among those of their own and the two neighbouring chunks, at a path.
 
@@ -124,39 +101,12 @@ def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces
     q, d = W.shape
     normals, flat = np.zeros((q, d)), np.zeros(q, bool)
     stands = np.arange(q)
-    places = [_places(W, cloud.rows[c], cloud.rows[c + 1], config.spacing, stands) for c in range(cloud.chunks)]
+    places = [thin_places(W, cloud.rows[c], cloud.rows[c + 1], config.spacing, stands) for c in range(cloud.chunks)]
     for c, own in enumerate(places):
         if not len(own):
             continue
-        near = np.concatenate(places[max(c - 1, 0) : c + 2])
-        k = min(config.neighbours, len(near))
-        _, at = cKDTree(W[near]).query(W[own], k=k, distance_upper_bound=config.radius)
-        at = at.reshape(len(own), k).astype(np.int64)
-        rows = np.append(near, -1)[at]
-        n, w = np.zeros((len(own), d)), np.zeros((len(own), 3))
-        fit_surfaces(W, rows, 2 * d, n, w)
-        middle = w[:, 1 if d == 3 else 2]
-        with np.errstate(invalid="ignore"):
-            good = (w[:, 0] <= config.thickness**2) & (middle >= config.extent**2)
-            good &= w[:, 0] <= config.flatness * middle
-        n[np.einsum("ki,ki->k", n, O[own] - W[own]) < 0] *= -1.0
-        normals[own], flat[own] = n, good
+        normals[own], flat[own] = fit_places(W, O, own, np.concatenate(places[max(c - 1, 0) : c + 2]), config)
     return Surfaces(np.einsum("kji,kj->ki", rotations(poses)[cloud.step], normals), flat, stands)
-
-
-def _places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Index:
-    """Rows of the points ``a:b`` that stand for themselves; enters into ``stands`` who stands for the others."""
-    if a == b:
-        return np.zeros(0, np.int64)
-    cell = np.floor(W[a:b] / spacing).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    key = cell[:, 0]
-    for k in range(1, cell.shape[1]):
-        key = key * size[k] + cell[:, k]
-    _, first, back = np.unique(key, return_index=True, return_inverse=True)
-    stands[a:b] = a + first[back]
-    return np.sort(a + first)
 
 
 @dataclass(frozen=True, slots=True)

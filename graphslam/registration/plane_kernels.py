@@ -1,4 +1,4 @@
-"""Numba kernels of the refinement: surface directions, point-to-plane residuals and their blocks. Plain arrays only."""
+"""Numba kernels of points on planes: surface directions, residuals and their blocks. Plain arrays only."""
 
 from __future__ import annotations
 
