@@ -7,8 +7,8 @@ Which graphs there are is said in :mod:`graphslam.backend.hypotheses`, how they 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,24 +25,32 @@ from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
+from graphslam.backend.refining import Refined, refine_run
 from graphslam.backend.streams import ImuPart, imus_of
 from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, RunFolderError
+from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.evidence.formats import load_npz
 from graphslam.frontends.segslam.front_end import SegSlam
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.log_digest import log_digest
+from graphslam.io.submap_store import read_submaps
 from graphslam.io.tum import write_tum
 from graphslam.loops.candidates import FRONT_END
 from graphslam.loops.ledger import ledger_of_events
 from graphslam.maps.alternatives import Alternative, Choice, choose
 from graphslam.maps.export import save_maps
+from graphslam.maps.global_map import make_map
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
-from graphslam.maps.run_map import REACH_MARGIN, RunMap, solved_poses
+from graphslam.maps.refined import map_of_frames
+from graphslam.maps.run_map import REACH_MARGIN, MapConfig, RunMap, make_run_map, solved_poses
+from graphslam.refine.config import RefineConfig
 
 logger = logging.getLogger(__name__)
 MOST = 16
@@ -59,10 +67,19 @@ class Clearest:
         The chosen one first.
     left_out : int
         Alternatives that were not solved.
+    refined : Refined or None
+        The chosen one refined by its scans; None where the run is not, or where that was refused.
+    refined_map : RunMap or None
+        Its fused map.
+    findings : list of Finding
+        What the refinement says of it.
     """
 
     choice: Choice
     left_out: int
+    refined: Refined | None = None
+    refined_map: RunMap | None = None
+    findings: list[Finding] = field(default_factory=list)
 
 
 def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Clearest:
@@ -77,7 +94,7 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
     run : Run
         Read back with its grids (`remake_map.map_of_folder`).
     made : RunMap
-        Its fused map.
+        Its fused map. Of a refined run the graphs are judged by the maps that they have before the refinement.
     progress : bool
         Show a progress bar.
 
@@ -87,6 +104,9 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         The graph of the run held GPS or an IMU, whose records are not in its folder: an older version wrote it.
     """
     config, streams = _graph_options(run)
+    if run.folder is not None and any(s.report.get("refined") for s in run.submaps):
+        run = replace(run, submaps=read_submaps(run.folder, load_grid=load_npz))
+        made = make_run_map(run.submaps, run.map, reach=sensor_reach(read_options(run.folder)))
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
     decided = [d for d in ledger if d.verdict == "accepted" and d.source == FRONT_END and d.T_ij]
@@ -106,7 +126,7 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         facts = {"matches": len(chosen) - taken, "loops": taken}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
     choice = choose(alternatives, model=made.fused.grid.model, progress=progress)
-    return Clearest(choice, len(every) - len(choices))
+    return _refined(run, Clearest(choice, len(every) - len(choices)), run.submaps)
 
 
 def clearest_of_topologies(
@@ -167,7 +187,28 @@ def clearest_of_topologies(
         progress=progress,
     )
     model = next(iter(told[0].grids.values())).model
-    return Clearest(choose(alternatives, model=model, progress=progress), left_out)
+    found = Clearest(choose(alternatives, model=model, progress=progress), left_out)
+    return _refined(run, found, told[found.choice.best.number].submaps)
+
+
+def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
+    """The chosen alternative refined by the scans of the run, where the run is refined; all are judged without that."""
+    if run.folder is None:
+        return found
+    values = read_options(run.folder)
+    config: RefineConfig = build(RefineConfig, values.get("refine", {}), "refine")
+    taken, generation = consistent(run.folder, read_taken) if config.use else (None, None)
+    if taken is None or taken.scans is None:
+        return found
+    check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
+    solution = found.choice.best.alternative.solution
+    solved = make_map(solution, list(submaps), {}, 1)
+    refined, said = refine_run(config, taken.scans, submaps, solved, gps=solution.T_gps_world is not None)
+    if refined is None or not refined.submaps:
+        return replace(found, refined=refined, findings=said)
+    options: MapConfig = build(MapConfig, values.get("map", {}), "map")
+    made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=sensor_reach(values), config=options)
+    return replace(found, refined=refined, refined_map=made, findings=said)
 
 
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
@@ -197,8 +238,9 @@ def write_clearest(
 ) -> list[Path]:
     """Keep the alternatives in a run folder.
 
-    The chosen map and its path are ``clearest.ply``, ``clearest.tum`` and so on; of every alternative
-    ``alternatives/NN.tum`` has the path and ``NN.g2o`` the graph, in the order of ``clearest.json``.
+    The chosen map and its path are ``clearest.ply``, ``clearest.tum`` and so on, refined by the scans where that was
+    done; of every alternative ``alternatives/NN.tum`` has the path of its graph and ``NN.g2o`` the graph, in the order
+    of ``clearest.json``.
 
     Parameters
     ----------
@@ -207,8 +249,9 @@ def write_clearest(
     bands : mapping, optional
         Heights of floor plans [m].
     """
-    choice = found.choice
-    made = save_maps(choice.best_map.grid, folder, name="clearest", bands=bands)
+    choice, refined = found.choice, found.refined
+    drawn = choice.best_map if found.refined_map is None else found.refined_map.fused
+    made = save_maps(drawn.grid, folder, name="clearest", bands=bands)
     kept = folder / "alternatives"
     kept.mkdir(exist_ok=True)
     for old in (*kept.glob("[0-9]*.tum"), *kept.glob("[0-9]*.g2o")):
@@ -217,11 +260,15 @@ def write_clearest(
     for k, (row, j) in enumerate(zip(choice.rows(), choice.order, strict=True)):
         path = j.alternative.solution.trajectory(covariances=False)
         if k == 0:
-            write_tum(folder / "clearest.tum", path)
+            write_tum(folder / "clearest.tum", path if refined is None else refined.map.trajectory)
         files = [f"alternatives/{k:02d}.tum", f"alternatives/{k:02d}.g2o"]
         write_tum(folder / files[0], path)
         write_g2o(folder / files[1], to_network(j.alternative.graph))
         table.append({**row, "files": files})
     value = {"why": choice.why(), "scale": choice.scale, "left_out": found.left_out, "candidates": table}
+    if found.refined_map is not None:
+        value["refined_entropy"] = found.refined_map.fused.entropy()
+    if found.findings:
+        value["refinement"] = [f.as_row() for f in found.findings]
     OutputFiles(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})
     return [*made, folder / "clearest.tum", folder / "clearest.json"]

@@ -14,6 +14,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.ledger import EXCLUSIVE, Ledger
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
@@ -109,6 +110,43 @@ def refine_run(
         logger.warning("the path is not refined: %s", error)
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
     return Refined(found, refined, drawn, path), findings_of(found)
+
+
+def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> tuple[Ledger, list[Finding]]:
+    """What a refined path spends: every scan with motion and gravity once; all factors of the graph were its start.
+
+    Parameters
+    ----------
+    ledger : Ledger
+        Of the graph.
+    submaps : sequence of Submap
+        That say which streams their front end used.
+    r : Refinement
+
+    Returns
+    -------
+    ledger : Ledger
+    findings : list of Finding
+        What is spent, and which streams of the graph the refined path does not hold.
+    """
+    out, entries = ledger.as_start(), ledger.entries()
+    streams = frozenset().union(*(s.uses for s in submaps))
+    out.spend(SCAN_PAIRS, "scan-pairs", streams, (float(r.times[0]), float(r.times[-1])))
+    factors = len({e.factor_id for e in entries})
+    text = (
+        f"The refined path spends {', '.join(sorted(streams)) or 'the scans'} once (scan-pairs). The {factors} factors "
+        "of the graph, its exits, matches and loops, were its start and enter no sum."
+    )
+    found = [Finding("", "refine-evidence", text)]
+    lost = sorted({e.stream.partition("/")[0] for e in entries if e.kind == EXCLUSIVE} - streams)
+    if lost:
+        text = f"The refined path does not hold {', '.join(lost)}: the graph that was its start did."
+        found.append(Finding("look", "refine-streams", text))
+    return out, found
+
+
+SCAN_PAIRS = -1
+"""Number of the refinement in a ledger of factors, which are counted from 0."""
 
 
 def findings_of(r: Refinement) -> list[Finding]:

@@ -58,6 +58,8 @@ class DenseSession:
     gps : GpsOptions
     T_gps_base : (7,) or (3,) or None
         First base in the GPS frame by the run's own graph.
+    refined : bool
+        Its submaps lie along a path refined by scans, which spent every scan: it has no ties of its own.
     """
 
     name: str
@@ -69,6 +71,7 @@ class DenseSession:
     fixes: Gps | None = None
     gps: GpsOptions = field(default_factory=GpsOptions)
     T_gps_base: Array | None = None
+    refined: bool = False
 
     @property
     def chain(self) -> Array:

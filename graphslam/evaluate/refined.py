@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
@@ -97,3 +98,15 @@ def refinement_metrics(out: Metrics, r: Refinement) -> None:
         if name in r.constants:
             out.add(f"refine_{name}", r.constants[name][0], unit)
             out.add(f"refine_{name}_sigma", r.constants[name][1], unit)
+
+
+def refinement_facts(r: Refinement) -> dict[str, Any]:
+    """What ``run.json`` holds of a refinement, JSON-serialisable: rounds, constants with σ, yaw bias by time."""
+    return {
+        "rounds": [asdict(x) for x in r.rounds],
+        "agreement": list(r.agreement),
+        "constants": {name: {"value": v, "sigma": s} for name, (v, s) in r.constants.items()},
+        "yaw_bias": r.yaw_bias.tolist(),
+        "motion_chi2_per_dof": r.motion,
+        "left_apart": r.times[r.refused].tolist() if len(r.refused) else [],
+    }

@@ -26,6 +26,7 @@ DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
     "levelled": "each base was levelled by the same gravity that the submap's exit holds",
+    "start": "where the refinement by scans began: it enters no sum of the refined path",
 }
 
 
@@ -135,6 +136,13 @@ second time: submap 0 spent it over [0.000, 10.000) s
             if e.kind == EXCLUSIVE:
                 entries = self._exclusive[e.stream]
                 del entries[bisect_left(entries, e)]
+
+    def as_start(self) -> Ledger:
+        """The same entries as those of the start of a refinement, which spends their streams anew."""
+        out = Ledger()
+        for e in self.entries():
+            out.spend(e.factor_id, e.factor, [e.stream], (e.t_start, e.t_end), "start")
+        return out
 
     def entries(self) -> list[Entry]:
         """All entries in order of time."""

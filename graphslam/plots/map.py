@@ -112,6 +112,7 @@ def plot_map(
     gps: Gps | npt.ArrayLike | None = None,
     truth: Truth | Path | None = None,
     dead_reckoning: Path | None = None,
+    before: Path | None = None,
     confidence: float = 0.95,
     pose_ellipses: int = 0,
     title: str | None = None,
@@ -133,6 +134,8 @@ def plot_map(
     truth : Truth, Trajectory or (n, ≥ 2), optional
     dead_reckoning : Trajectory or (n, ≥ 2), optional
         The path before any correction.
+    before : Trajectory or (n, ≥ 2), optional
+        The path of the graph, where a refinement began.
     confidence : float
         Of the ellipses.
     pose_ellipses : int
@@ -142,6 +145,9 @@ def plot_map(
     if dead_reckoning is not None:
         p = positions_of(dead_reckoning)
         ax.plot(p[:, 0], p[:, 1], color=style.DEAD_RECKONING, lw=1.5, ls=":", label="dead reckoning", zorder=1)
+    if before is not None:
+        p = positions_of(before)
+        ax.plot(p[:, 0], p[:, 1], color=style.GRAPH, lw=1.5, label="graph, before the refinement", zorder=2)
     if truth is not None:
         _plot_truth(ax, truth)
     if gps is not None:

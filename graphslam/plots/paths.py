@@ -14,7 +14,13 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
 from graphslam.plots.map import plot_ellipses
 
-_COLOURS = {"dead reckoning": style.DEAD_RECKONING, "RBPF": style.VERMILION, "SegSLAM": style.ESTIMATE}
+GRAPH = "graph, before the refinement"
+_COLOURS = {
+    "dead reckoning": style.DEAD_RECKONING,
+    "RBPF": style.VERMILION,
+    "SegSLAM": style.ESTIMATE,
+    GRAPH: style.GRAPH,
+}
 
 
 def position_covariances(poses: Array, covariances: Array) -> Array:
@@ -49,7 +55,7 @@ def plot_paths(
     ----------
     ax : Axes or None
     paths : mapping of label to Trajectory
-        "dead reckoning", "RBPF" and "SegSLAM" have colours of their own.
+        "dead reckoning", "RBPF", "SegSLAM" and :data:`GRAPH` have colours of their own.
     truth : Trajectory or (n, ≥ dim), optional
     ellipses : int
         Of each path that has covariances, spread over its length.
@@ -76,7 +82,7 @@ def plot_paths(
     for k, (label, path) in enumerate(paths.items()):
         colour = _COLOURS.get(label, style.colour(k))
         p = path.positions[:, ij]
-        ax.plot(p[:, 0], p[:, 1], color=colour, lw=1.5, label=label, zorder=3)
+        ax.plot(p[:, 0], p[:, 1], color=colour, lw=1.5, label=label, zorder=2.5 if label == GRAPH else 3)
         ax.plot(*p[-1], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=6, mec="white", mew=0.7, zorder=5)
         if path.covariances is None or ellipses < 1:
             continue

@@ -28,6 +28,8 @@ LANDMARK = VERMILION
 TRUTH = BLACK
 GPS = GREEN
 DEAD_RECKONING = ORANGE
+GRAPH = SKY
+"""The path of the graph, where a refinement by scans began."""
 BOUNDS = PALE
 
 # curves and bars that have no meaning of their own, in order

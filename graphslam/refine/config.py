@@ -14,7 +14,7 @@ from graphslam.registration.surfaces import SurfaceConfig
 class RefineConfig:
     """How the solved path is refined by the scans themselves."""
 
-    use: bool = False
+    use: bool = True
     """Refine the solved path of runs whose front end works on scans; false: the path of the graph is the result."""
     chunk_length: float = 3.0
     """Way over which the points of steps are searched together [m]."""

@@ -65,7 +65,7 @@ class Drive:
         part = dict(self.options)
         if frontend == "segslam":
             part |= {"segslam": SEGMENTS}
-        return {"frontend": part, "map": {"fuse": False}}
+        return {"frontend": part, "map": {"fuse": False}, "refine": {"use": False}}  # it is filters that are tried
 
 
 SEGMENTS = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import bz2
 import gzip
 import io
+import json
 import lzma
 import shutil
 from collections.abc import Callable
@@ -20,16 +21,18 @@ import numpy as np
 import scipy.io
 import scipy.sparse as sp
 
+from graphslam.app.folders.generations import outputs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.files import loops_of_run, read_merged_dense
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.config import read_toml
+from graphslam.core.geometry import se2_between
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
@@ -70,6 +73,9 @@ from graphslam.io.victoria_park_published import (
     read_slsjf_observations,
     read_ufastslam_detections,
 )
+from graphslam.maps.refined import base_frames
+from graphslam.frontends.odometry.lasting import LEAST
+from graphslam.refine.scans import Scans
 
 
 @dataclass(frozen=True)
@@ -240,8 +246,6 @@ def finished_run() -> Path:
     match = {"event": "between", "group": "match", "factor_id": 3, "i": 0, "j": 1, "target": 0, "submap": 1,
              "support": 0.5, "fitness": None}  # fmt: skip
     with open(out / "events.jsonl", "a") as stream:
-        import json
-
         for event in (
             loop.event(),
             match,
@@ -261,6 +265,64 @@ def read_run(root: Path) -> Any:
     run._repr_html_()
     source = submap_source(run)
     return run, loops_of_run(root).decisions, source
+
+
+def refined_run(root: Path) -> None:
+    """The same run as if its path had been refined by scans."""
+    run_folder(root)
+    at = outputs(root)
+    run = open_run(root)
+    frames = base_frames(run.map)
+    store = SubmapStore(at / "refined")
+    for s, a, b in zip(run.submaps, frames, frames[1:]):
+        t = np.array(s.interval)
+        pose = se2_between(a, b)
+        path = Trajectory(t, np.array([np.zeros(3), pose]), np.tile(0.01 * np.eye(3), (2, 1, 1)))
+        store.append(
+            Submap(
+                key=s.key, interval=s.interval, exit_pose=pose, exit_covariance=0.01 * np.eye(3), trajectory=path,
+                cloud=np.ones((4, 2)), uses=s.uses, report={"refined": True},
+            )
+        )  # fmt: skip
+    write_tum(at / "trajectory_graph.tum", run.map.trajectory)
+    facts = json.loads((at / "run.json").read_text())
+    turn = {"distance": 0.3, "sigma": 0.03, "pairs": 9, "passes": 4, "spread": 0.02, "moved": 0.01}
+    facts["refine"] = {
+        "rounds": [turn], "agreement": [0.7, 0.9], "constants": {"scale": {"value": 0.01, "sigma": 0.001}},
+        "yaw_bias": [[0.0, 1e-3], [30.0, 2e-3]], "left_apart": [[1.0, 9.0]], "motion_chi2_per_dof": 0.5,
+    }  # fmt: skip
+    write_json(at / "run.json", facts)
+    some_scans(at)
+
+
+def some_scans(root: Path) -> None:
+    """Beams of three steps in space."""
+    r, n = rng(), 3
+    q = np.tile([0.3, 0, 0, 0, 0, 0, 1.0], (n, 1))
+    Scans(
+        times=TIMES[:n],
+        odometry=Odometry(times=TIMES[:n], increments=q, covariances=np.tile(1e-4 * np.eye(6), (n, 1, 1))),
+        offsets=np.array([0, 4, 8, 12]),
+        points=r.normal(size=(12, 3)).astype(np.float32),
+        origins=np.zeros((12, 3), np.float32),
+        returns=np.ones(12, np.bool_),
+        max_range=8.0,
+        lasting=LEAST,
+        tilt=np.zeros((n, 2)),
+        tilt_sigma=1e-3,
+        tilt_time=5.0,
+    ).save(root / "scans.npz")
+
+
+def read_scans(root: Path) -> Any:
+    """With all that a refinement asks of them."""
+    scans = Scans.load(root / "scans.npz")
+    return scans, [scans.scan(k) for k in range(len(scans))], scans.path_length, scans.group
+
+
+def read_refined(root: Path) -> Any:
+    run = open_run(root)
+    return run, run.verdict, refined_submaps_of(run), Scans.load(outputs(root) / "scans.npz")
 
 
 def report_of_run(root: Path) -> Any:
@@ -531,6 +593,9 @@ READERS: dict[str, Reader] = {
     "log-mesh": Reader(log_with_mesh, read_log_mesh),
     "submap-store": Reader(submap_store, read_store),
     "run": Reader(run_folder, read_run, NO_FIGURE | LOOPS),
+    "refined-run": Reader(refined_run, read_refined, NO_FIGURE | LOOPS, slow=3),
+    "refined-report": Reader(refined_run, report_of_run, frozenset(), slow=100),
+    "scans": Reader(some_scans, read_scans),
     "run-report": Reader(run_folder, report_of_run, frozenset(), slow=100),
     "run-config": Reader(just_config, read_config, frozenset({"*"})),
     "merged": Reader(merged_folder, read_merged),

@@ -65,6 +65,12 @@ def make_map(
         text += f"\n\n{table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
             text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
+        if found.findings:
+            value["refinement"] = [f.as_row() for f in found.findings]
+            text += "".join(f"\nof the chosen one: {f.text}" for f in found.findings)
+        if found.refined_map is not None:
+            value["refined_entropy"] = found.refined_map.fused.entropy()
+            text += f"\nentropy of its refined map: {value['refined_entropy']:.1f}"
         text += f"\npaths and graphs of all: {run / 'alternatives'}"
         if found.left_out:
             text += f"\n{found.left_out} more were not solved"

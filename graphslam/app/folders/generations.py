@@ -39,16 +39,18 @@ GENERATIONS, CURRENT = "generations", "current"
 OWNED = (
     *("run.json", "merge.json", "metrics.json", "timings.json", "events.jsonl", "ledger.csv", "landmarks.csv"),
     *("map.npz", "merged.npz", "association.npz", "graph.g2o", "trajectory.tum", "trajectory_*.tum", "nodes.tum"),
-    *("truth.npz", "truth.tum", "dead_reckoning.tum", "gps_*.npz", "fixes.npz", "taken.npz", "inputs/*.npz"),
-    *("inputs/log.json", "fused_map.json", "map.ply", "map.bt", "cloud.ply", "map.pgm", "map.yaml"),
+    *("truth.npz", "truth.tum", "dead_reckoning.tum", "gps_*.npz", "fixes.npz", "taken.npz", "scans.npz"),
+    *("inputs/*.npz", "inputs/log.json", "fused_map.json", "map.ply", "map.bt", "cloud.ply", "map.pgm", "map.yaml"),
     *("map-*.pgm", "map-*.yaml"),
     *("map.grid.npz", "map.kml", "map.geojson", "clearest.*", "clearest-*", "alternatives/*.tum", "alternatives/*.g2o"),
-    *("report.html", "report.md", "table.csv", "timings.csv", "figures/*.png"),
+    *("report.html", "report.md", "table.csv", "timings.csv", "figures/*.png", "refined/*.npz", "refined/index.json"),
 )
 """Files that verbs write, in folders of plain files, where nothing else says which are ours."""
 NOT_OWNED = ("figures/progress.png",)
 """Written while a run goes on, and of no generation."""
-_FOLDERS = (GENERATIONS, "submaps", "trials", "figures", "inputs", "alternatives")
+_PARTS = ("figures", "alternatives", "inputs", "refined")
+"""Folders of a state."""
+_FOLDERS = (GENERATIONS, "submaps", "trials", *_PARTS)
 _READ = (*OWNED, *NOT_OWNED, *_FOLDERS, *(f"{f}/*" for f in _FOLDERS[:3]), CURRENT, "config.toml", "study.json")
 """Names, as shell patterns, that our readers follow and our writers write to."""
 _NUMBER = re.compile(r"\d{6,}")
@@ -242,7 +244,7 @@ def sweep(folder: str | os.PathLike[str]) -> None:
     for name in _numbers(home):
         if target != f"{GENERATIONS}/{name}":
             shutil.rmtree(home / GENERATIONS / name, ignore_errors=True)
-    for part in (home, home / "figures", home / "submaps", home / "alternatives", home / "inputs"):
+    for part in (home, home / "submaps", *(home / p for p in _PARTS)):
         if part.is_symlink() or not part.is_dir():
             continue
         sweep_parts(part)
@@ -268,7 +270,7 @@ def is_empty(folder: str | os.PathLike[str]) -> bool:
         elif path.name == GENERATIONS and ours and path.is_dir():
             if any(not _NUMBER.fullmatch(p.name) for p in path.iterdir()):
                 return False
-        elif path.is_dir() and not path.is_symlink() and path.name in ("figures", "alternatives", "inputs", "submaps"):
+        elif path.is_dir() and not path.is_symlink() and path.name in (*_PARTS, "submaps"):
             inside = (p for p in path.iterdir() if f"{path.name}/{p.name}" not in NOT_OWNED)
             if any(not (is_part(p.name) or (p.is_symlink() and _is_ours(home, p) and not p.exists())) for p in inside):
                 return False

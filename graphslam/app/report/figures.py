@@ -18,6 +18,7 @@ from graphslam.io.tum import read_tum
 
 CAPTIONS = {
     "map.png": "The map: path with 95 % ellipses, landmarks where there are any; truth, GPS, dead reckoning if known",
+    "refined.png": "The path of the graph and the path refined by scans: distances from the truth, or from each other",
     "side.png": "The path from the side",
     "submaps.png": "Submaps at their solved poses",
     "fused.png": "Fused evidence grid at the solved poses",

@@ -8,7 +8,7 @@ from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import folded, missing, note, section
-from graphslam.core.markup import Markup, Row, element, join, table
+from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, join, table
 
 ORDER = ("accepted", "switched-off", "undone", "rejected")
 COLUMNS = {
@@ -123,4 +123,9 @@ def hypotheses(folder: ReportFolder) -> Markup:
     }
     shown = {k: v for k, v in columns.items() if any(k in c for c in candidates)}
     why = note(join(["Why: ", str(found.get("why", "not said")), "."]))
-    return section("hypotheses", title, table(candidates, shown), why)
+    parts = [table(candidates, shown), why]
+    entropy = found.get("refined_entropy")
+    if is_figure(entropy):
+        text = "All are judged by the maps of their graphs; the chosen one was then refined by its scans: entropy "
+        parts.append(note(text, figure_text(entropy), "."))
+    return section("hypotheses", title, *parts)

@@ -11,6 +11,7 @@ from graphslam.app.report.figures import figures
 from graphslam.app.report.folder import Kind, read_folder
 from graphslam.app.report.loops import hypotheses, loops
 from graphslam.app.report.markup import note, page
+from graphslam.app.report.refinement import refinement
 from graphslam.app.report.sections import (
     events,
     evidence,
@@ -31,6 +32,7 @@ logger = logging.getLogger(__name__)
 PAGE = "report.html"
 _PARTS = {
     "figures": figures,
+    "refinement": refinement,
     "run": what_was_run,
     "records": records,
     "metrics": metrics,

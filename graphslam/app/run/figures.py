@@ -15,7 +15,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots.map import plot_map
-from graphslam.plots.paths import plot_paths
+from graphslam.plots.paths import GRAPH, plot_paths
+from graphslam.plots.refined import plot_before_after
 from graphslam.plots.save import save
 from graphslam.plots.submaps import plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
@@ -59,6 +60,7 @@ def draw_map(run: Run, ax: Any = None) -> Any:
         gps=fixes,
         truth=truth,
         dead_reckoning=None if reckoned is None else reckoned.transformed(T),
+        before=None if run.graph_path is None else run.graph_path.transformed(T),
         pose_ellipses=12,
         title=title,
     )
@@ -90,6 +92,8 @@ def _as_solved(run: Run) -> list[Submap]:
 def _draw_paths(run: Run, ax: Any, plane: str) -> Any:
     """A map in space: its path from above or from the side, with what it claims to know, truth and dead reckoning."""
     paths = {run.name: run.map.trajectory}
+    if run.graph_path is not None:
+        paths[GRAPH] = Trajectory(run.graph_path.times, run.graph_path.poses)  # its ellipses would hide the map's
     reckoned = _fitting(run.dead_reckoning, run.map.trajectory)
     if reckoned is not None and reckoned.dim == 3:
         paths["dead reckoning"] = reckoned
@@ -114,6 +118,9 @@ def save_figures(run: Run, folder: Path) -> list[Path]:
         submaps, bases = [plan_submap(s) for s in submaps], plan_pose(bases)
     chain = plot_submap_chain(None, submaps, bases, title=f"{run.name}: submaps at their solved poses")
     made.append(save(chain, folder / "submaps.png"))
+    if run.graph_path is not None:
+        ax = plot_before_after(None, run.graph_path, run.map.trajectory, truth=run.truth_path)
+        made.append(save(ax, folder / "refined.png"))
     if run.gps:
         made.append(save(plot_gps_residuals(None, dict(run.gps)), folder / "gps_residuals.png"))
     if run.checks is not None and run.checks.gps is not None:

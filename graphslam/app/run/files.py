@@ -103,6 +103,14 @@ RUN: dict[str, Any] = {
     "gps?": _PART,
     "imu?": _PART,
     "verdict?": _PART,
+    "refine?": {
+        "rounds?": [{"distance": float, "sigma": float, "pairs": int, "passes": int, "spread": float, "moved": float}],
+        "agreement?": [float],
+        "constants?": {str: {"value": float, "sigma": float}},
+        "yaw_bias?": [(float, float)],
+        "left_apart?": [(float, float)],
+        "motion_chi2_per_dof?": float,
+    },
 }
 MERGE: dict[str, Any] = {"sessions?": [_PART], "graph?": _PART}
 METRIC: dict[str, Any] = {"key": str, "value?": float, "unit?": str, "direction?": str}

@@ -40,16 +40,19 @@ from graphslam.app.run.taken import write_taken
 from graphslam.core.atomic import write_npz
 from graphslam.core.digest import Digest
 from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.without_truth import ClassConsistency
+from graphslam.evidence.formats import load_npz
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
-from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_submaps, write_truth
+from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
 from graphslam.maps.global_map import GlobalMap
+from graphslam.maps.refined import base_frames
 
 logger = logging.getLogger(__name__)
 OF_THE_CLOCK = ("seconds", RESUMED)
@@ -60,7 +63,7 @@ SAME_BYTES = (
     *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
     *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
-    *("scans.npz", "trajectory_graph.tum", "refined/*"),
+    *("scans.npz", "trajectory_graph.tum", "refined/*", "figures/refined.png"),
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
 )
@@ -73,6 +76,8 @@ _MADE_OF_MAP = ("map.grid.npz", "map.kml", "map.geojson", "clearest*", "alternat
 
 REFINED = "refined"
 """Folder of a run in which the submaps along the refined path lie."""
+SAME_FRAME = 1e-6
+"""By how much exits of the refined submaps and the nodes of the map may differ [m], [rad]."""
 
 
 def write_outputs(folder: Path, run: Run) -> Run:
@@ -111,13 +116,14 @@ def _write_files(new: Generation, run: Run) -> None:
         write_g2o(root / "graph.g2o", to_network(run.graph))
     if run.truth is not None:
         write_truth(root, run.truth)
-    for name, path in (("truth.tum", run.truth_path), ("dead_reckoning.tum", run.dead_reckoning)):
+    paths = {"truth": run.truth_path, "dead_reckoning": run.dead_reckoning, "trajectory_graph": run.graph_path}
+    for name, path in paths.items():
         if path is not None:
-            write_tum(root / name, path)
+            write_tum(root / f"{name}.tum", path)
     if run.refined is not None:
-        write_tum(root / "trajectory_graph.tum", run.refined.graph_path)
-        if run.refined.submaps:
-            write_submaps(root / REFINED, run.refined.submaps)
+        store = SubmapStore(root / REFINED)
+        for s in run.refined.submaps:
+            store.append(s)
     for name, r in run.gps.items():
         arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
         write_npz(root / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays, **mark})
@@ -280,7 +286,46 @@ def _open(home: Path, root: Path) -> Run:
         truth=read_truth(root),
         truth_path=_path(root / "truth.tum", m.dim),
         dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
+        graph_path=_path(root / "trajectory_graph.tum", m.dim),
     )
+
+
+def refined_submaps_of(run: Run) -> list[Submap]:
+    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the result.
+
+    Raises
+    ------
+    FormatError, DataError
+        The store is damaged, or not of the state that the run was read in.
+    """
+    if run.refined is not None:
+        return run.refined.submaps
+    if run.folder is None:
+        return []
+    return consistent(run.folder, lambda root: _refined_of(run, root / REFINED))
+
+
+def _refined_of(run: Run, store: Path) -> list[Submap]:
+    if not store.is_dir():
+        return []
+    submaps, where = read_submaps(store, load_grid=load_npz), str(store)
+    have, wanted = [s.key for s in submaps], [s.key for s in run.submaps]
+    if have != wanted:
+        raise FormatError("refined submaps are not those of the run", where=where, got=have[:9], wanted=wanted[:9])
+    frames = base_frames(run.map)
+    g = group_of(frames)
+    exits = g.between(frames[:-1], frames[1:])
+    if submaps[0].dim != run.map.dim:
+        raise FormatError("refined submaps are of another dimension", where=where, got=submaps[0].dim)
+    off = np.abs(g.log(g.between(exits, np.array([s.exit_pose for s in submaps]))))
+    if off.max() > SAME_FRAME:
+        raise FormatError(
+            "refined submaps do not lie along the path of map.npz: one of them was copied or changed alone",
+            where=where,
+            got=f"{off.max():.3g} m or rad apart",
+            wanted="0",
+        )
+    return submaps
 
 
 def _check_submaps(home: Path, root: Path) -> None:

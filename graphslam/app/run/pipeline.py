@@ -29,13 +29,14 @@ from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.backend.refining import refine_run
+from graphslam.backend.refining import refine_run, refined_ledger
 from graphslam.backend.streams import ImuPart, beacons_of, compasses_of, imus_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.findings import verdict_json
 from graphslam.core.json_file import check_json
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import level
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -56,7 +57,13 @@ from graphslam.evaluate.metrics import (
     truth_path,
 )
 from graphslam.evaluate.reckoning import dead_reckoning
-from graphslam.evaluate.refined import heading_error, refined_truth_metrics, refinement_metrics, upright_truth
+from graphslam.evaluate.refined import (
+    heading_error,
+    refined_truth_metrics,
+    refinement_facts,
+    refinement_metrics,
+    upright_truth,
+)
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
@@ -320,17 +327,19 @@ def _judge(
     clock, graph_path = time.perf_counter(), global_map.trajectory
     with_gps = solution.T_gps_world is not None
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=with_gps)
+    ledger = back.graph.ledger
     if refined is not None:
         global_map = refined.map
+        ledger, spent = refined_ledger(ledger, submaps, refined.refinement)
+        refining = [*refining, *spent]
         seconds["refine"] = time.perf_counter() - clock
         seconds["total"] += seconds["refine"]
         refinement_metrics(out, refined.refinement)
         if fused is not None and refined.submaps:
-            before, (fused, why_not) = (
-                fused,
-                _fused_map(refined.submaps, map_of_frames(refined.map), settings.map, effective),
-            )
-            if fused is not None:
+            before = fused
+            fused, why_not = _fused_map(refined.submaps, map_of_frames(refined.map), settings.map, effective)
+            if fused is not None:  # the open chain is that of the front end, whose exits the refinement replaced
+                fused = replace(fused, open_entropy=before.open_entropy, open_volume=before.open_volume)
                 out.add("map_entropy_graph", before.fused.entropy(), f"nat {'m³' if before.fused.dim == 3 else 'm²'}")
     if fused is not None:
         for row in fused.metrics():
@@ -347,14 +356,15 @@ def _judge(
         if back.graph.dim == 2:
             dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"
+    base = true_first_base(log, submaps[0])
     true_path = truth_path(log, global_map.trajectory.times, submaps[0])
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
     checks = check_without_truth(out, back.graph, identified, global_map.base_poses, gps, settings)
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:
-            base = true_first_base(log, submaps[0])
             truth, true_path = upright_truth(truth, true_path, np.array(base))
+            base = level(np.array(base)).tolist() if back.graph.dim == 3 else base
             refined_truth_metrics(out, global_map, refined.refinement, submaps, truth, path=true_path)
             if true_path is not None and len(true_path) >= 3:
                 out.add("path_rmse_aligned_graph", ate(graph_path, true_path).statistics.rmse, "m")
@@ -374,7 +384,7 @@ def _judge(
         "backend": effective["backend"],
         "gps": effective["gps"],
         "imu": effective["imu"],
-        "T_world_base": true_first_base(log, submaps[0]),
+        "T_world_base": base,
         "versions": versions(),
         "seconds": seconds,
         "resumed_submaps": work.resumed,
@@ -388,6 +398,8 @@ def _judge(
         "converged": solution.converged,
         "graph": graph_facts(back.graph, checks.classes),
     }
+    if refined is not None:
+        report["refine"] = refinement_facts(refined.refinement)
     if why_not:
         report["map_left_out"] = why_not
     used = frozenset().union(*(s.uses for s in submaps))
@@ -407,7 +419,7 @@ def _judge(
         metrics=metrics,
         report=report,
         events=list(back.graph.events),
-        ledger=back.graph.ledger.table(),
+        ledger=ledger.table(),
         gps=residuals,
         fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
         taken=taken,
@@ -418,6 +430,7 @@ def _judge(
         graph=back.graph,
         checks=checks,
         fused=fused,
+        graph_path=None if refined is None else refined.graph_path,
         refined=refined,
     )
 

@@ -11,7 +11,7 @@ from graphslam.app.hypotheses import Clearest, clearest_of_choices, clearest_of_
 from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
-from graphslam.app.run.outputs import REFINED, open_run
+from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, MissingDataError
@@ -126,9 +126,8 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     """
     run = open_run(path)
     root = Path(path)
-    refined = outputs(root) / REFINED
-    frames = map_of_frames(run.map) if refined.is_dir() else run.map
-    submaps = read_submaps(refined if refined.is_dir() else root, load_grid=load_npz)
+    refined = refined_submaps_of(run)
+    submaps = refined or read_submaps(root, load_grid=load_npz)
     if not has_maps(submaps):
         raise MissingDataError(
             f"{root}: the run has no evidence grids or clouds to make a map of",
@@ -138,5 +137,9 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
     config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")
+    frames = map_of_frames(run.map) if refined else run.map
     made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
+    if refined and {"map_entropy_open_chain", "map_known_volume_open_chain"} <= set(run.metrics["key"]):
+        entropy, volume = (run.metric(f"map_{what}_open_chain") for what in ("entropy", "known_volume"))
+        made = replace(made, open_entropy=entropy, open_volume=volume)  # of the front end's exits, as the run has them
     return replace(run, submaps=submaps, fused=made), made

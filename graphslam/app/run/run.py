@@ -67,8 +67,10 @@ class Run:
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
         Fused evidence grid of submaps that have grids. For a run read back from disk: ``remake_map.map_of_folder``.
+    graph_path : Trajectory or None
+        Of a refined run the path of the graph, where the refinement began; from disk without covariances.
     refined : Refined or None
-        The path refined by its scans, and the path of the graph where that began; None for a run read back from disk.
+        The path refined by its scans; None for a run read back from disk, whose ``map`` has the refined path.
 
     Examples
     --------
@@ -96,6 +98,7 @@ class Run:
     graph: PoseGraph | None = None
     checks: WithoutTruth | None = None
     fused: RunMap | None = None
+    graph_path: Trajectory | None = None
     refined: Refined | None = None
 
     def metric(self, key: str) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from graphslam.app.folders.generations import consistent
 from graphslam.app.run.files import read_options, read_report
+from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.sessions import DenseSession, InnerTie, ties_of_graph, ties_of_network
@@ -35,14 +36,14 @@ def is_dense(run: Run) -> bool:
 
 
 def with_maps(run: Run) -> list[Submap]:
-    """The submaps of a run with their dense maps, read from its folder where they are not there.
+    """The submaps of a run with their dense maps, along its refined path where it has one.
 
     Raises
     ------
     DataError
         A submap whose map is nowhere.
     """
-    submaps = list(run.submaps)
+    submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
         submaps = read_submaps(run.folder, load_grid=load_npz)
     without = [s.key for s in submaps if not has_view(s)]
@@ -71,6 +72,9 @@ def _options(run: Run, part: str, kind: Any) -> Any:
 def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.inf) -> DenseSession:
     """A run as a session of a common graph: its keys follow ``first_key``, its clock goes on ``after`` [s].
 
+    Of a refined run the chain is that of its refined submaps, and nothing else: its re-entries and loops were made of
+    the scans that the refinement spent, and enter no sum a second time.
+
     Raises
     ------
     DataError
@@ -80,11 +84,14 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     begin = run.submaps[0].interval[0]
     shift = 0.0 if begin > after else float(np.ceil(after - begin) + 1000.0)
     keys = {s.key: first_key + k for k, s in enumerate(run.submaps)}
-    submaps = [_in_common(s, keys, name, shift) for s in with_maps(run)]
+    found = with_maps(run)
+    refined = all(s.report.get("refined") is True for s in found)
+    submaps = [_in_common(s, keys, name, shift) for s in found]
+    inner = [] if refined else _inner(run, config)
     fixes = None if run.fixes is None else replace(run.fixes, times=run.fixes.times + shift)
     return DenseSession(
-        name, submaps, config, SessionMap(submaps, config.node_spacing), _inner(run, config), shift, fixes,
-        _options(run, "gps", GpsOptions), run.map.T_gps_world,
+        name, submaps, config, SessionMap(submaps, config.node_spacing), inner, shift, fixes,
+        _options(run, "gps", GpsOptions), run.map.T_gps_world, refined,
     )  # fmt: skip
 
 

@@ -109,7 +109,8 @@ def merge_dense(
 
     The first base of the first run is fixed. Every other run hangs on one that is in already: by GPS where both have
     fixes in their graphs (their frames must be one), by places that look alike, register and agree, or by both. Chains,
-    re-entries and loops of every run are those of its own graph.
+    re-entries and loops of every run are those of its own graph; of a run refined by its scans the refined submaps are
+    its chain, and it has no ties of its own.
 
     Parameters
     ----------
@@ -268,6 +269,7 @@ def _said(s: PlacedSession) -> dict[str, Any]:
         "name": s.name,
         "source": s.run.name,
         "submaps": len(s.session.submaps),
+        "refined": s.session.refined,
         "T_world_first_base": s.T_world_base.tolist(),
         "hangs_on": None if a is None else a.known.name,
         "gps": s.session.fixes is not None,

@@ -140,7 +140,7 @@ def test_its_options_are_checked():
 def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):
     """SegSLAM on a robot whose IMU it uses: looked at, and nothing is said against it; turned round, it is named."""
     log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
-    options = {"frontend": {"filter": {"particles": 1}}, "map": {"fuse": False}}
+    options = {"frontend": {"filter": {"particles": 1}}, "map": {"fuse": False}, "refine": {"use": False}}
     r = pipeline.run(log, frontend="segslam", seed=2, config=options, progress=False)
     assert [e["verdict"] for e in r.events if e["event"] == "imu-axes"] == ["as stated"]
     imu = log["imu"]

@@ -22,7 +22,12 @@ from graphslam.sim.crawler_config import CrawlerConfig
 from tests.app.cli.test_cli import graphslam
 from tests.faults.kills import snapshot
 
-OPTIONS: dict[str, Any] = {"frontend": {"filter": {"particles": 3}}, "backend": {"loops": True}, "map": {"fuse": False}}
+OPTIONS: dict[str, Any] = {
+    "frontend": {"filter": {"particles": 3}},
+    "backend": {"loops": True},
+    "map": {"fuse": False},
+    "refine": {"use": False},
+}
 
 
 @pytest.fixture(scope="module")

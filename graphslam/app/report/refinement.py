@@ -1,0 +1,69 @@
+"""What the refinement by scans found: before and after, constants, rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.markup import missing, note, picture, section
+from graphslam.core.markup import Markup, is_figure, pairs, table
+
+MEANING = {
+    "scale": ("scale of the wheels, distance too long by", "share"),
+    "side": ("mounting: scanner looks to the left of the way", "rad"),
+    "rise": ("mounting: scanner looks above the way", "rad"),
+    "clock": ("clock of the motion ahead of that of the scans", "s"),
+    "roll": ("lasting error of gravity's roll", "rad"),
+    "pitch": ("lasting error of gravity's pitch", "rad"),
+}
+"""Lasting errors: in words, and their unit."""
+BEFORE_AFTER = (
+    ("aligned error of the path [m]", "path_rmse_aligned_graph", "path_rmse_aligned"),
+    ("share of the points of the scans that agree", "refine_agreement_graph", "refine_agreement"),
+    ("entropy of the fused map [nat m³, in the plane nat m²]", "map_entropy_graph", "map_entropy"),
+)
+
+
+def refinement(folder: ReportFolder) -> Markup:
+    """The path of the graph and the refined one in figures, and what else the scans determined."""
+    title = "Refinement by scans"
+    found = folder.part("refine")
+    if folder.kind != "run":
+        return section("refinement", title, note("Of finished single runs alone."))
+    if not found:
+        return section("refinement", title, note("The path is that of the graph: the verdict says why, where it may."))
+    m = folder.values()
+    rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
+    parts: list[Any] = [table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
+    parts += [_constants(found), *_bias(found)]
+    rounds = found.get("rounds") or []
+    columns = {
+        **{"distance": "pairs within [m]", "sigma": "σ of a pair [m]", "pairs": "pairs", "passes": "of other passes"},
+        **{"spread": "spread of the residuals [m]", "moved": "path moved by [m]"},
+    }
+    parts.append(table(rounds, columns) if rounds else missing("rounds of the refinement."))
+    apart = found.get("left_apart") or []
+    if apart:
+        listed = {f"{k + 1}": f"{a:.1f} s and {b:.1f} s" for k, (a, b) in enumerate(apart[:20])}
+        parts += [note(f"Places that the graph drew together and the scans contradict ({len(apart)}):"), pairs(listed)]
+    parts.append(note("What the refined path spends, and what was only its start: see the part on evidence."))
+    return section("refinement", title, *parts)
+
+
+def _constants(found: Mapping[str, Any]) -> Markup:
+    rows = []
+    for name, entry in (found.get("constants") or {}).items():
+        words, unit = MEANING.get(name, (name, ""))
+        rows.append({"what": words, "value": entry["value"], "sigma": entry["sigma"], "unit": unit})
+    return table(rows, {"what": "lasting error", "value": "value", "sigma": "σ", "unit": "unit"})
+
+
+def _bias(found: Mapping[str, Any]) -> list[Markup]:
+    knots = [k for k in found.get("yaw_bias") or [] if all(is_figure(v) for v in k)]
+    if not knots:
+        return []
+    from graphslam.plots.refined import plot_yaw_bias
+    from graphslam.plots.save import png
+
+    return [picture(png(plot_yaw_bias(None, knots)), "Bias of the yaw rate at its knots")]

@@ -1,0 +1,81 @@
+"""A path before and after its refinement by scans."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.trajectory_error import ate
+from graphslam.plots import style
+from graphslam.plots.paths import position_covariances
+
+
+def plot_before_after(
+    ax: Axes | None,
+    graph: Trajectory,
+    refined: Trajectory,
+    *,
+    truth: Trajectory | None = None,
+    title: str | None = None,
+) -> Axes:
+    """Errors of both paths over time, each aligned as a whole; without truth how far the refinement moved the path.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    graph, refined : Trajectory
+        Where the refinement began, and its result. Covariances of the result are drawn as the σ that it claims.
+    truth : Trajectory, optional
+    title : str, optional
+
+    Raises
+    ------
+    DataError
+        The paths share no time.
+    """
+    ax = style.new_axes(ax, (8.0, 3.2))
+    begin = refined.times[0]
+    if truth is None:
+        moved = ate(graph, refined)
+        rms = float(np.sqrt(np.mean(moved.translation**2)))
+        label = f"graph to refined path, RMS {rms:.3f} m"
+        ax.plot(moved.times - begin, moved.translation, color=style.GRAPH, lw=1.4, label=label)
+    else:
+        for path, name, colour in ((graph, "graph", style.GRAPH), (refined, "refined", style.ESTIMATE)):
+            e = ate(path, truth)
+            label = f"{name}, RMS {e.statistics.rmse:.3f} m"
+            ax.plot(e.times - begin, np.maximum(e.translation, 1e-4), color=colour, lw=1.4, label=label)
+    if refined.covariances is not None:
+        P = position_covariances(refined.poses, refined.covariances)
+        sigma = np.sqrt(np.maximum(np.trace(P, axis1=1, axis2=2), 0.0))
+        keep = sigma > 1e-4  # the first position is held
+        label = "refined, σ of the position"
+        ax.plot(refined.times[keep] - begin, sigma[keep], color=style.GREY, lw=1.0, ls="--", label=label)
+    ax.set_yscale("log")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("distance from the truth [m]" if truth is not None else "distance [m]")
+    ax.set_title(title or "path before and after its refinement by scans", fontsize="medium")
+    style.legend(ax)
+    return ax
+
+
+def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike, *, title: str | None = None) -> Axes:
+    """Bias of the yaw rate over time.
+
+    Parameters
+    ----------
+    ax : Axes or None
+    knots : (k, 2)
+        Time [s] and bias [rad/s].
+    title : str, optional
+    """
+    t, bias = np.asarray(knots, dtype=np.float64).reshape(-1, 2).T
+    ax = style.new_axes(ax, (8.0, 2.4))
+    ax.plot(t - t[0], 1e3 * bias, color=style.ESTIMATE, marker="o", ms=3, lw=1.2)
+    ax.axhline(0.0, color=style.GREY, lw=0.8)
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("yaw bias [mrad/s]")
+    ax.set_title(title or "bias of the yaw rate, as the refinement found it", fontsize="medium")
+    return ax

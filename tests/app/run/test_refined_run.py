@@ -1,0 +1,240 @@
+"""A run of a front end with scans ends with a path refined by them: files, figures, verdict, and the verbs after it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import graphslam
+from graphslam.app.hypotheses import clearest_of_choices, write_clearest
+from graphslam.app.report.report import make_report
+from graphslam.app.run import outputs, pipeline
+from graphslam.app.run.outputs import SAME_BYTES, open_run, refined_submaps_of
+from graphslam.app.run.pipeline import again, run
+from graphslam.app.run.remake_map import map_of_folder
+from graphslam.app.run.run import Run
+from graphslam.app.sessions.localise import localise
+from graphslam.core.errors import FormatError, GraphSlamError
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import SE3, level
+from graphslam.graph.ledger import EXCLUSIVE
+from graphslam.io.tum import read_tum
+from graphslam.maps.refined import base_frames
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from tests.faults.kills import snapshot
+from tests.reference.small_maps import same_map
+
+OPTIONS: dict[str, Any] = {"frontend": {"filter": {"particles": 1}}}
+
+
+def drive(seed: int) -> SensorLog:
+    """Twice round a corner of one court, by a robot of its own."""
+    return simulate_crawler(court(seed=9), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+
+
+def made(log: SensorLog, out: Path, *, seed: int = 2, resume: bool = False, **options: Any) -> Run:
+    return run(log, frontend="segslam", seed=seed, out=out, config=OPTIONS | options, resume=resume, progress=False)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return made(drive(9), tmp_path_factory.mktemp("refined") / "run")
+
+
+@pytest.fixture
+def copy(finished: Run, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(str(finished.folder), tmp_path / "copy", symlinks=True))
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures take as long as the rest."""
+    monkeypatch.setattr(outputs, "save_figures", lambda *_: [])
+    monkeypatch.setattr(outputs, "draw_run_map", lambda *_, **__: [])
+
+
+def differing(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
+    return [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
+
+
+def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
+    assert finished.metric("path_rmse_aligned") < 0.03
+    assert finished.metric("path_rmse_aligned") < 0.3 * finished.metric("path_rmse_aligned_graph")
+    assert finished.metric("map_entropy") < finished.metric("map_entropy_graph")
+    assert finished.metric("refine_agreement") > finished.metric("refine_agreement_graph") + 0.1
+    assert finished.folder is not None
+    for name in ("refined/index.json", "scans.npz", "trajectory_graph.tum", "figures/refined.png"):
+        assert (finished.folder / name).is_file(), name
+    again_read = open_run(finished.folder)
+    assert again_read.graph_path is not None
+    assert finished.refined is not None
+    np.testing.assert_allclose(again_read.graph_path.poses, finished.refined.graph_path.poses, atol=1e-6)
+    np.testing.assert_array_equal(again_read.map.trajectory.poses, finished.refined.refinement.poses)
+    assert {"refined", "refine-evidence"} <= {f.code for f in again_read.verdict}
+    assert again_read.report["refine"]["rounds"][-1]["pairs"] == finished.metric("refine_pairs")
+    page = make_report(finished.folder)
+    assert "refine" not in " ".join(page.problems)
+    for text in ("Refinement by scans", "scale of the wheels", "Bias of the yaw rate at its knots", "scan-pairs"):
+        assert text in page.html, text
+
+
+def test_the_ledger_says_what_the_refined_path_spends(finished: Run) -> None:
+    """Every stream of the scans once, and nothing else: the graph's factors are named as its start."""
+    assert finished.ledger is not None
+    assert finished.graph is not None
+    t = finished.ledger
+    spent = t[t["kind"] == EXCLUSIVE]
+    assert set(spent["factor"]) == {"scan-pairs"}
+    assert set(spent["stream"]) == set(finished.submaps[0].uses)
+    assert spent["stream"].is_unique
+    path = finished.map.trajectory
+    assert (spent["t_start"] == path.times[0]).all()
+    assert (spent["t_end"] == path.times[-1]).all()
+    rest = t[t["kind"] != EXCLUSIVE]
+    assert set(rest["kind"]) == {"start"}
+    assert set(rest["factor_id"]) == set(finished.graph.ledger.table()["factor_id"])
+
+
+def test_bases_of_the_refined_submaps_stand_level_in_the_frame_of_the_truth(finished: Run) -> None:
+    base = np.array(finished.report["T_world_base"])
+    np.testing.assert_allclose(level(base), base, atol=1e-12)
+    submaps = refined_submaps_of(finished)
+    frames = base_frames(finished.map)
+    for s, a, b in zip(submaps, frames, frames[1:]):
+        np.testing.assert_allclose(SE3.between(a, b), s.exit_pose, atol=1e-12)
+        assert s.trajectory is not None
+        where = SE3.compose(np.broadcast_to(a, s.trajectory.poses.shape), s.trajectory.poses)
+        np.testing.assert_allclose(where, finished.map.trajectory.interpolate(s.trajectory.times), atol=1e-6)
+        assert np.linalg.eigvalsh(s.exit_covariance).min() > 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_interrupted_and_made_again_it_is_the_same_to_the_last_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = drive(9).slice(0.0, 16.0)
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as m:
+        m.setattr(pipeline, "refine_run", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            made(log, tmp_path / "stopped")
+    assert not (tmp_path / "stopped" / "run.json").exists()
+    made(log, tmp_path / "stopped", resume=True)
+    made(log, tmp_path / "whole")
+    wanted = snapshot(tmp_path / "whole", SAME_BYTES)
+    assert {"refined/index.json", "refined/000000.grid.npz", "trajectory_graph.tum", "scans.npz"} <= set(wanted)
+    assert differing(wanted, snapshot(tmp_path / "stopped", SAME_BYTES)) == []
+    again(tmp_path / "whole", [], progress=False)
+    assert differing(wanted, snapshot(tmp_path / "whole", SAME_BYTES)) == []
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_without_it_everything_is_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a front end that gives no steps, which nothing refines; its options apart."""
+    log = drive(9).slice(0.0, 16.0)
+    plain = made(log, tmp_path / "off", refine={"use": False})
+    assert plain.refined is None
+    assert not any(k.startswith("refine") for k in plain.metrics["key"])
+    with monkeypatch.context() as m:
+        m.setattr(pipeline.Scans, "of", staticmethod(lambda *_: None))
+        made(log, tmp_path / "none")
+    off, none = (snapshot(tmp_path / n, SAME_BYTES) for n in ("off", "none"))
+    assert differing(off, none) == ["config.toml"]
+    assert not [n for n in off if n.startswith("refined") or n == "scans.npz" or "graph.tum" in n]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_switched_off_it_leaves_nothing_of_a_refined_state(copy: Path) -> None:
+    config = copy / "config.toml"
+    text = config.read_text()
+    at = text.index("[refine]")
+    config.write_text(text[:at] + text[at:].replace("use = true", "use = false", 1))
+    again(copy, [], progress=False)
+    assert refined_submaps_of(open_run(copy)) == []
+    for name in ("refined/index.json", "trajectory_graph.tum", "figures/refined.png"):
+        assert not (copy / name).is_symlink(), name
+    assert open_run(copy).graph_path is None
+
+
+def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path) -> None:
+    read, remade = map_of_folder(copy)
+    assert finished.fused is not None
+    assert same_map(remade.fused.grid, finished.fused.fused.grid)
+    assert remade.open_entropy == finished.metric("map_entropy_open_chain")
+    found = clearest_of_choices(read, remade, progress=False)
+    rows = found.choice.rows()
+    assert len(rows) > 1
+    own = [r for r in rows if r["choice"] == "as the run"]
+    assert own[0]["entropy"] == pytest.approx(finished.metric("map_entropy_graph"), rel=1e-3)
+    assert found.refined is not None  # the chosen one is refined, whichever it is
+    assert found.refined_map is not None
+    assert found.refined_map.fused.entropy() < rows[0]["entropy"]
+    write_clearest(copy, found)
+    kept = json.loads((copy / "clearest.json").read_text())
+    assert kept["refined_entropy"] == found.refined_map.fused.entropy()
+    np.testing.assert_allclose(
+        read_tum(copy / "clearest.tum", dim=3).poses, found.refined.map.trajectory.poses, atol=1e-6
+    )
+
+
+def test_a_store_that_is_damaged_or_of_another_state_is_refused(copy: Path) -> None:
+    """Of plain files, as they are copied by hand."""
+    plain = Path(shutil.copytree(copy, copy.with_name("plain")))
+    assert len(refined_submaps_of(open_run(plain))) > 2
+    store = plain / "refined"
+    keep = (store / "000001.npz").read_bytes()
+    for foreign in ((plain / "submaps" / "000001.npz").read_bytes(), keep[: len(keep) // 2], b""):
+        (store / "000001.npz").write_bytes(foreign)
+        with pytest.raises(GraphSlamError, match="refined"):
+            map_of_folder(plain)
+    (store / "000001.npz").write_bytes(keep)
+    index = json.loads((store / "index.json").read_text())
+    (store / "index.json").write_text(
+        json.dumps(index | {"submaps": index["submaps"][:-1], "count": index["count"] - 1})
+    )
+    with pytest.raises(FormatError, match="not those of the run"):
+        map_of_folder(plain)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_two_refined_sessions_are_merged_by_their_refined_submaps(finished: Run, tmp_path: Path) -> None:
+    other = made(drive(11), tmp_path / "other", seed=4)
+    assert finished.folder is not None
+    both = graphslam.merge([finished.folder, other.folder])
+    assert [s.session.refined for s in both.sessions] == [True, True]
+    assert both.metric("path_rmse_aligned") < 0.03
+    base = both.sessions[1]
+    assert both.metric(f"{base.name}_base_nees") < 22.5  # χ² of six degrees of freedom, 99.9 %
+    # no re-entry or loop of a run is a factor: its scans are spent; ties between the sessions are declared
+    groups = {e["group"] for e in both.graph.events if e.get("event") == "between"}
+    assert groups == {"session"}
+    t = both.graph.ledger.table()
+    ties = t[t["stream"].str.endswith("/scan")]
+    assert set(ties["kind"]) == {"shared-scan"}
+    assert [s["refined"] for s in both.report["sessions"]] == [True, True]
+    found = localise(finished, refined_submaps_of(other)[:2])
+    assert found.found, found.why
+    true = SE3.between(np.array(finished.report["T_world_base"]), np.array(other.report["T_world_base"]))
+    e = SE3.log(SE3.between(found.T_map_base, true))
+    assert np.linalg.norm(e[3:]) < 0.05
+
+
+def test_scans_are_read_again_as_they_were(finished: Run) -> None:
+    assert finished.folder is not None
+    assert finished.taken is not None
+    scans = finished.taken.scans
+    assert scans is not None
+    read = type(scans).load(finished.folder / "scans.npz")
+    for name in ("times", "offsets", "points", "origins", "returns", "tilt"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(scans, name))
+    assert read.lasting == scans.lasting
