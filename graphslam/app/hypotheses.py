@@ -105,8 +105,9 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
     """
     config, streams = _graph_options(run)
     if run.folder is not None and any(s.report.get("refined") for s in run.submaps):
-        run = replace(run, submaps=read_submaps(run.folder, load_grid=load_npz))
-        made = make_run_map(run.submaps, run.map, reach=sensor_reach(read_options(run.folder)))
+        folder = run.folder
+        run = replace(run, submaps=read_submaps(folder, load_grid=load_npz))
+        made = make_run_map(run.submaps, run.map, reach=sensor_reach(read_options(folder)))
     ledger = ledger_of_events(run.events).current()
     loops = [d for d in ledger if d.verdict == "accepted" and d.source != FRONT_END and d.T_ij]
     decided = [d for d in ledger if d.verdict == "accepted" and d.source == FRONT_END and d.T_ij]

@@ -52,6 +52,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.octomap import read_octomap, write_octomap
+from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
 from graphslam.io.g2o import read_g2o
@@ -74,7 +75,6 @@ from graphslam.io.victoria_park_published import (
     read_ufastslam_detections,
 )
 from graphslam.maps.refined import base_frames
-from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.refine.scans import Scans
 
 
