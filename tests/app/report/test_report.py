@@ -20,7 +20,19 @@ from graphslam.core.log import SensorLog
 from tests.app.report.test_markup import HOSTILE
 from tests.reference.page import Page
 
-PARTS = ["figures", "run", "records", "metrics", "graph", "loops", "hypotheses", "evidence", "events", "times"]
+PARTS = [
+    "figures",
+    "refinement",
+    "run",
+    "records",
+    "metrics",
+    "graph",
+    "loops",
+    "hypotheses",
+    "evidence",
+    "events",
+    "times",
+]
 
 
 @pytest.fixture(scope="module")
