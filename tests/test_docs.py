@@ -28,6 +28,7 @@ PAGES = [
     "mrclam.md",
     "plaza.md",
     "pose-graphs.md",
+    "refinement.md",
     "registration.md",
     "report.md",
     "robust.md",
