@@ -314,6 +314,10 @@ class SegSlamConfig:
     """The throw-away filter."""
     handover: HandoverConfig = field(default_factory=HandoverConfig)
     """What is handed over."""
+    inside: Literal["filter", "scan-window"] = "filter"
+    """What carries the particles through a segment: the motion with its noise, which the filter samples, as in the
+    paper; or scan-to-window odometry (``frontend.window``), which is the same for all and leaves nothing to sample that
+    a map could tell apart. Particles then differ where it pays: in which older map they enter."""
     segments_per_interval: int = 0
     """Segments of one interval that are kept, heaviest first; 0 = all."""
     lock_after: int = 0
@@ -321,3 +325,5 @@ class SegSlamConfig:
 
     def __post_init__(self) -> None:
         _check(self, "segslam")
+        if self.inside not in ("filter", "scan-window"):
+            raise ConfigError(f"segslam.inside = {self.inside!r}; known: filter, scan-window")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from graphslam.core.log import DropCounter, SensorLog
@@ -15,6 +15,8 @@ from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.scan_window.config import ScanWindowConfig
+from graphslam.frontends.scan_window.followed import followed
 from graphslam.frontends.segslam.config import SegSlamConfig
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segslam import run_segslam
@@ -32,7 +34,9 @@ class SegSlamFrontEndConfig:
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
     """Segmentation, matching, what is handed over."""
     drift: FilterDrift = field(default_factory=FilterDrift)
-    """Errors that all particles share."""
+    """Errors that all particles share, where the filter carries them."""
+    window: ScanWindowConfig = field(default_factory=ScanWindowConfig)
+    """Scan-to-window odometry inside the segments (``segslam.inside = "scan-window"``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +80,11 @@ class SegSlam(FrontEnd):
         self, log: SensorLog, *, seed: SeedTree, drops: DropCounter | None = None, watch: Watch | None = None
     ) -> SegSlamResult:
         """The SegMap with all particles, of which :meth:`submaps` hands over the best one's chain."""
-        c = self.config
-        return run_segslam(self.steps(log, drops=drops), c.filter, c.segslam, seed.child(0), watch=watch)
+        c, steps, filter = self.config, self.steps(log, drops=drops), self.config.filter
+        if c.segslam.inside == "scan-window":
+            # one path for all: what it leaves to sample is less than a map can tell apart
+            steps, filter = followed(steps, c.window), replace(filter, walk_scale=0.0, motion_scale=0.0)
+        return run_segslam(steps, filter, c.segslam, seed.child(0), watch=watch)
 
 
 def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:

@@ -24,6 +24,7 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.odometry.scan_use import uncorrected, uncorrected_covariance
 from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.scan_window.followed import FollowedErrors
 from graphslam.frontends.segslam.config import HandoverConfig
 from graphslam.frontends.segslam.covariance import exit_covariance
 from graphslam.frontends.segslam.sampling import MapSample, nearest_step
@@ -54,8 +55,11 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
     """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
 
     With the steps also what dead reckoning adds where no scan corrects it
-    (:mod:`graphslam.frontends.odometry.scan_use`).
+    (:mod:`graphslam.frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
     """
+    if steps is not None and isinstance(steps.errors, FollowedErrors):
+        steps.errors.prepare(segmap[int(i)].interval[0] for i in chain)
+        return drift_by_errors(steps.errors, gravity=segmap.gravity)
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
     stretches = [] if steps is None else uncorrected(steps)
 

@@ -1,0 +1,61 @@
+"""What steers scan-to-window odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError
+from graphslam.registration.surfaces import SurfaceConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanWindowConfig:
+    """How each scan is put on the surfaces of the window before it."""
+
+    seconds: float = 24.0
+    """Age of the oldest surfaces of the window [s]."""
+    most_steps: int = 60
+    """Steps of the window at most: of faster scans only every so many become surfaces."""
+    lay: float = 4.0
+    """Scans become surfaces together, so many seconds of them at a time, when those of the next lot are there too [s].
+    A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted."""
+    points: int = 250
+    """Points of a scan that are looked for on surfaces."""
+    distances: tuple[float, ...] = (1.0, 0.5, 0.3, 0.3)
+    """Greatest distance of a point from its surface in each iteration [m]."""
+    spent: float = 1.7
+    """σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
+    normal_sigma: float = 0.03
+    """σ of the normal of a surface [rad]: what surfaces hold must be clearly more than it would pretend to."""
+    least_points: int = 20
+    """A scan with fewer points on surfaces is lost: it corrects nothing."""
+    least_overlap: float = 0.25
+    """… and one of whose points a smaller share lies on surfaces."""
+    most_spread: float = 0.15
+    """… and one whose residuals are spread wider than this [m]."""
+    surprise: float = 40.0
+    """… and one whose correction is this far from what the motion allows (χ² of up to six degrees of freedom)."""
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    """What counts as a surface."""
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "lay", "spent", "normal_sigma", "most_spread", "surprise"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"window: {name} = {value}; wanted > 0")
+        if not 0.0 <= self.least_overlap <= 1.0:
+            raise ConfigError(f"window: least_overlap = {self.least_overlap}; wanted 0 … 1")
+        if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
+            raise ConfigError(f"window: distances = {self.distances}; wanted at least one, all > 0 m")
+        for name, least in (("most_steps", 2), ("points", 6), ("least_points", 6)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"window: {name} = {getattr(self, name)}; wanted ≥ {least}")
+        if self.lay > self.seconds or self.lay < self.spacing:
+            raise ConfigError(f"window: lay = {self.lay} s; wanted between two steps ({self.spacing} s) and seconds")
+
+    @property
+    def spacing(self) -> float:
+        """Least time between steps that become surfaces [s]."""
+        return self.seconds / self.most_steps

@@ -1,0 +1,94 @@
+"""Steps whose motion is that of scan-to-window odometry: for front ends that work on the motion of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, level
+from graphslam.core.records import Odometry
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.scan_window.config import ScanWindowConfig
+from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam.frontends.scan_window.tracker import Track, track
+
+
+@dataclass(frozen=True, slots=True)
+class FollowedErrors:
+    """Honest covariance of a followed path over any interval (`PathErrors`).
+
+    Parameters
+    ----------
+    steps : Steps
+        As they were before.
+    config : ScanWindowConfig
+    """
+
+    steps: Steps
+    config: ScanWindowConfig
+    _tracks: list[tuple[list[int], Track]] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    def prepare(self, starts: Iterable[int]) -> None:
+        """Follow the steps once for intervals that begin at ``starts`` and end no later than the next one begins."""
+        begins = sorted({0, *(int(k) for k in starts)})
+        if not any(set(begins) <= set(known) for known, _ in self._tracks):
+            self._tracks.append((begins, track(self.steps, self.config, begins)))
+
+    def between(
+        self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
+    ) -> tuple[Array, Array]:
+        """Motion from step ``start`` to step ``end`` and its covariance ``(d, d)``, right tangent.
+
+        Raises
+        ------
+        DataError
+            No such interval.
+        """
+        if not 0 <= start <= end < len(self.steps):
+            raise DataError(
+                "no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {len(self.steps)}"
+            )
+        found = self._of(start, end)
+        if found is None:
+            self.prepare([start])
+            found = self._of(start, end)
+        assert found is not None
+        poses = a, b = found.poses[start], found.poses[end]
+        joint = found.joints[end]
+        if start == end:
+            d = len(joint) // 2
+            joint = np.tile(joint[d:, d:], (2, 2))
+        frames = level(a) if level_start else a, level(b) if level_end else b
+        return group_of(a).between(*frames), relative_covariance(poses, frames, joint)
+
+    def _of(self, start: int, end: int) -> Track | None:
+        for begins, made in self._tracks:
+            if start in begins:
+                later = begins[begins.index(start) + 1 :]
+                if not later or end <= later[0]:
+                    return made
+        return None
+
+
+def followed(steps: Steps, config: ScanWindowConfig) -> Steps:
+    """Steps with the increments, and in space the roll and pitch, of scan-to-window odometry.
+
+    What is new in an increment is no longer independent of the one before, since both lean on the same window: the
+    covariances of the increments stay those of the motion, for whom they serve as weights; :class:`FollowedErrors`
+    knows how far the path is off over any interval. Roll and pitch are the path's own, and not to be doubted again.
+    """
+    made, g = track(steps, config), group_of(steps.odometry.increments)
+    increments = np.concatenate([g.identity[None], g.between(made.poses[:-1], made.poses[1:])])
+    tilt = None if steps.tilt is None else se3.roll_pitch(made.poses)[0]
+    return replace(
+        steps,
+        odometry=Odometry(times=steps.times, increments=increments, covariances=steps.odometry.covariances),
+        tilt=tilt,
+        tilt_sigma=0.0,
+        errors=FollowedErrors(steps, config),
+    )

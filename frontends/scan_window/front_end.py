@@ -1,0 +1,237 @@
+"""The front end ``scan-window``: scan-to-window odometry, cut into submaps with evidence grids."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.poses import group_of, level
+from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.base import FrontEnd, Watch
+from graphslam.frontends.odometry.scan_use import checked_steps, scan_findings
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.scan_window.config import ScanWindowConfig
+from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam.frontends.scan_window.tracker import Found, Tracker
+
+MANY = 0.2
+"""Share of lost scans from which a line of the verdict says so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowSubmapConfig:
+    """How the path is cut into submaps, and what their grids are made of."""
+
+    length: float = 30.0
+    """Way of a submap [m]."""
+    seconds: float = 12.0
+    """… which lasts no less than this [s]."""
+    voxel_size: float = 0.2
+    """Edge of a voxel [m]."""
+    lift: float = 0.25
+    """Height of the base over the lattice of its map, in voxels, where gravity is told: a floor between two layers of
+    voxels would be in one of them here and in the other there."""
+    hit: float = 0.7
+    """Probability that a voxel is occupied, given that a beam ended in it."""
+    miss: float = 0.4
+    """The same, given that a beam passed through it."""
+    clamp: tuple[float, float] = (0.1192, 0.971)
+    """Bounds of a voxel's probability."""
+
+    def __post_init__(self) -> None:
+        for name in ("length", "voxel_size"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"submap: {name} = {value}; wanted > 0")
+        if not (np.isfinite(self.seconds) and self.seconds >= 0):
+            raise ConfigError(f"submap: seconds = {self.seconds}; wanted ≥ 0")
+        if not (np.isfinite(self.lift) and 0.0 <= self.lift <= 1.0):
+            raise ConfigError(f"submap: lift = {self.lift}; wanted 0 … 1 voxels")
+        self.beam_model()
+
+    def beam_model(self) -> BeamModel:
+        """What a beam says of a voxel."""
+        return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanWindowFrontEndConfig:
+    """The front end ``scan-window``."""
+
+    steps: StepConfig = field(default_factory=StepConfig)
+    """How the log becomes steps."""
+    window: ScanWindowConfig = field(default_factory=ScanWindowConfig)
+    """How each scan is put on the surfaces of the window before it."""
+    submap: WindowSubmapConfig = field(default_factory=WindowSubmapConfig)
+    """How the path is cut, and what the maps are made of."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanWindow(FrontEnd):
+    """The front end ``scan-window``.
+
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. It draws nothing, and
+    says of every step what the steps up to it let it say. A run that is resumed follows the path again from its start
+    (a few milliseconds a step), since the window and the errors that last go on from submap to submap, and makes the
+    maps that are missing.
+    """
+
+    config: ScanWindowFrontEndConfig = field(default_factory=ScanWindowFrontEndConfig)
+    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
+    name: ClassVar[str] = "scan-window"
+
+    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
+        """The steps of a log; those of the last one are kept."""
+        if not (self._made and self._made[0] is log):
+            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
+        made: Steps = self._made[1]
+        return made
+
+    def submaps(
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
+    ) -> Iterator[Submap]:
+        """See :class:`~graphslam.frontends.base.FrontEnd`."""
+        first = 0 if after is None else after.key + 1
+        yield from window_submaps(self.steps(log, drops=drops), self.config.window, self.config.submap, first_key=first)
+
+
+def window_submaps(
+    steps: Steps, window: ScanWindowConfig, config: WindowSubmapConfig, *, first_key: int = 0
+) -> Iterator[Submap]:
+    """Submaps of scan-to-window odometry, in order.
+
+    Parameters
+    ----------
+    steps : Steps
+    window : ScanWindowConfig
+    config : WindowSubmapConfig
+    first_key : int
+        Submaps before it are not made.
+
+    Raises
+    ------
+    DataError
+        Fewer than two steps: there is no interval.
+    """
+    n = len(steps)
+    if n < 2:
+        raise DataError("too few steps for a submap", where=steps.name, got=n, wanted="at least 2")
+    tracker, way = Tracker(steps, window), steps.path_length
+    start, key, states = 0, 0, []
+    for k in range(n):
+        found = tracker.step()
+        if k == 0:
+            tracker.begin()
+        states.append((tracker.pose, tracker.joint, found))
+        full = way[k] - way[start] >= config.length and steps.times[k] - steps.times[start] >= config.seconds - 1e-6
+        if k == n - 1 or full:
+            if key >= first_key:
+                ended = "end-of-log" if k == n - 1 else "length"
+                submap = _submap(steps, (start, k), states, config, key, ended, tracker.lasting)
+                yield submap
+            tracker.begin()
+            # the scan of a step between two submaps is in the map of the one that ends there
+            start, key, states = k, key + 1, [(tracker.pose, tracker.joint, found)]
+
+
+def _submap(
+    steps: Steps,
+    interval: tuple[int, int],
+    states: list[tuple[Array, Array, Found]],
+    config: WindowSubmapConfig,
+    key: int,
+    ended: str,
+    lasting: Array,
+) -> Submap:
+    start, end = interval
+    gravity = steps.tilt is not None
+    poses = np.array([s[0] for s in states])
+    lift = config.lift * config.voxel_size if gravity else 0.0
+    g = group_of(poses)
+    begin, exit = (_base(p, lift, gravity) for p in (poses[0], poses[-1]))
+    path = g.between(np.broadcast_to(begin, poses.shape), poses)
+    C = np.array([relative_covariance((poses[0], p), (begin, p), joint) for p, joint, _ in states])
+    grid = EvidenceGrid(config.voxel_size, model=config.beam_model(), dim=g.dim)
+    dropped = 0
+    for k, T in zip(range(start, end + 1), path):
+        points, origins, returns = steps.scan(k)
+        if len(points) and (k > start or k == 0):
+            dropped += grid.insert_scan(points, origins, pose=T, max_range=steps.max_range, returns=returns).dropped
+    report = {"ended": ended, "steps": end - start, "length": round(float(np.ptp(steps.path_length[[start, end]])), 3)}
+    report |= {"beams_dropped": int(dropped), **_summary([s[2] for s in states[int(start > 0) :]])}
+    report["yaw_bias"] = float(lasting[0])
+    findings = [*steps.findings, *scan_findings(steps)] if key == 0 else []
+    findings += _lost(key, end - start, report)
+    if findings:
+        report["findings"] = [f.as_row() for f in findings]
+    return Submap(
+        key=key,
+        interval=(float(steps.times[start]), float(steps.times[end])),
+        exit_pose=g.between(begin, exit),
+        exit_covariance=relative_covariance((poses[0], poses[-1]), (begin, exit), states[-1][1]),
+        trajectory=Trajectory(steps.times[start : end + 1], path, C),
+        grid=grid,
+        uses=steps.uses,
+        report=report | {"exit_covariance": "window"},
+    )
+
+
+def _base(body: Array, lift: float, gravity: bool) -> Array:
+    """The frame of a submap that begins at a body."""
+    if not gravity:
+        return body
+    base = level(body)
+    base[2] -= lift
+    return base
+
+
+def _summary(found: list[Found]) -> dict[str, Any]:
+    """What scans said, in figures."""
+    lost = Counter(f.lost for f in found if f.lost and f.lost != "start")
+    spreads = [f.spread for f in found if np.isfinite(f.spread)]
+    overlaps = [f.overlap for f in found if np.isfinite(f.overlap)]
+    return {
+        "scans_lost": sum(lost.values()),
+        "scans_lost_why": dict(sorted(lost.items())),
+        "overlap_median": float(np.median(overlaps)) if overlaps else None,
+        "spread_median": float(np.median(spreads)) if spreads else None,
+    }
+
+
+def _lost(key: int, steps: int, report: dict[str, Any]) -> list[Finding]:
+    lost = report["scans_lost"]
+    if lost <= MANY * steps:
+        return []
+    why = ", ".join(f"{n} for {WHY[code]}" for code, n in report["scans_lost_why"].items())
+    text = (
+        f"Submap {key}: {lost} of {steps} scans found no place on the surfaces before them ({why}). The path there is "
+        "that of the motion, and the covariances are as wide as its."
+    )
+    return [Finding("bad" if lost > 0.5 * steps else "look", "scans-lost", text)]
+
+
+WHY = {
+    "points": "too few returns",
+    "overlap": "too few points on surfaces",
+    "spread": "the spread of the distances",
+    "surprise": "a correction that the motion rules out",
+}
