@@ -14,6 +14,7 @@ from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.gaussian import ellipse_rings, largest_sigmas
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
 from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.plan_view import plan_pose
 from graphslam.io.geographic import WRITERS, GeographicMap
 
 _RING = 36  # corners of an ellipse
@@ -57,6 +58,8 @@ def geographic_map(
     confidence : float
         Of the ellipses.
 
+    A run in space is seen from above; it has no landmarks.
+
     Raises
     ------
     ConfigError, GeometryError
@@ -69,13 +72,14 @@ def geographic_map(
     def place(points: Array) -> Array:
         return enu_to_geodetic(points, *datum)[..., :2]
 
-    centres, P = m.landmarks_in(T)
+    T = plan_pose(T) if len(T) == 7 else T
+    centres, P = m.landmarks_in(T) if m.dim == 2 else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
     scored = run.gps.get("all")
-    fixes = np.zeros((0, 2)) if scored is None else scored.points + scored.residuals
+    fixes = np.zeros((0, 2)) if scored is None else (scored.points + scored.residuals)[:, :2]
     return GeographicMap(
         name=run.name,
         description=f"{len(run.submaps)} submaps, {len(m.landmarks)} landmarks; datum {datum[0]:.6f}, {datum[1]:.6f}",
-        path=place(se2_transform(T, m.trajectory.positions)),
+        path=place(se2_transform(T, m.trajectory.positions[:, :2])),
         landmarks=place(centres),
         landmark_ids=m.landmark_ids,
         landmark_sigmas=largest_sigmas(P),

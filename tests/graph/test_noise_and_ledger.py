@@ -150,3 +150,18 @@ def test_against_brute_force(rng):
         except EvidenceReusedError:
             assert clash
     assert 20 < len(accepted) < 380
+
+
+def test_what_was_only_a_start_leaves_its_streams_to_be_spent() -> None:
+    ledger = Ledger()
+    ledger.spend(0, "submap 0", ["laser", "wheels"], (0.0, 10.0))
+    ledger.spend(3, "match", ["laser"], (0.0, 10.0), kind="shared-scan")
+    start = ledger.as_start()
+    assert [(e.factor_id, e.stream, e.t_start, e.t_end) for e in start.entries()] == [
+        (e.factor_id, e.stream, e.t_start, e.t_end) for e in ledger.entries()
+    ]
+    assert {e.kind for e in start.entries()} == {"start"}
+    start.spend(-1, "scan-pairs", ["laser", "wheels"], (0.0, 10.0))
+    with pytest.raises(EvidenceReusedError, match="scan-pairs spent it"):
+        start.spend(4, "late", ["laser"], (9.0, 11.0))
+    assert ledger.conflict("laser", (5.0, 6.0)).factor == "submap 0"  # the first ledger is as it was

@@ -11,7 +11,7 @@ from graphslam.core.markup import Markup, is_figure, pairs, table
 
 MEANING = {
     "scale": ("scale of the wheels, distance too long by", "share"),
-    "side": ("mounting: scanner looks to the left of the way", "rad"),
+    "side": ("mounting: scanner looks to the side of the way", "rad"),
     "rise": ("mounting: scanner looks above the way", "rad"),
     "clock": ("clock of the motion ahead of that of the scans", "s"),
     "roll": ("lasting error of gravity's roll", "rad"),
@@ -22,6 +22,7 @@ BEFORE_AFTER = (
     ("aligned error of the path [m]", "path_rmse_aligned_graph", "path_rmse_aligned"),
     ("share of the points of the scans that agree", "refine_agreement_graph", "refine_agreement"),
     ("entropy of the fused map [nat m³, in the plane nat m²]", "map_entropy_graph", "map_entropy"),
+    ("known volume of the fused map [m³, in the plane m²]", "map_known_volume_graph", "map_known_volume"),
 )
 
 

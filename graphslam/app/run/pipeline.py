@@ -340,7 +340,9 @@ def _judge(
             fused, why_not = _fused_map(refined.submaps, map_of_frames(refined.map), settings.map, effective)
             if fused is not None:  # the open chain is that of the front end, whose exits the refinement replaced
                 fused = replace(fused, open_entropy=before.open_entropy, open_volume=before.open_volume)
-                out.add("map_entropy_graph", before.fused.entropy(), f"nat {'m³' if before.fused.dim == 3 else 'm²'}")
+                unit = "m³" if before.fused.dim == 3 else "m²"
+                out.add("map_entropy_graph", before.fused.entropy(), f"nat {unit}")
+                out.add("map_known_volume_graph", before.fused.known_volume(), unit)
     if fused is not None:
         for row in fused.metrics():
             out.add(*row)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import graphslam
+from graphslam.app.export import export
 from graphslam.app.hypotheses import clearest_of_choices, write_clearest
 from graphslam.app.report.report import make_report
 from graphslam.app.run import outputs, pipeline
@@ -227,6 +228,14 @@ def test_two_refined_sessions_are_merged_by_their_refined_submaps(finished: Run,
     true = SE3.between(np.array(finished.report["T_world_base"]), np.array(other.report["T_world_base"]))
     e = SE3.log(SE3.between(found.T_map_base, true))
     assert np.linalg.norm(e[3:]) < 0.05
+
+
+def test_it_is_exported_as_it_is_seen_from_above(finished: Run, tmp_path: Path) -> None:
+    file = export(finished, (48.1, 11.5), format="geojson", heading=90.0, out=tmp_path / "map.geojson")
+    lines = [f["geometry"] for f in json.loads(file.read_text())["features"]]
+    (path,) = [g["coordinates"] for g in lines if g["type"] == "LineString"]
+    east = [111_320.0 * np.cos(np.deg2rad(48.1)) * (p[0] - 11.5) for p in path]  # x looks east
+    np.testing.assert_allclose(east, finished.map.trajectory.positions[:, 0], atol=0.1)
 
 
 def test_scans_are_read_again_as_they_were(finished: Run) -> None:
