@@ -23,8 +23,9 @@ def test_errors_of_both_paths_and_the_sigma_that_is_claimed() -> None:
     ax = plot_before_after(None, path(0.4), path(0.02, sigma=0.03), truth=path(0.0))
     lines = {str(x.get_label()): np.asarray(x.get_ydata()) for x in ax.lines}
     graph, refined, sigma = lines.values()
-    assert list(lines)[0].startswith("graph, RMS 0.2")
-    assert list(lines)[1].startswith("refined, RMS 0.01")
+    first, second, _ = lines
+    assert first.startswith("graph, RMS 0.2")
+    assert second.startswith("refined, RMS 0.01")
     assert graph.max() > 10 * refined.max()
     np.testing.assert_allclose(sigma, np.sqrt(2) * 0.03)
     plt.close(ax.figure)
