@@ -88,6 +88,8 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     refined = all(s.report.get("refined") is True for s in found)
     submaps = [_in_common(s, keys, name, shift) for s in found]
     inner = [] if refined else _inner(run, config)
+    if refined:  # gravity is in the refined exits, with a σ of its own
+        config = replace(config, level_sigma=0.0)
     fixes = None if run.fixes is None else replace(run.fixes, times=run.fixes.times + shift)
     return DenseSession(
         name, submaps, config, SessionMap(submaps, config.node_spacing), inner, shift, fixes,
