@@ -25,9 +25,15 @@ class LastingSigmas:
     """Between the clocks of motion and scans [s]."""
     tilt: float
     """Constant part of gravity's roll and pitch [rad]."""
+    bend: float
+    """Of wheels in the plane: what they turn too much for each metre driven, one being larger [rad/m]."""
+    turn: float
+    """Of wheels in the plane: share of the turns, the distance between them being known no better."""
 
 
-LEAST = LastingSigmas(yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3)
+LEAST = LastingSigmas(
+    yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3, bend=0.03, turn=0.03
+)
 """What no robot is known better to than from its own scans: consumer gyros, wheels under load, brackets, clocks."""
 
 
@@ -47,4 +53,6 @@ def lasting_sigmas(steps: Steps) -> LastingSigmas:
         direction=least.direction,
         clock=least.clock,
         tilt=max(tilt, least.tilt),
+        bend=least.bend,
+        turn=least.turn,
     )

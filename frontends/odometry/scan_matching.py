@@ -33,7 +33,8 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
     """Steps whose increments are fused with matches of neighbouring scans.
 
     Between two scans that are matched there may be steps without a beam; the correction then goes into the last
-    increment. What it knows of errors over intervals (``errors``) is lost: it was that of the odometry alone.
+    increment. What it knows of errors over intervals (``errors``) is lost: it was that of the odometry alone, which
+    stays in ``recorded``.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
     if drops is not None:
         drops.drop("steps", "scan does not match the one before (odometry kept)", failed)
     motion = replace(o, increments=increments, covariances=covariances)
-    return replace(steps, odometry=motion, errors=None)
+    return replace(steps, odometry=motion, errors=None, recorded=o)
 
 
 def fuse(T: Array, P: Array, T_match: Array, R: Array) -> tuple[Array, Array]:

@@ -69,6 +69,8 @@ class Steps:
         In the records of the motion, which is a guess there.
     findings : tuple of Finding
         What was noticed when scans and motion were put beside each other.
+    recorded : Odometry or None
+        The motion without what scans say of it, where ``odometry`` holds that too.
 
     Raises
     ------
@@ -92,6 +94,7 @@ class Steps:
     errors: PathErrors | None = None
     gaps: Gaps = field(default_factory=Gaps)
     findings: tuple[Finding, ...] = ()
+    recorded: Odometry | None = None
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__

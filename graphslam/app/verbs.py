@@ -10,7 +10,7 @@ import pandas as pd
 
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.front_ends import front_end_names
+from graphslam.app.run.front_ends import front_end_names, recommended
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import open_run as open_run
@@ -23,15 +23,24 @@ from graphslam.app.studies.study import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
+from graphslam.core.config import build
+from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.frontends.odometry.recorded import chain
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import make_steps
 from graphslam.join import registry as joining
+from graphslam.refine.config import RefineConfig
+from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 
 __all__ = [
     *("compare", "find_study", "first_particles", "front_ends", "join_submaps", "joiners", "load", "local_maps"),
-    *("open_run", "open_study", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
+    *("open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
 ]
 
 
@@ -103,6 +112,57 @@ def load(source: str | Path, **options: Any) -> SensorLog:
     >>> log.slice(0.0, 60.0)
     """
     return load_log_source(source, **options)
+
+
+def refine_path(
+    source: SensorLog | str | Path,
+    path: Trajectory | None = None,
+    *,
+    steps: StepConfig | Mapping[str, Any] | None = None,
+    config: RefineConfig | None = None,
+) -> Refinement:
+    """Refine a path by the scans of a log, without any front end: clouds with poses, or a path found elsewhere.
+
+    Parameters
+    ----------
+    source : SensorLog, card or folder
+        With scans or clouds, and motion.
+    path : Trajectory, optional
+        Of the base, where the refinement begins; gravity-aligned in space. By default the odometry of the log.
+    steps : StepConfig or mapping, optional
+        How the log becomes steps. By default what the preset of the log for ``segslam`` says of it, or else
+        :class:`~graphslam.frontends.odometry.step_config.StepConfig`.
+    config : RefineConfig, optional
+
+    Returns
+    -------
+    Refinement
+        ``times``, ``poses``, ``covariances``, and how far scans agree before and after (``agreement``).
+
+    Raises
+    ------
+    MissingDataError, DataError, ConfigError
+        No scanner, no motion, or a path that does not cover it.
+
+    Examples
+    --------
+    >>> found = gs.refine_path("lidar3d-hku1", steps={"period": None, "odometry_tilt_sigma": 0.005})
+    >>> found.agreement
+    """
+    log = source if isinstance(source, SensorLog) else load(source)
+    if steps is None:
+        steps = recommended(log, "segslam").get("frontend", {}).get("steps", {})
+    cut = make_steps(log, steps if isinstance(steps, StepConfig) else build(StepConfig, dict(steps), "steps"))
+    start = chain(cut.odometry) if path is None else path
+    if start.times[0] > cut.times[0] or start.times[-1] < cut.times[-1]:
+        raise DataError(
+            "the path does not cover the scans",
+            where=log.name,
+            got=f"{start.times[0]:.3f} to {start.times[-1]:.3f} s",
+            wanted=f"{cut.times[0]:.3f} to {cut.times[-1]:.3f} s",
+        )
+    with one_blas_thread():
+        return refine(Scans.of(cut), start.interpolate(cut.times), config)
 
 
 def compare(

@@ -20,10 +20,16 @@ class RefineConfig:
     """Way over which the points of steps are searched together [m]."""
     chunk_time: float = 10.0
     """Longest time of such a chunk, for robots that stand still [s]."""
+    chunk_turn: float = 0.5
+    """In the plane: greatest turn within such a chunk [rad]; a scanner that looks one way soon sees other walls."""
     reach: float = 10.0
     """Chunks whose centres are nearer than this may see the same surfaces [m]."""
     distances: tuple[float, ...] = (1.0, 0.7, 0.5, 0.4, 0.3)
     """Greatest distance of a pair in each round over all passes [m]."""
+    spacing: float = 0.2
+    """In the plane: way from node to node [m]. Steps between, whole scans of the same place, follow the odometry."""
+    turn: float = 0.1
+    """In the plane: turn from node to node [rad]; whichever of the two is reached first."""
     every: int = 2
     """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
     most_points: int = 400_000
@@ -37,7 +43,7 @@ class RefineConfig:
     """What counts as a surface."""
 
     def __post_init__(self) -> None:
-        for name in ("chunk_length", "chunk_time", "reach", "spent", "knot"):
+        for name in ("chunk_length", "chunk_time", "chunk_turn", "reach", "spacing", "turn", "spent", "knot"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")

@@ -3,7 +3,8 @@
 Increments of odometry are compared with the path, roll and pitch with gravity. Errors that do not fade within a step
 would be promised away many times over if they were taken for white, so they are states: the bias of the yaw rate, which
 may walk; the scale of distances; the direction in which the body is said to move (a scanner that is mounted askew
-against the odometry); the offset between the clocks of motion and scans; the constant part of gravity's roll and pitch.
+against the odometry); the offset between the clocks of motion and scans; the constant part of gravity's roll and pitch;
+in the plane what wheels turn too much for each metre and each radian.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]
 
-SCALE, SIDE, RISE, CLOCK, ROLL, PITCH = range(6)
+SCALE, SIDE, RISE, CLOCK, ROLL, PITCH, BEND, TURN = range(8)
 """Places of the constant states: scale of distances; direction of motion, to the side and upwards [rad]; clock of the
-motion ahead of the scans [s]; gravity's constant roll and pitch [rad]. In 2-D: the first, second and fourth."""
+motion ahead of the scans [s]; gravity's constant roll and pitch [rad]; what wheels turn too much for each metre [rad/m]
+and for each radian. In 3-D: all but the last two. In 2-D: the first, second, fourth and the last two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,8 @@ class MotionModel:
         d = self.group.dim
         span = float(t[-1] - t[0]) if n > 1 else 0.0
         self.knots = np.linspace(t[0], t[-1], max(2, int(np.ceil(span / knot)) + 1))
-        self.constants = 6 if d == 3 else 3
-        self.at = np.array([SCALE, SIDE, RISE, CLOCK, ROLL, PITCH] if d == 3 else [0, 1, -1, 2, -1, -1])
+        self.constants = 6 if d == 3 else 5
+        self.at = np.array([0, 1, 2, 3, 4, 5, -1, -1] if d == 3 else [0, 1, -1, 2, -1, -1, 3, 4])
         self.widths = np.concatenate([np.full(n, self.group.dof), np.ones(len(self.knots)), [self.constants]]).astype(
             np.int64
         )
@@ -96,6 +98,9 @@ class MotionModel:
         if d == 3:
             B[:, P[0], 2 + self.at[RISE]] = -move[:, 2]
             B[:, P[2], 2 + self.at[RISE]] = move[:, 0]
+        else:
+            B[:, 2, 2 + self.at[BEND]] = -move[:, 0]
+            B[:, 2, 2 + self.at[TURN]] = -xi[:, 2]
         B[:, :, 2 + self.at[CLOCK]] = -(edge[1:] - edge[:-1])
         keep = np.arange(g.dof)
         if self.gravity:  # roll and pitch of the increments are gravity's own: they are read there
@@ -113,6 +118,17 @@ class MotionModel:
     def steps_count(self) -> int:
         """Number of step nodes."""
         return len(self.steps)
+
+    def constant_sigmas(self) -> Array:
+        """Prior σ of the constant states ``(c,)``."""
+        s, sigma = self.sigmas, np.zeros(self.constants)
+        for place, value in zip(
+            (SCALE, SIDE, RISE, CLOCK, ROLL, PITCH, BEND, TURN),
+            (s.scale, s.direction, s.direction, s.clock, s.tilt, s.tilt, s.bend, s.turn),
+        ):
+            if self.at[place] >= 0:
+                sigma[self.at[place]] = value
+        return sigma
 
     def whiteners(self) -> Array:
         """``W`` ``(n - 1, m, m)`` with ``Wᵀ W`` = information of the increments, at their present scales."""
@@ -141,6 +157,11 @@ class MotionModel:
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
         W = self.whiteners()
         k = self.keep
+        if (
+            g.dim == 2
+        ):  # wheels that slip, and records that lie, are no matter of σ: beyond what chance does, less weight
+            r = np.einsum("kij,kj->ki", W, e[:, k])
+            W = W * np.sqrt(np.minimum(1.0, SLIPPED / np.maximum(np.sum(r**2, axis=1), 1e-12)))[:, None, None]
         return Terms(
             np.einsum("kij,kj->ki", W, e[:, k]),
             W @ J[:, k],
@@ -164,12 +185,7 @@ class MotionModel:
             (1, 1),
             "yaw bias walk",
         )
-        sigma = np.zeros(self.constants)
-        for place, value in zip(
-            (SCALE, SIDE, RISE, CLOCK, ROLL, PITCH), (s.scale, s.direction, s.direction, s.clock, s.tilt, s.tilt)
-        ):
-            if self.at[place] >= 0:
-                sigma[self.at[place]] = value
+        sigma = self.constant_sigmas()
         fixed = Terms(
             (constants / sigma)[None], np.diag(1.0 / sigma)[None], np.array([[n + K]]), (self.constants,), "constants"
         )
@@ -220,5 +236,7 @@ class MotionModel:
         return Terms((r / HELD)[None], (J / HELD)[None], np.array([[0]]), (g.dof,), "gauge")
 
 
+SLIPPED = 16.3
+"""χ² of an increment in the plane beyond which it is none of those whose σ is stated: 99.9 %."""
 HELD = 1e-5
 """σ of the gauge [m, rad]: far below what anything else says."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from graphslam.core.poses import group_of
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel
+from graphslam.refine.nodes import find_nodes, path_between, scans_at
 from graphslam.refine.problem import Problem, Solved, States, point_information
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Cloud, Surfaces, associate, chunk_pairs, find_surfaces
@@ -79,7 +80,7 @@ class Refinement:
     yaw_bias : (k, 2)
         Time [s] and bias of the yaw rate [rad/s] at the knots.
     constants : dict of str to (value, σ)
-        ``scale``, ``side``, ``rise``, ``clock``, ``roll``, ``pitch``.
+        ``scale``, ``side``, ``rise``, ``clock``, ``roll``, ``pitch``; ``bend``, ``turn``.
     rounds : tuple of Round
     parts : dict of str to float
         Objective by kind of factor at the end.
@@ -92,6 +93,10 @@ class Refinement:
         contradict each other.
     solved : Solved
         The last linearisation, for joint covariances.
+    nodes : (m,)
+        Steps that are nodes of the problem; between them the path follows the odometry.
+    own : (n, d, d)
+        Covariance of steps between nodes that they do not share with a node.
     """
 
     times: Array
@@ -106,6 +111,8 @@ class Refinement:
     agreement: tuple[float, float]
     motion: float
     solved: Solved
+    nodes: Index
+    own: Array
 
     @property
     def better(self) -> bool:
@@ -114,9 +121,16 @@ class Refinement:
 
     def joint(self, steps: npt.ArrayLike) -> Array:
         """Joint covariance of some steps ``(k·d, k·d)``."""
-        d = self.covariances.shape[1]
-        rows = (np.asarray(steps, np.int64)[:, None] * d + np.arange(d)).ravel()
-        return self.solved.factor.inverse_block(rows)
+        d, g = self.covariances.shape[1], group_of(self.poses)
+        k = np.asarray(steps, np.int64)
+        near = np.clip(np.searchsorted(self.nodes, k), 0, len(self.nodes) - 1)
+        rows, back = np.unique(near, return_inverse=True)
+        P = self.solved.factor.inverse_block((rows[:, None] * d + np.arange(d)).ravel())
+        P = P.reshape(len(rows), d, len(rows), d)[back][:, :, back]
+        A = g.adjoint(g.between(self.poses[k], self.poses[self.nodes[near]]))
+        C = np.einsum("iab,ibjc,jdc->iajd", A, P, A)
+        C[np.arange(len(k)), :, np.arange(len(k))] += self.own[k]
+        return np.asarray(C.reshape(len(k) * d, -1))
 
 
 def refine(
@@ -152,10 +166,27 @@ def refine(
         )
     if len(steps) < 3:
         raise DataError("too few steps to refine", where=steps.name, got=len(steps), wanted="≥ 3")
-    work = _Work(steps, start, config, progress or (lambda _: None))
+    nodes = find_nodes(steps, config.spacing, config.turn)
+    few = 3 <= len(nodes) < len(steps)
+    if not few:
+        nodes = np.arange(len(steps), dtype=np.int64)
+    work = _Work(scans_at(steps, nodes) if few else steps, start[nodes], config, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
-    return work.run()
+    found = work.run()
+    if not few:
+        return found
+    poses, covariances, own = path_between(steps, nodes, found.poses, found.covariances)
+    return replace(
+        found,
+        times=steps.times,
+        poses=poses,
+        covariances=covariances,
+        start=start,
+        refused=nodes[found.refused],
+        nodes=nodes,
+        own=own,
+    )
 
 
 class _Work:
@@ -165,7 +196,8 @@ class _Work:
         self.steps, self.start, self.config, self.tell = steps, start, config, tell
         self.group = group_of(start)
         self.motion = MotionModel(steps, knot=config.knot)
-        self.cloud = Cloud.of(steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time)
+        turn = config.chunk_turn if steps.group.dim == 2 else np.inf
+        self.cloud = Cloud.of(steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time, chunk_turn=turn)
         self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
         self.problem = Problem(self.motion, self.cloud, start[0].copy())
         self.poses = start.copy()
@@ -265,7 +297,7 @@ class _Work:
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
         const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))
-        names = ("scale", "side", "rise", "clock", "roll", "pitch")
+        names = ("scale", "side", "rise", "clock", "roll", "pitch", "bend", "turn")
         sigma = np.sqrt(np.diag(const))
         at = self.motion.at
         return Refinement(
@@ -283,4 +315,6 @@ class _Work:
             agreement=(self.agreement(self.start), self.agreement(self.poses)),
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
             solved=solved,
+            nodes=np.arange(n, dtype=np.int64),
+            own=np.zeros((n, w, w)),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,9 +76,12 @@ class Scans:
     def of(cls, steps: Steps) -> Scans:
         """Those of steps, with σ of the lasting errors that their motion states, never less
         than :data:`~graphslam.frontends.odometry.lasting.LEAST`."""
+        odometry = steps.odometry
+        if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
+            odometry = replace(odometry, covariances=steps.recorded.covariances)
         return cls(
             times=steps.times,
-            odometry=steps.odometry,
+            odometry=odometry,
             offsets=steps.offsets,
             points=steps.points.astype(np.float32),
             origins=steps.origins.astype(np.float32),
@@ -112,7 +115,7 @@ class Scans:
     def save(self, file: Path) -> None:
         """Write ``scans.npz``."""
         l = self.lasting
-        lasting = [l.yaw_bias, l.yaw_walk, l.scale, l.direction, l.clock, l.tilt]
+        lasting = [l.yaw_bias, l.yaw_walk, l.scale, l.direction, l.clock, l.tilt, l.bend, l.turn]
         arrays: dict[str, Any] = {
             "format": SCANS_FORMAT,
             "times": self.times,
@@ -139,8 +142,8 @@ class Scans:
         a = read_npz(file, fmt=SCANS_FORMAT, fields=FIELDS)
         s = a["scalars"]
         try:
-            if len(s) != 9 or not np.all(s >= 0) or s[0] <= 0:
-                raise DataError("scalars are impossible", got=s.tolist(), wanted="9 numbers, ≥ 0, the range > 0")
+            if len(s) != 11 or not np.all(s >= 0) or s[0] <= 0:
+                raise DataError("scalars are impossible", got=s.tolist(), wanted="11 numbers, ≥ 0, the range > 0")
             d = {3: 2, 7: 3}.get(a["increments"].shape[1])
             if d is None or a["points"].shape != a["origins"].shape or a["points"].shape[1] != d:
                 raise DataError("points and increments do not fit", got=(a["increments"].shape, a["points"].shape))
@@ -165,6 +168,8 @@ class Scans:
                     direction=float(s[6]),
                     clock=float(s[7]),
                     tilt=float(s[8]),
+                    bend=float(s[9]),
+                    turn=float(s[10]),
                 ),
                 name=name,
             )

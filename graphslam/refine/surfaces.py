@@ -41,16 +41,18 @@ class Cloud:
     rows: Index
 
     @classmethod
-    def of(cls, steps: Scans, *, chunk_length: float, chunk_time: float) -> Cloud:
-        """The returns of steps in chunks of a length [m], at most of a time [s]."""
+    def of(cls, steps: Scans, *, chunk_length: float, chunk_time: float, chunk_turn: float = np.inf) -> Cloud:
+        """The returns of steps in chunks of a length [m], at most of a time [s] and of a turn of the heading [rad]."""
         n = len(steps)
         step = np.repeat(np.arange(n), np.diff(steps.offsets))
         hit = steps.returns
         way, t = steps.path_length, steps.times
+        turned = np.cumsum(np.abs(steps.group.log(steps.odometry.increments)[:, steps.group.heading]))
         chunk = np.zeros(n, np.int64)
         c, first = 0, 0
         for k in range(1, n):
-            if way[k] - way[first] > chunk_length or t[k] - t[first] > chunk_time:
+            longer = way[k] - way[first] > chunk_length or t[k] - t[first] > chunk_time
+            if longer or turned[k] - turned[first] > chunk_turn:
                 c, first = c + 1, k
             chunk[k] = c
         s = step[hit]

@@ -1,0 +1,120 @@
+"""Which steps are the nodes of a refinement, and the path of the steps between them.
+
+A planar scanner sends ten whole scans while the robot moves by its own length: their surfaces are the same, and so are
+the errors of their beams. As nodes of their own they cost the cube of their number, and tell nothing new. Nodes are
+therefore the steps between which the body moved; what lies between follows the odometry from node to node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.core.records import Odometry
+from graphslam.refine.scans import Scans
+
+Index = npt.NDArray[np.int64]
+
+
+def find_nodes(steps: Scans, spacing: float, turn: float) -> Index:
+    """Numbers ``(m,)`` of the steps that are nodes: first, last, and each that moved enough since the one before.
+
+    In space a step may hold a part of a turn of the scanner only, and all are nodes.
+
+    Parameters
+    ----------
+    steps : Scans
+    spacing, turn : float
+        Way [m] and turn [rad] by the odometry from node to node; a step is one as soon as either is reached.
+    """
+    n, g = len(steps), steps.group
+    if g.dim == 3 or n < 3:
+        return np.arange(n, dtype=np.int64)
+    u = steps.odometry.increments
+    way, turned = np.cumsum(np.hypot(u[:, 0], u[:, 1])), np.cumsum(np.abs(u[:, 2]))
+    seen = np.diff(steps.offsets) > 0
+    nodes = [0]
+    for k in range(1, n - 1):
+        if seen[k] and (way[k] - way[nodes[-1]] >= spacing or turned[k] - turned[nodes[-1]] >= turn):
+            nodes.append(k)
+    return np.array([*nodes, n - 1], np.int64)
+
+
+def scans_at(steps: Scans, nodes: Index) -> Scans:
+    """The scans of some steps, with the motion between them."""
+    g, o = steps.group, steps.odometry
+    increments, covariances = o.increments[nodes].copy(), o.covariances[nodes].copy()
+    U, P = chained(steps, nodes)
+    last = nodes[1:] - 1
+    increments[1:] = g.compose(U[last], o.increments[nodes[1:]])
+    back = g.adjoint(g.inverse(o.increments[nodes[1:]]))
+    covariances[1:] += back @ P[last] @ np.swapaxes(back, 1, 2)
+    counts = np.diff(steps.offsets)[nodes]
+    rows = np.repeat(steps.offsets[nodes] - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    times = steps.times[nodes]
+    return replace(
+        steps,
+        times=times,
+        odometry=Odometry(times=times, increments=increments, covariances=covariances),
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        points=steps.points[rows],
+        origins=steps.origins[rows],
+        returns=steps.returns[rows],
+        tilt=None if steps.tilt is None else steps.tilt[nodes],
+    )
+
+
+def chained(steps: Scans, nodes: Index) -> tuple[Array, Array]:
+    """Motion ``(n, 7|3)`` from the last node to each step, and its covariance ``(n, d, d)``, right tangent."""
+    g, o, n = steps.group, steps.odometry, len(steps)
+    first = np.zeros(n, bool)
+    first[nodes] = True
+    U, P = np.tile(g.identity, (n, 1)), np.zeros((n, g.dof, g.dof))
+    back = g.adjoint(g.inverse(o.increments))
+    for k in range(1, n):
+        if not first[k]:
+            U[k] = g.compose(U[k - 1], o.increments[k])
+            P[k] = back[k] @ P[k - 1] @ back[k].T + o.covariances[k]
+    return U, P
+
+
+def path_between(steps: Scans, nodes: Index, poses: Array, covariances: Array) -> tuple[Array, Array, Array]:
+    """All steps along the refined path of the nodes.
+
+    Parameters
+    ----------
+    steps : Scans
+    nodes : (m,)
+    poses : (m, 7|3)
+        Of the nodes.
+    covariances : (m, d, d)
+
+    Returns
+    -------
+    poses : (n, 7|3)
+    covariances : (n, d, d)
+    own : (n, d, d)
+        What steps between nodes do not share with a node.
+    """
+    g, n = steps.group, len(steps)
+    U, _ = chained(steps, nodes)
+    a = np.clip(np.searchsorted(nodes, np.arange(n), side="right") - 1, 0, len(nodes) - 2)
+    b = a + 1
+    whole = scans_at(steps, nodes).odometry
+    # what the refined path moved more than the odometry from node to node, spread by time
+    left = g.log(g.between(whole.increments[b], g.between(poses[a], poses[b])))
+    t = steps.times
+    share = (t - t[nodes[a]]) / (t[nodes[b]] - t[nodes[a]])
+    out = g.compose(g.compose(poses[a], U), g.exp(share[:, None] * left))
+    out[nodes] = poses
+    s = share[:, None, None]
+    own = s * (1.0 - s) * whole.covariances[b]
+    C = own.copy()
+    for node, weight in ((a, 1.0 - s), (b, s)):
+        A = g.adjoint(g.between(out, poses[node]))
+        C += weight * (A @ covariances[node] @ np.swapaxes(A, 1, 2))
+    C[nodes], own[nodes] = covariances, 0.0
+    return out, 0.5 * (C + np.swapaxes(C, 1, 2)), own
