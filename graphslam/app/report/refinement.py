@@ -16,6 +16,8 @@ MEANING = {
     "clock": ("clock of the motion ahead of that of the scans", "s"),
     "roll": ("lasting error of gravity's roll", "rad"),
     "pitch": ("lasting error of gravity's pitch", "rad"),
+    "bend": ("wheels turn too much for each metre", "rad/m"),
+    "turn": ("wheels turn too much for each radian", "share"),
 }
 """Lasting errors: in words, and their unit."""
 BEFORE_AFTER = (
