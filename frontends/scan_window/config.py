@@ -31,7 +31,7 @@ class ScanWindowConfig:
     """σ of the normal of a surface [rad]: what surfaces hold must be clearly more than it would pretend to."""
     least_points: int = 20
     """A scan with fewer points on surfaces is lost: it corrects nothing."""
-    least_overlap: float = 0.25
+    least_overlap: float = 0.1
     """… and one of whose points a smaller share lies on surfaces."""
     most_spread: float = 0.15
     """… and one whose residuals are spread wider than this [m]."""

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphslam.core import se3
-from graphslam.core.errors import DataError
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.records import Odometry
+from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
 from graphslam.frontends.scan_window.exits import relative_covariance
@@ -92,3 +93,17 @@ def followed(steps: Steps, config: ScanWindowConfig) -> Steps:
         tilt_sigma=0.0,
         errors=FollowedErrors(steps, config),
     )
+
+
+def once(config: StepConfig) -> None:
+    """Refuse steps whose motion was fused with the same scans already.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if config.match_scans:
+        raise ConfigError(
+            "frontend.steps.match_scans = true fuses the motion with the scans, which scan-to-window odometry would "
+            "spend a second time; wanted false"
+        )

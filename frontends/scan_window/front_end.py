@@ -25,6 +25,7 @@ from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
 from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam.frontends.scan_window.followed import once
 from graphslam.frontends.scan_window.tracker import Found, Tracker
 
 MANY = 0.2
@@ -77,6 +78,9 @@ class ScanWindowFrontEndConfig:
     """How each scan is put on the surfaces of the window before it."""
     submap: WindowSubmapConfig = field(default_factory=WindowSubmapConfig)
     """How the path is cut, and what the maps are made of."""
+
+    def __post_init__(self) -> None:
+        once(self.steps)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.followed import followed
+from graphslam.frontends.scan_window.followed import followed, once
 from graphslam.frontends.segslam.config import SegSlamConfig
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segslam import run_segslam
@@ -37,6 +37,10 @@ class SegSlamFrontEndConfig:
     """Errors that all particles share, where the filter carries them."""
     window: ScanWindowConfig = field(default_factory=ScanWindowConfig)
     """Scan-to-window odometry inside the segments (``segslam.inside = "scan-window"``)."""
+
+    def __post_init__(self) -> None:
+        if self.segslam.inside == "scan-window":
+            once(self.steps)
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,6 +219,12 @@ def test_segslam_follows_scans_inside_its_segments(log: SensorLog) -> None:
     followed_exit = g.between(path[rows[0]], path[rows[1]])
     assert np.abs(g.log(g.between(followed_exit, scans.exit_pose))).max() < 1e-6
     assert np.sqrt(scans.exit_covariance[2, 2]) < 0.7 * np.sqrt(sampled.exit_covariance[2, 2])
+    twice = StepConfig(match_scans=True)
+    with pytest.raises(ConfigError, match="match_scans"):
+        ScanWindowFrontEndConfig(steps=twice)
+    with pytest.raises(ConfigError, match="match_scans"):
+        SegSlamFrontEndConfig(steps=twice, segslam=SegSlamConfig(inside="scan-window"))
+    assert SegSlamFrontEndConfig(steps=twice).segslam.inside == "filter"
     with pytest.raises(ConfigError, match="inside"):
         SegSlamConfig(inside="guess")  # type: ignore[arg-type]
 
