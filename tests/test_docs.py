@@ -32,6 +32,7 @@ PAGES = [
     "registration.md",
     "report.md",
     "robust.md",
+    "scan-window.md",
     "segmap-graph.md",
     "segslam-recorded.md",
     "segslam.md",

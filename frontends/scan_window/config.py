@@ -18,12 +18,14 @@ class ScanWindowConfig:
     """Age of the oldest surfaces of the window [s]."""
     most_steps: int = 60
     """Steps of the window at most: of faster scans only every so many become surfaces."""
-    lay: float = 4.0
+    lay: float | None = None
     """Scans become surfaces together, so many seconds of them at a time, when those of the next lot are there too [s].
-    A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted."""
+    A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted;
+    but what lies behind by then must still be in view. None: 4 s in space, where scanners spin as slowly, and 1 s in the
+    plane, where one scan sees all that it can."""
     points: int = 250
     """Points of a scan that are looked for on surfaces."""
-    distances: tuple[float, ...] = (1.0, 0.5, 0.3, 0.3)
+    distances: tuple[float, ...] = (1.0, 0.5, 0.3)
     """Greatest distance of a point from its surface in each iteration [m]."""
     spent: float = 1.7
     """σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
@@ -41,7 +43,7 @@ class ScanWindowConfig:
     """What counts as a surface."""
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "lay", "spent", "normal_sigma", "most_spread", "surprise"):
+        for name in ("seconds", "spent", "normal_sigma", "most_spread", "surprise"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"window: {name} = {value}; wanted > 0")
@@ -52,7 +54,7 @@ class ScanWindowConfig:
         for name, least in (("most_steps", 2), ("points", 6), ("least_points", 6)):
             if getattr(self, name) < least:
                 raise ConfigError(f"window: {name} = {getattr(self, name)}; wanted ≥ {least}")
-        if self.lay > self.seconds or self.lay < self.spacing:
+        if self.lay is not None and not self.spacing <= self.lay <= self.seconds:
             raise ConfigError(f"window: lay = {self.lay} s; wanted between two steps ({self.spacing} s) and seconds")
 
     @property

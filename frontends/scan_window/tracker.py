@@ -41,6 +41,8 @@ Index = npt.NDArray[np.int64]
 
 FREE_TILT = 0.02
 """σ of roll and pitch of a step's motion where gravity tells them [rad]: they were made of gravity's own readings."""
+LAY = {2: 1.0, 3: 4.0}
+"""How long scans are gathered for surfaces where nobody says so [s]."""
 CLEARLY = 4.0
 """How many times what noise of the normals would say of a direction surfaces must say of it."""
 TOLD = 1e-5
@@ -116,6 +118,7 @@ class Tracker:
         self.normals = np.zeros_like(self.points)
         self.R = np.zeros((self.slots + 2, g.dim, g.dim))
         self.t = np.zeros((self.slots + 2, g.dim))
+        self.lay = config.lay if config.lay is not None else LAY[g.dim]
         self.free = list(range(self.slots))[::-1]
         self.lots: list[list[tuple[int, int, float]]] = []  # (slot, points, time) of the steps of each lot
         self.waiting: list[tuple[int, int, float]] = []
@@ -242,6 +245,7 @@ class Tracker:
         self.points[source], self.origins[source] = points[p], origins[p]
         towards = origins[p] - points[p]
         d = np.zeros(self.x)
+        lately = self._seen(self.pose)  # the corrections to come turn it by next to nothing
         for distance in c.distances:
             pose = g.compose(self.pose, g.exp(d[:w]))
             R = self._place(self.NOW, pose)
@@ -266,7 +270,8 @@ class Tracker:
             L, G, b = self._blocks(pairs, information, slots)
             # what is measured: Jᵀ Λ r, of as many directions as surfaces hold, each of unit noise
             every = every_direction(points[p][near], information)
-            M = held_directions(L, every, c.normal_sigma, self._unheld(L, every, pose))
+            seen = np.stack([L, every])
+            M = held_directions(L, every, c.normal_sigma, self._unheld(lately + seen))
             H = np.zeros((len(M), self.x))
             H[:, :w] = M @ L
             y = M @ (L @ d[:w] - b)
@@ -274,25 +279,20 @@ class Tracker:
             d = gain[0] @ y
         surprise = float(y @ np.linalg.solve(gain[2], y))
         lost = "spread" if scatter > c.most_spread else "surprise" if surprise > c.surprise else ""
-        self._remember(L, every, pose)
+        self._lately, self._seen_at = (1.0 - self.config.spacing / self.lay) * lately + seen, pose
         if not lost:
             self._correct(gain, y)
         return Found(n, overlap, scatter, surprise, lost)
 
-    def _unheld(self, L: Array, every: Array, pose: Array) -> Array:
+    def _unheld(self, seen: Array) -> Array:
         """Directions ``(w, m)`` that nothing has held lately, this scan included: along a corridor, say."""
-        held, all_held = self._seen(pose) + np.stack([L, every])
-        values, V = directions(held, all_held, self.config.normal_sigma)
+        values, V = directions(seen[0], seen[1], self.config.normal_sigma)
         return V[:, values <= CLEARLY]
 
     def _seen(self, pose: Array) -> Array:
         """What scans held of late, and what they would have along every axis ``(2, w, w)``, in the axes of a pose."""
         A = self.group.adjoint(self.group.between(self._seen_at, pose))
         return np.asarray(A.T @ self._lately @ A)
-
-    def _remember(self, L: Array, every: Array, pose: Array) -> None:
-        left = 1.0 - self.config.spacing / self.config.lay
-        self._lately, self._seen_at = left * self._seen(pose) + np.stack([L, every]), pose
 
     def _blocks(self, pairs: Pairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
         """Information of the pose of now ``(w, w)``, with the slots ``(w, w·s)``, and ``Jᵀ Λ r`` ``(w,)``."""
@@ -338,7 +338,7 @@ class Tracker:
                 self._clone(slot)
                 self.waiting.append((slot, n, now))
                 self.last_laid = now
-        if self.waiting and now - self.waiting[0][2] >= self.config.lay - 1e-6:
+        if self.waiting and now - self.waiting[0][2] >= self.lay - 1e-6:
             self._make_surfaces(now)
 
     def _drop(self, lots: int) -> None:
