@@ -21,8 +21,8 @@ class ScanWindowConfig:
     lay: float | None = None
     """Scans become surfaces together, so many seconds of them at a time, when those of the next lot are there too [s].
     A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted;
-    but what lies behind by then must still be in view. None: 4 s in space, where scanners spin as slowly, and 1 s in the
-    plane, where one scan sees all that it can."""
+    but what lies behind by then must still be in view. None: 4 s in space, where scanners spin as slowly, and 1 s in
+    the plane, where one scan sees all that it can."""
     points: int = 250
     """Points of a scan that are looked for on surfaces."""
     distances: tuple[float, ...] = (1.0, 0.5, 0.3)

@@ -281,6 +281,14 @@ def test_a_place_that_nobody_saw_before_is_no_place(caplog: pytest.LogCaptureFix
 
 
 def test_numbers_that_cannot_be_are_refused() -> None:
-    for bad in ({"seconds": 0.0}, {"spent": np.nan}, {"least_overlap": 1.5}, {"distances": ()}, {"points": 3}, {"lay": 30.0}, {"lay": 0.1}):
+    for bad in (
+        {"seconds": 0.0},
+        {"spent": np.nan},
+        {"least_overlap": 1.5},
+        {"distances": ()},
+        {"points": 3},
+        {"lay": 30.0},
+        {"lay": 0.1},
+    ):
         with pytest.raises(ConfigError, match="window"):
             ScanWindowConfig(**bad)  # type: ignore[arg-type]
