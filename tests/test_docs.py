@@ -28,6 +28,7 @@ PAGES = [
     "mrclam.md",
     "plaza.md",
     "pose-graphs.md",
+    "refinement-recorded.md",
     "refinement.md",
     "registration.md",
     "report.md",
