@@ -48,7 +48,7 @@ def lasting_sigmas(steps: Steps) -> LastingSigmas:
         bias, scale = e.yaw_bias, e.scale
     return LastingSigmas(
         yaw_bias=max(bias, least.yaw_bias),
-        yaw_walk=max(walk, least.yaw_walk),
+        yaw_walk=walk or least.yaw_walk,  # a walk that is greater than stated is found and widened
         scale=max(scale, least.scale),
         direction=least.direction,
         clock=least.clock,

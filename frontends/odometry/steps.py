@@ -53,6 +53,8 @@ class Steps:
         Where the beams began, same frame.
     returns : (q,) bool
         Did the beam meet something?
+    ages : (q,) or None
+        Time from each beam to the stamp of its step, over which motion alone places it [s]; None: no time.
     max_range, range_sigma : float
         [m]
     tilt : (n, 2) or None
@@ -85,6 +87,7 @@ class Steps:
     returns: npt.NDArray[np.bool_]
     max_range: float
     range_sigma: float
+    ages: Array | None = None
     tilt: Array | None = None
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
@@ -121,6 +124,8 @@ class Steps:
         for what in ("max_range", "range_sigma"):
             if not (np.isfinite(getattr(self, what)) and getattr(self, what) > 0):
                 raise DataError(f"{what} is impossible", where=self.name, got=getattr(self, what), wanted="> 0 m")
+        if self.ages is not None and (np.shape(self.ages) != (q,) or not np.all(np.isfinite(self.ages))):
+            raise GeometryError("ages have the wrong shape", got=np.shape(self.ages), wanted=f"({q},), finite")
         if self.tilt is not None:
             tilt = np.ascontiguousarray(self.tilt, dtype=np.float64)
             if d != 3 or tilt.shape != (n, 2) or not np.all(np.isfinite(tilt)):
@@ -222,6 +227,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         returns=met,
         max_range=config.max_range or max(s.max_range for s in sources),
         range_sigma=max(s.sigma for s in sources),
+        ages=times[step[chosen]] - beam_times[chosen],
         tilt=level_on_the_whole(motion.tilt, motion.odometry.increments) if config.level_floors else motion.tilt,
         tilt_sigma=motion.tilt_sigma,
         tilt_time=motion.tilt_time,

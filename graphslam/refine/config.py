@@ -34,16 +34,13 @@ class RefineConfig:
     """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
     most_points: int = 400_000
     """Of so many points in the log at most; more are thinned evenly."""
-    spent: float = 1.7
-    """σ of a pair in multiples of the spread of the residuals: pairs share targets and normals, and are worth less than
-    if they did not. From simulated robots of drawn noise."""
     knot: float = 30.0
     """Time between the knots of the yaw bias [s]."""
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     """What counts as a surface."""
 
     def __post_init__(self) -> None:
-        for name in ("chunk_length", "chunk_time", "chunk_turn", "reach", "spacing", "turn", "spent", "knot"):
+        for name in ("chunk_length", "chunk_time", "chunk_turn", "reach", "spacing", "turn", "knot"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")

@@ -17,10 +17,19 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
+from graphslam.linear.block_cholesky import BlockFactor
 from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]
 
+SAMPLED = 24
+"""Steps at which the leverage of the odometry is computed."""
+LEFT = 0.02
+"""Share of a residual below which it says nothing of its noise."""
+MEDIAN = 0.4549
+"""Median of χ² of one degree of freedom."""
+RARE = 10.8
+"""χ² of one degree of freedom at 99.9 %."""
 SCALE, SIDE, RISE, CLOCK, ROLL, PITCH, BEND, TURN = range(8)
 """Places of the constant states: scale of distances; direction of motion, to the side and upwards [rad]; clock of the
 motion ahead of the scans [s]; gravity's constant roll and pitch [rad]; what wheels turn too much for each metre [rad/m]
@@ -58,9 +67,11 @@ class MotionModel:
     steps : Scans
     knot : float
         Time between knots of the yaw bias [s].
+    bridge : (n,), optional
+        Share of an increment's variance that is left of it in the beams of its step.
     """
 
-    def __init__(self, steps: Scans, *, knot: float = 30.0) -> None:
+    def __init__(self, steps: Scans, *, knot: float = 30.0, bridge: Array | None = None) -> None:
         self.steps = steps
         self.group: Group = group_of(steps.odometry.increments)
         self.sigmas = steps.lasting
@@ -106,10 +117,12 @@ class MotionModel:
         if self.gravity:  # roll and pitch of the increments are gravity's own: they are read there
             keep = keep[2:]
         self.keep = keep
+        self.bridge = np.zeros(n) if bridge is None else bridge
         C = steps.odometry.covariances[1:][:, keep][:, :, keep]
         self.covariances = C
         self.B = B
         self.scales = np.ones(len(keep))
+        self.walk = 1.0
         self.nodes = np.column_stack(
             [np.arange(n - 1), np.arange(1, n), n + a, n + a + 1, np.full(n - 1, n + len(self.knots))]
         ).astype(np.int64)
@@ -136,6 +149,56 @@ class MotionModel:
         L = np.linalg.cholesky(self.covariances * s[:, None] * s[None, :])
         return np.asarray(np.linalg.inv(L))
 
+    def corrections(self, poses: Array) -> Array:
+        """By what the increment that ends at each step was wrong ``(n, d)``, right tangent; the first is not known."""
+        g = self.group
+        e = g.log(g.between(self.steps.odometry.increments[1:], g.between(poses[:-1], poses[1:])))
+        return np.concatenate([np.zeros((1, g.dof)), e])
+
+    @property
+    def within(self) -> Array:
+        """Covariance ``(n, d, d)`` of the beams of a step against its pose, by the motion between, as widened."""
+        C = self.steps.odometry.covariances.copy()
+        s = np.ones(self.group.dof)
+        s[self.keep] = self.scales
+        if len(C) > 1:
+            C[0] = C[1]
+        return np.asarray(C * s[:, None] * s[None, :] * self.bridge[:, None, None])
+
+    def widen(self, poses: Array, states: tuple[Array, Array], factor: BlockFactor) -> None:
+        """Widen what the motion promises where the scans show more: its σ by component, and the walk of the yaw bias.
+
+        A residual is smaller than the error by as much as it took part in the estimate (its leverage
+        ``(J C Jᵀ)_cc / Σ_cc``), so the variance is the sum of squares over what is left of the degrees of freedom
+        (restricted maximum likelihood); the leverage is computed at some steps evenly over the way. Never narrowed:
+        what a log states of its motion is believed as far as nothing speaks against it.
+        """
+        g, n, K = self.group, len(self.steps), len(self.knots)
+        e, J = self._increments(poses, states)
+        C = np.einsum("kii->ki", self.covariances)
+        some = np.unique(np.linspace(0, n - 2, min(SAMPLED, n - 1)).round().astype(np.int64))
+        left = np.empty((len(some), len(self.keep)))
+        for m, k in enumerate(some.tolist()):
+            rows = k * g.dof + np.arange(2 * g.dof)
+            rest = [self.nodes[k, 2:4] - n, K + np.arange(self.constants)]
+            rows = np.concatenate([rows, n * g.dof + np.concatenate(rest)])
+            P = factor.inverse_block(rows)
+            left[m] = 1.0 - np.einsum("ci,ij,cj->c", J[k], P, J[k]) / (C[k] * self.scales**2)
+        left = np.maximum(np.mean(left, axis=0), LEFT)
+        # single slips are no matter of σ
+        r2 = np.minimum(e**2 / C, RARE * self.scales**2)
+        self.scales = np.sqrt(np.maximum(np.mean(r2, axis=0) / left, 1.0))
+        q = self.sigmas.yaw_walk * np.sqrt(np.diff(self.knots))
+        z = np.diff(states[0]) / np.maximum(q, 1e-12)
+        P = factor.inverse_block(n * g.dof + np.arange(K))
+        D = np.diff(np.eye(K), axis=0)
+        left_walk = np.maximum(1.0 - np.einsum("ci,ij,cj->c", D, P, D) / (q * self.walk) ** 2, 0.0)
+        # by the median of steps that the scans decided: one bent by a wrong place shall not excuse itself
+        decided = left_walk > LEFT
+        if np.count_nonzero(decided) >= 3:
+            spread = float(np.median(z[decided] ** 2 / left_walk[decided])) / MEDIAN
+            self.walk = float(np.sqrt(max(spread, 1.0)))
+
     def _state_rows(self, states: tuple[Array, Array]) -> Array:
         bias, constants = states
         a = self.nodes[:, 2] - len(self.steps)
@@ -148,27 +211,25 @@ class MotionModel:
             out += self._gravity(poses, states)
         return out
 
-    def _odometry(self, poses: Array, states: tuple[Array, Array]) -> Terms:
+    def _increments(self, poses: Array, states: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Errors of the increments ``(n - 1, m)`` and their derivatives by the two poses and the states."""
         g = self.group
         step = g.between(poses[:-1], poses[1:])
         raw = g.log(g.between(self.steps.odometry.increments[1:], step))
         e = raw - np.einsum("kij,kj->ki", self.B, self._state_rows(states))
         Jr = np.linalg.inv(g.right_jacobian(raw))
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
+        return e[:, self.keep], J[:, self.keep]
+
+    def _odometry(self, poses: Array, states: tuple[Array, Array]) -> Terms:
+        e, J = self._increments(poses, states)
         W = self.whiteners()
-        k = self.keep
-        if (
-            g.dim == 2
-        ):  # wheels that slip, and records that lie, are no matter of σ: beyond what chance does, less weight
-            r = np.einsum("kij,kj->ki", W, e[:, k])
+        if self.group.dim == 2:
+            # wheels that slip, and records that lie, are no matter of σ: beyond what chance does, less weight
+            r = np.einsum("kij,kj->ki", W, e)
             W = W * np.sqrt(np.minimum(1.0, SLIPPED / np.maximum(np.sum(r**2, axis=1), 1e-12)))[:, None, None]
-        return Terms(
-            np.einsum("kij,kj->ki", W, e[:, k]),
-            W @ J[:, k],
-            self.nodes,
-            (g.dof, g.dof, 1, 1, self.constants),
-            "odometry",
-        )
+        dof = self.group.dof
+        return Terms(np.einsum("kij,kj->ki", W, e), W @ J, self.nodes, (dof, dof, 1, 1, self.constants), "odometry")
 
     def _priors(self, states: tuple[Array, Array]) -> list[Terms]:
         bias, constants = states
@@ -176,8 +237,7 @@ class MotionModel:
         first = Terms(
             np.array([[bias[0] / s.yaw_bias]]), np.array([[[1.0 / s.yaw_bias]]]), np.array([[n]]), (1,), "yaw bias"
         )
-        q = s.yaw_walk * np.sqrt(np.diff(self.knots))
-        q = np.maximum(q, 1e-12)
+        q = np.maximum(self.walk * s.yaw_walk * np.sqrt(np.diff(self.knots)), 1e-12)
         walk = Terms(
             (np.diff(bias) / q)[:, None],
             np.stack([-1.0 / q, 1.0 / q], axis=1)[:, None, :],

@@ -63,6 +63,7 @@ def scans_at(steps: Scans, nodes: Index) -> Scans:
         points=steps.points[rows],
         origins=steps.origins[rows],
         returns=steps.returns[rows],
+        ages=None if steps.ages is None else steps.ages[rows],
         tilt=None if steps.tilt is None else steps.tilt[nodes],
     )
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from graphslam.core.geometry import Array
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
@@ -91,10 +92,62 @@ class Solved:
     parts: dict[str, float]
 
 
-def point_information(pairs: Pairs, residuals: Array, sigma: float, *, robust: float = 2.0) -> Array:
-    """Information of each pair: Geman–McClure weight at ``robust`` σ, over σ² and over the pairs of its source."""
-    w = 1.0 / (1.0 + (residuals / (robust * sigma)) ** 2) ** 2
-    return w * pairs.weight / sigma**2
+FEW = 200
+"""Pairs below which the noise of ranges is not told from that of surfaces."""
+BINS = 6
+"""Classes of incidence, and classes of the share of motion in each of them."""
+MOTION = 0.25
+"""Greatest share of the motion within a step in the spread of residuals that shall tell other noise."""
+
+
+def pair_noise(pairs: Pairs, residuals: Array) -> Array:
+    """Variances ``(3,)`` of a range and of the surfaces themselves [m²], from the residuals; 1 for the motion.
+
+    A beam that grazes a floor misses it by far less than its range is wrong, so the spread of residuals follows the
+    incidence of their beams: squared spreads (1.48 × the median absolute residual) of classes of incidence are
+    fitted by a line with two parts that are never negative.
+    """
+    if not len(residuals):
+        return np.array([0.0, 1e-4, 1.0])
+    spread = (1.4826 * float(np.median(np.abs(residuals)))) ** 2
+    if len(residuals) < FEW:
+        return np.array([0.0, max(spread, LEAST_SPREAD**2), 1.0])
+    order = np.argsort(pairs.once[:, 0], kind="stable")
+    classes = [
+        c[part]
+        for c in np.array_split(order, BINS)
+        for part in np.array_split(np.argsort(pairs.once[c, 2], kind="stable"), BINS)
+    ]
+    A = np.array([np.median(pairs.once[c], axis=0) for c in classes])
+    v = np.array([(1.4826 * np.median(np.abs(residuals[c]))) ** 2 for c in classes])
+    # a step's own pose takes up some of what its motion did: classes that motion rules say too little
+    ruled = A[:, 2] / np.maximum(v, LEAST_SPREAD**2)
+    some = ruled <= max(MOTION, float(np.quantile(ruled, 0.25)))
+    A, v = A[some, :2], np.maximum(v[some] - A[some, 2], LEAST_SPREAD**2)
+    w = 1.0 / np.maximum(v, 1e-3 * spread + LEAST_SPREAD**2)  # the spread of a variance is in proportion to it
+    found, _ = nnls(A * w[:, None], v * w)
+    return np.append(np.maximum(found, [0.0, LEAST_SPREAD**2]), 1.0)
+
+
+LEAST_SPREAD = 1e-3
+"""No surface is known better [m]."""
+
+
+def point_information(pairs: Pairs, residuals: Array, noise: Array, least: float = 0.0) -> Array:
+    """Information of each pair: Geman–McClure weight over the variance of what it newly spends.
+
+    Parameters
+    ----------
+    pairs : Pairs
+    residuals : (k,) [m]
+    noise : (3,)
+        Variances of a range and of the surfaces [m²], and 1 (:func:`pair_noise`).
+    least : float
+        Residuals are not doubted below it: before the path is right, they are wide for its sake [m].
+    """
+    doubt = np.maximum(4.0 * pairs.once @ noise, least**2)
+    w = 1.0 / (1.0 + residuals**2 / doubt) ** 2
+    return np.asarray(w / (pairs.spent @ noise))
 
 
 class Problem:

@@ -22,7 +22,7 @@ from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel
 from graphslam.refine.nodes import find_nodes, path_between, scans_at
-from graphslam.refine.problem import Problem, Solved, States, point_information
+from graphslam.refine.problem import Problem, Solved, States, pair_noise, point_information
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 
@@ -35,6 +35,8 @@ STILL = 0.01, 1e-4
 """A round moved the path by less than so much [m], or than this share of its length: it stands still."""
 MOST_ROUNDS = 10
 MOST_GATES = 6
+DOUBTED = 0.2
+"""Residuals below this share of the greatest distance of a pair are not doubted."""
 KEPT = 2
 """Surfaces are found anew in so many rounds over all passes; then the steps about a point move no more."""
 
@@ -47,8 +49,8 @@ class Round:
     ----------
     distance : float
         Greatest distance of a pair [m].
-    sigma : float
-        Of a pair [m].
+    noise : (float, float)
+        σ of a range and of the surfaces themselves [m].
     pairs, passes : int
         Pairs of points, and how many of them between different passes.
     spread : float
@@ -58,7 +60,7 @@ class Round:
     """
 
     distance: float
-    sigma: float
+    noise: tuple[float, float]
     pairs: int
     passes: int
     spread: float
@@ -88,6 +90,10 @@ class Refinement:
         Steps that the start drew together although the scans between contradict it.
     agreement : (start, refined)
         Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
+    scales : (c,)
+        By which the σ of the odometry's components were widened, since the scans show more.
+    walk : float
+        The same of the walk of the yaw bias.
     motion : float
         χ² of the walk of the yaw bias by its degrees of freedom: far above 1 where the scans of passes and the motion
         contradict each other.
@@ -109,6 +115,8 @@ class Refinement:
     parts: dict[str, float]
     refused: Index
     agreement: tuple[float, float]
+    scales: Array
+    walk: float
     motion: float
     solved: Solved
     nodes: Index
@@ -195,9 +203,11 @@ class _Work:
     def __init__(self, steps: Scans, start: Array, config: RefineConfig, tell: Callable[[str], Any]) -> None:
         self.steps, self.start, self.config, self.tell = steps, start, config, tell
         self.group = group_of(start)
-        self.motion = MotionModel(steps, knot=config.knot)
         turn = config.chunk_turn if steps.group.dim == 2 else np.inf
-        self.cloud = Cloud.of(steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time, chunk_turn=turn)
+        self.raw = self.cloud = Cloud.of(
+            steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time, chunk_turn=turn
+        )
+        self.motion = MotionModel(steps, knot=config.knot, bridge=self.cloud.bridge())
         self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
         self.problem = Problem(self.motion, self.cloud, start[0].copy())
         self.poses = start.copy()
@@ -218,21 +228,33 @@ class _Work:
         return self.result(guides.steps[~taken & guides.far(self.poses)])
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool) -> None:
-        """Associate anew, and two Gauss–Newton steps; without a σ it comes from the spread of the residuals."""
+        """Associate anew, and two Gauss–Newton steps; without a σ the noise comes from the residuals."""
+        if passes:
+            self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
         if again or self.surfaces is None:
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
         self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
         self.pairs, self.whose = associate(
-            self.cloud, self.surfaces, self.poses, self.chunks, distance=distance, every=self.every
+            self.cloud,
+            self.surfaces,
+            self.poses,
+            self.chunks,
+            distance=distance,
+            every=self.every,
+            within=self.motion.within if sigma is None else None,
         )
         before = self.poses
         for _ in range(2):
             r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-            spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
-            s = sigma or max(self.config.spent * spread, 0.1 * distance)
-            self.step(point_information(self.pairs, r, s))
+            noise = pair_noise(self.pairs, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
+            solved = self.step(point_information(self.pairs, r, noise, DOUBTED * distance))
+        if passes:
+            self.motion.widen(self.poses, self.states, solved.factor)
+        self.noise = noise
         d = self.group.dim
         moved = float(np.sqrt(np.mean(np.sum((self.poses[:, :d] - before[:, :d]) ** 2, axis=1))))
+        spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
+        s = (float(np.sqrt(noise[0])), float(np.sqrt(noise[1])))
         found = Round(distance, s, len(r), int(np.sum(self.chunks.passes[self.whose])), spread, moved)
         self.rounds.append(found)
         self.tell(f"round {len(self.rounds)}: {found.pairs} pairs within {distance:g} m, moved by {moved:.3f} m")
@@ -254,7 +276,7 @@ class _Work:
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
         r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-        information = point_information(self.pairs, r, NEAR[-1][1])
+        information = point_information(self.pairs, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
         taken = np.zeros(len(guides), bool)
         for _ in range(MOST_GATES):
             w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
@@ -283,17 +305,19 @@ class _Work:
             chunks,
             distance=self.config.distances[0],
             every=4 * self.every,
+            within=self.motion.within,
             least_share=0.0,
         )
         r = self.problem.residuals(pairs, surfaces, poses)
-        near = np.maximum(1.0 - (r / (3.0 * self.rounds[-1].sigma)) ** 2, 0.0)
-        return float(np.sum(near * pairs.weight) / max(np.sum(pairs.weight), 1.0))
+        near = np.maximum(1.0 - r**2 / (9.0 * pairs.once @ self.noise), 0.0)
+        weight = 1.0 / pairs.spent[:, 1]
+        return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
     def result(self, refused: Index) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
         r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-        solved = self.step(point_information(self.pairs, r, self.rounds[-1].sigma))
+        solved = self.step(point_information(self.pairs, r, self.noise, DOUBTED * self.config.distances[-1]))
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
         const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))
@@ -313,6 +337,8 @@ class _Work:
             parts=solved.parts,
             refused=refused,
             agreement=(self.agreement(self.start), self.agreement(self.poses)),
+            scales=self.motion.scales,
+            walk=self.motion.walk,
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
             solved=solved,
             nodes=np.arange(n, dtype=np.int64),

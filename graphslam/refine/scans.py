@@ -29,6 +29,7 @@ FIELDS: dict[str, Field] = {
     "origins": floats("q", "c"),
     "returns": flags("q"),
     "scalars": floats("s"),
+    "ages": floats("q"),
     "tilt": floats("n", "t", optional=True),
 }
 """``scalars``: max_range, tilt_sigma, tilt_time, then the lasting errors in their order."""
@@ -49,6 +50,8 @@ class Scans:
     points, origins : (q, dim)
         Ends and beginnings of the beams, frame of the base at the stamp of their step, in single precision [m].
     returns : (q,) bool
+    ages : (q,)
+        Time from each beam to the stamp of its step, over which motion alone places it, in single precision [s].
     max_range : float
         [m]
     tilt : (n, 2) or None
@@ -65,6 +68,7 @@ class Scans:
     points: npt.NDArray[np.float32]
     origins: npt.NDArray[np.float32]
     returns: npt.NDArray[np.bool_]
+    ages: npt.NDArray[np.float32]
     max_range: float
     lasting: LastingSigmas
     tilt: Array | None = None
@@ -86,6 +90,7 @@ class Scans:
             points=steps.points.astype(np.float32),
             origins=steps.origins.astype(np.float32),
             returns=steps.returns,
+            ages=np.asarray(np.zeros(len(steps.points)) if steps.ages is None else steps.ages, np.float32),
             max_range=steps.max_range,
             lasting=lasting_sigmas(steps),
             tilt=steps.tilt,
@@ -125,6 +130,7 @@ class Scans:
             "points": self.points,
             "origins": self.origins,
             "returns": self.returns,
+            "ages": self.ages,
             "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting]),
         }
         if self.tilt is not None:
@@ -147,8 +153,8 @@ class Scans:
             d = {3: 2, 7: 3}.get(a["increments"].shape[1])
             if d is None or a["points"].shape != a["origins"].shape or a["points"].shape[1] != d:
                 raise DataError("points and increments do not fit", got=(a["increments"].shape, a["points"].shape))
-            if len(a["returns"]) != len(a["points"]):
-                raise DataError("returns and points differ in number", got=len(a["returns"]), wanted=len(a["points"]))
+            if not len(a["returns"]) == len(a["ages"]) == len(a["points"]):
+                raise DataError("beams differ in number", got=len(a["returns"]), wanted=len(a["points"]))
             times = check_times(a["times"])
             return cls(
                 times=times,
@@ -157,6 +163,7 @@ class Scans:
                 points=a["points"],
                 origins=a["origins"],
                 returns=a["returns"],
+                ages=a["ages"],
                 max_range=float(s[0]),
                 tilt=a.get("tilt"),
                 tilt_sigma=float(s[1]),

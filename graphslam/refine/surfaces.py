@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +24,12 @@ class Cloud:
     Parameters
     ----------
     points : (q, d)
-        Each in the frame of its own step.
+        Each in the frame of its own step, as the odometry placed it there.
     origins : (q, d)
         Of the beams, same frames.
     step : (q,)
+    age : (q,)
+        Share of the step's time between the beam and the stamp.
     chunk : (n,)
         Of each step, ascending from 0.
     rows : (c + 1,)
@@ -37,6 +39,7 @@ class Cloud:
     points: Array
     origins: Array
     step: Index
+    age: Array
     chunk: Index
     rows: Index
 
@@ -57,9 +60,37 @@ class Cloud:
             chunk[k] = c
         s = step[hit]
         rows = np.searchsorted(chunk[s], np.arange(c + 2)).astype(np.int64)
+        dt = np.diff(t, prepend=t[0])
+        dt[0] = dt[1] if n > 1 else 1.0
         return cls(
-            steps.points[hit].astype(np.float64), steps.origins[hit].astype(np.float64), s.astype(np.int64), chunk, rows
+            steps.points[hit].astype(np.float64),
+            steps.origins[hit].astype(np.float64),
+            s.astype(np.int64),
+            np.clip(steps.ages[hit] / dt[s], 0.0, 1.0),
+            chunk,
+            rows,
         )
+
+    def corrected(self, corrections: Array) -> Cloud:
+        """The cloud with beams placed anew in their steps, whose increments were wrong by ``(n, dof)``.
+
+        An error of the increment grew evenly over the time of the step: a beam of age α was placed by the share α of
+        it too far.
+        """
+        c = -self.age[:, None] * corrections[self.step]  # small: to first order
+
+        def moved(x: Array) -> Array:
+            if x.shape[1] == 3:
+                return np.asarray(x + np.cross(c[:, :3], x) + c[:, 3:])
+            return np.asarray(x + c[:, :2] + c[:, 2:] * np.column_stack([-x[:, 1], x[:, 0]]))
+
+        return replace(self, points=moved(self.points), origins=moved(self.origins))
+
+    def bridge(self) -> Array:
+        """Share ``(n,)`` of an increment's variance that is left of it in the beams of its step, mean of α (1 − α)."""
+        n = len(self.chunk)
+        part = np.bincount(self.step, weights=self.age * (1.0 - self.age), minlength=n)
+        return np.asarray(part / np.maximum(np.bincount(self.step, minlength=n), 1))
 
     @property
     def chunks(self) -> int:
@@ -130,6 +161,9 @@ class ChunkPairs:
         return self.a - self.b > NEIGHBOURS
 
 
+ALIKE = 0.5
+"""Share of its variance in which the motion moves all beams of a step as one: a Brownian bridge over a unit of time has
+the variance 1/6 at a time drawn at random, and its mean 1/12."""
 NEXT = 1
 """Chunks that follow each other so closely are compared with each other."""
 NEIGHBOURS = 5
@@ -174,6 +208,7 @@ def associate(
     *,
     distance: float,
     every: int,
+    within: Array | None = None,
     alike: float = 0.85,
     least_share: float = 0.10,
 ) -> tuple[Pairs, Index]:
@@ -183,6 +218,8 @@ def associate(
     ----------
     distance : float
         Greatest distance of a pair [m].
+    within : (n, d, d), optional
+        Covariance of the motion that moves the beams of each step against its pose, right tangents.
     alike : float
         Least cosine between the two normals, which point to where the beams came from, so that the two sides of a wall
         or of a ceiling never meet.
@@ -195,10 +232,10 @@ def associate(
     whose : (k,)
         Number of the chunk pair of each.
     """
-    W, _ = cloud.world(poses)
-    N = np.einsum("kij,kj->ki", rotations(poses)[cloud.step], surfaces.normals)
+    W, O = cloud.world(poses)
+    R = rotations(poses)
+    N = np.einsum("kij,kj->ki", R[cloud.step], surfaces.normals)
     trees: dict[int, tuple[cKDTree, Index]] = {}
-    sources: dict[int, Index] = {}
 
     def tree(c: int) -> tuple[cKDTree, Index]:
         if c not in trees:
@@ -207,17 +244,12 @@ def associate(
             trees[c] = (cKDTree(W[rows]) if len(rows) else None, rows)
         return trees[c]
 
-    def source(c: int) -> Index:
-        if c not in sources:
-            rows = np.arange(cloud.rows[c], cloud.rows[c + 1], every)
-            sources[c] = rows[surfaces.flat[surfaces.stands[rows]]]
-        return sources[c]
-
     found_p, found_q, whose = [], [], []
     passes = chunks.passes
     for m, (a, b) in enumerate(zip(chunks.a.tolist(), chunks.b.tolist())):
         t, rows = tree(b)
-        p = source(a)
+        p = np.arange(cloud.rows[a], cloud.rows[a + 1], every)
+        p = p[surfaces.flat[surfaces.stands[p]]]
         if t is None or len(p) == 0:
             continue
         _, at = t.query(W[p], k=1, distance_upper_bound=distance)
@@ -233,5 +265,31 @@ def associate(
     none = np.zeros(0, np.int64)
     p, q = np.concatenate([none, *found_p]), np.concatenate([none, *found_q])
     w = np.concatenate([none, *whose]).astype(np.int64)
-    times = np.bincount(p, minlength=len(cloud.points))
-    return Pairs(p, q, cloud.step[p], cloud.step[q], 1.0 / times[p]), w
+    O = O - W
+    beam = np.linalg.norm(O, axis=1)
+    beam[beam == 0] = 1.0
+
+    def incidence(rows: Index) -> Array:
+        return np.asarray((np.einsum("ki,ki->k", N[q], O[rows]) / beam[rows]) ** 2)
+
+    cp, cq = incidence(p), incidence(q)
+    mp, mq = (np.bincount(k, minlength=len(cloud.points))[k] for k in (p, q))
+    i, j = cloud.step[p], cloud.step[q]
+    once = [cp + cq, np.ones(len(p)), np.zeros(len(p))]
+    spent = [mp * cp + mq * cq, 0.5 * (mp + mq), np.zeros(len(p))]
+    if within is not None:
+        n = surfaces.normals[q]
+        for rows, k, m, times in ((p, i, np.einsum("kji,kj->ki", R[i], N[q]), mp), (q, j, n, mq)):
+            lever = _lever(cloud.points[rows], m)
+            v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
+            once[2] += v
+            spent[2] += v * np.maximum(times, ALIKE * np.bincount(k, minlength=len(within))[k])
+    return Pairs(p, q, i, j, np.column_stack(once), np.column_stack(spent)), w
+
+
+def _lever(points: Array, normals: Array) -> Array:
+    """Derivative ``(k, 6|3)`` of the distance of points from planes by the right tangent of their pose."""
+    if points.shape[1] == 3:
+        return np.concatenate([np.cross(points, normals), normals], axis=1)
+    turn = points[:, 0] * normals[:, 1] - points[:, 1] * normals[:, 0]
+    return np.column_stack([normals, turn])
