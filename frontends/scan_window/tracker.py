@@ -260,7 +260,7 @@ class Tracker:
             if len(near) < c.least_points or overlap < c.least_overlap:
                 return Found(len(near), overlap, np.nan, 0.0, "overlap")
             n = len(near)
-            pairs = Pairs(source[near], q, np.full(n, self.NOW), slot, np.ones(n))
+            pairs = Pairs(source[near], q, np.full(n, self.NOW), slot)
             r = np.empty(n)
             plane_residuals(pairs, self.R, self.t, self.points, self.normals, r)
             scatter = 1.4826 * float(np.median(np.abs(r)))

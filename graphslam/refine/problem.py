@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.refine.motion import MotionModel, Terms
-from graphslam.refine.surfaces import Cloud, Surfaces
+from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import rotations
 
@@ -100,7 +100,7 @@ MOTION = 0.25
 """Greatest share of the motion within a step in the spread of residuals that shall tell other noise."""
 
 
-def pair_noise(pairs: Pairs, residuals: Array) -> Array:
+def pair_noise(pairs: Association, residuals: Array) -> Array:
     """Variances ``(3,)`` of a range and of the surfaces themselves [m²], from the residuals; 1 for the motion.
 
     A beam that grazes a floor misses it by far less than its range is wrong, so the spread of residuals follows the
@@ -133,12 +133,12 @@ LEAST_SPREAD = 1e-3
 """No surface is known better [m]."""
 
 
-def point_information(pairs: Pairs, residuals: Array, noise: Array, least: float = 0.0) -> Array:
+def point_information(pairs: Association, residuals: Array, noise: Array, least: float = 0.0) -> Array:
     """Information of each pair: Geman–McClure weight over the variance of what it newly spends.
 
     Parameters
     ----------
-    pairs : Pairs
+    pairs : Association
     residuals : (k,) [m]
     noise : (3,)
         Variances of a range and of the surfaces [m²], and 1 (:func:`pair_noise`).

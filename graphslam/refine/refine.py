@@ -234,7 +234,7 @@ class _Work:
         if again or self.surfaces is None:
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
         self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
-        self.pairs, self.whose = associate(
+        self.found = associate(
             self.cloud,
             self.surfaces,
             self.poses,
@@ -245,9 +245,9 @@ class _Work:
         )
         before = self.poses
         for _ in range(2):
-            r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-            noise = pair_noise(self.pairs, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
-            solved = self.step(point_information(self.pairs, r, noise, DOUBTED * distance))
+            r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+            noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
+            solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
         if passes:
             self.motion.widen(self.poses, self.states, solved.factor)
         self.noise = noise
@@ -255,7 +255,7 @@ class _Work:
         moved = float(np.sqrt(np.mean(np.sum((self.poses[:, :d] - before[:, :d]) ** 2, axis=1))))
         spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
         s = (float(np.sqrt(noise[0])), float(np.sqrt(noise[1])))
-        found = Round(distance, s, len(r), int(np.sum(self.chunks.passes[self.whose])), spread, moved)
+        found = Round(distance, s, len(r), int(np.sum(self.chunks.passes[self.found.whose])), spread, moved)
         self.rounds.append(found)
         self.tell(f"round {len(self.rounds)}: {found.pairs} pairs within {distance:g} m, moved by {moved:.3f} m")
         log.info("refine: %s", found)
@@ -264,7 +264,7 @@ class _Work:
         """One Gauss–Newton step."""
         assert self.surfaces is not None
         solved, step = self.problem.linearise(
-            self.poses, self.states, self.pairs, self.surfaces, information, extra or []
+            self.poses, self.states, self.found.pairs, self.surfaces, information, extra or []
         )
         self.poses, self.states = self.problem.moved(self.poses, self.states, step)
         return solved
@@ -275,8 +275,8 @@ class _Work:
         if not len(guides):
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
-        r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-        information = point_information(self.pairs, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
+        r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+        information = point_information(self.found, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
         taken = np.zeros(len(guides), bool)
         for _ in range(MOST_GATES):
             w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
@@ -298,7 +298,7 @@ class _Work:
         """
         surfaces = find_surfaces(self.cloud, poses, self.config.surface)
         chunks = chunk_pairs(self.cloud, poses, self.config.reach, passes=True)
-        pairs, _ = associate(
+        found = associate(
             self.cloud,
             surfaces,
             poses,
@@ -308,16 +308,16 @@ class _Work:
             within=self.motion.within,
             least_share=0.0,
         )
-        r = self.problem.residuals(pairs, surfaces, poses)
-        near = np.maximum(1.0 - r**2 / (9.0 * pairs.once @ self.noise), 0.0)
-        weight = 1.0 / pairs.spent[:, 1]
+        r = self.problem.residuals(found.pairs, surfaces, poses)
+        near = np.maximum(1.0 - r**2 / (9.0 * found.once @ self.noise), 0.0)
+        weight = 1.0 / found.spent[:, 1]
         return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
     def result(self, refused: Index) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
-        r = self.problem.residuals(self.pairs, self.surfaces, self.poses)
-        solved = self.step(point_information(self.pairs, r, self.noise, DOUBTED * self.config.distances[-1]))
+        r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+        solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
         const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))

@@ -200,6 +200,31 @@ MOST = 3
 """Chunks of one other pass that a chunk is compared with."""
 
 
+@dataclass(frozen=True, slots=True)
+class Association:
+    """Pairs of points on surfaces, and what is known of their errors.
+
+    Parameters
+    ----------
+    pairs : Pairs
+    whose : (k,)
+        Number of the chunk pair of each.
+    once : (k, 3)
+        Variance of the residual per unit of (σ² of a range, σ² of the surfaces themselves, the motion's own share): the
+        squared cosines of incidence of the two beams, added; 1; the variance by the motion between beam and stamp [m²].
+    spent : (k, 3)
+        The same, each part multiplied by the number of pairs that share its error: those that use the same point,
+        those that use the same step. As independent errors of these variances they are no smaller in any direction
+        than the correlated ones (the matrix of the pairs is dominated by the sums of its rows), so that nothing is
+        spent twice.
+    """
+
+    pairs: Pairs
+    whose: Index
+    once: Array
+    spent: Array
+
+
 def associate(
     cloud: Cloud,
     surfaces: Surfaces,
@@ -211,7 +236,7 @@ def associate(
     within: Array | None = None,
     alike: float = 0.85,
     least_share: float = 0.10,
-) -> tuple[Pairs, Index]:
+) -> Association:
     """Nearest surface in each chunk for every ``every``-th point of its partner.
 
     Parameters
@@ -225,12 +250,6 @@ def associate(
         or of a ceiling never meet.
     least_share : float
         Pairs of passes whose share of paired points is below it are left out.
-
-    Returns
-    -------
-    pairs : Pairs
-    whose : (k,)
-        Number of the chunk pair of each.
     """
     W, O = cloud.world(poses)
     R = rotations(poses)
@@ -284,7 +303,7 @@ def associate(
             v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
             once[2] += v
             spent[2] += v * np.maximum(times, ALIKE * np.bincount(k, minlength=len(within))[k])
-    return Pairs(p, q, i, j, np.column_stack(once), np.column_stack(spent)), w
+    return Association(Pairs(p, q, i, j), w, np.column_stack(once), np.column_stack(spent))
 
 
 def _lever(points: Array, normals: Array) -> Array:

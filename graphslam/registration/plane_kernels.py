@@ -22,22 +22,12 @@ class Pairs(NamedTuple):
         Rows of the points: the source point, and the target point whose neighbourhood is the surface.
     i, j : (k,)
         Their steps.
-    once : (k, 3)
-        Variance of the residual per unit of (σ² of a range, σ² of the surfaces themselves, the motion's own share): the
-        squared cosines of incidence of the two beams, added; 1; the variance by the motion between beam and stamp [m²].
-    spent : (k, 3)
-        The same, each part multiplied by the number of pairs that share its error: those that use the same point,
-        those that use the same step. As independent errors of these variances they are no smaller in any direction
-        than the correlated ones (the matrix of the pairs is dominated by the sums of its rows), so that nothing is
-        spent twice.
     """
 
     source: Index
     target: Index
     i: Index
     j: Index
-    once: Array
-    spent: Array
 
 
 @nb.njit(cache=True, fastmath={"contract"})

@@ -120,7 +120,7 @@ def test_what_a_scan_says_of_two_poses(dim: int) -> None:
     t.points[source] = rng.normal(size=(40, dim))
     t._place(t.NOW, t.pose)
     slot = q // t.rows
-    pairs = Pairs(source, q, np.full(40, t.NOW), slot, np.ones(40))
+    pairs = Pairs(source, q, np.full(40, t.NOW), slot)
     information, slots = rng.uniform(1.0, 2.0, size=40), np.unique(slot)
     poses = {t.NOW: t.pose} | {int(s): pose_of(t, int(s)) for s in slots}
 
