@@ -49,7 +49,7 @@ class Round:
     ----------
     distance : float
         Greatest distance of a pair [m].
-    noise : (float, float)
+    range_sigma, surface_sigma : float
         σ of a range and of the surfaces themselves [m].
     pairs, passes : int
         Pairs of points, and how many of them between different passes.
@@ -60,7 +60,8 @@ class Round:
     """
 
     distance: float
-    noise: tuple[float, float]
+    range_sigma: float
+    surface_sigma: float
     pairs: int
     passes: int
     spread: float
@@ -254,8 +255,8 @@ class _Work:
         d = self.group.dim
         moved = float(np.sqrt(np.mean(np.sum((self.poses[:, :d] - before[:, :d]) ** 2, axis=1))))
         spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
-        s = (float(np.sqrt(noise[0])), float(np.sqrt(noise[1])))
-        found = Round(distance, s, len(r), int(np.sum(self.chunks.passes[self.found.whose])), spread, moved)
+        a, b, _ = np.sqrt(noise).tolist()
+        found = Round(distance, a, b, len(r), int(np.sum(self.chunks.passes[self.found.whose])), spread, moved)
         self.rounds.append(found)
         self.tell(f"round {len(self.rounds)}: {found.pairs} pairs within {distance:g} m, moved by {moved:.3f} m")
         log.info("refine: %s", found)

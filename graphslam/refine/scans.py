@@ -29,7 +29,7 @@ FIELDS: dict[str, Field] = {
     "origins": floats("q", "c"),
     "returns": flags("q"),
     "scalars": floats("s"),
-    "ages": floats("q"),
+    "ages": floats("q", optional=True),
     "tilt": floats("n", "t", optional=True),
 }
 """``scalars``: max_range, tilt_sigma, tilt_time, then the lasting errors in their order."""
@@ -50,8 +50,8 @@ class Scans:
     points, origins : (q, dim)
         Ends and beginnings of the beams, frame of the base at the stamp of their step, in single precision [m].
     returns : (q,) bool
-    ages : (q,)
-        Time from each beam to the stamp of its step, over which motion alone places it, in single precision [s].
+    ages : (q,) or None
+        Time from each beam to the stamp of its step, over which motion alone places it [s]; None: no time.
     max_range : float
         [m]
     tilt : (n, 2) or None
@@ -68,9 +68,9 @@ class Scans:
     points: npt.NDArray[np.float32]
     origins: npt.NDArray[np.float32]
     returns: npt.NDArray[np.bool_]
-    ages: npt.NDArray[np.float32]
     max_range: float
     lasting: LastingSigmas
+    ages: npt.NDArray[np.float32] | None = None
     tilt: Array | None = None
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
@@ -90,7 +90,7 @@ class Scans:
             points=steps.points.astype(np.float32),
             origins=steps.origins.astype(np.float32),
             returns=steps.returns,
-            ages=np.asarray(np.zeros(len(steps.points)) if steps.ages is None else steps.ages, np.float32),
+            ages=None if steps.ages is None else steps.ages.astype(np.float32),
             max_range=steps.max_range,
             lasting=lasting_sigmas(steps),
             tilt=steps.tilt,
@@ -130,9 +130,10 @@ class Scans:
             "points": self.points,
             "origins": self.origins,
             "returns": self.returns,
-            "ages": self.ages,
             "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting]),
         }
+        if self.ages is not None:
+            arrays["ages"] = self.ages
         if self.tilt is not None:
             arrays["tilt"] = self.tilt
         write_npz(file, arrays)
@@ -153,7 +154,7 @@ class Scans:
             d = {3: 2, 7: 3}.get(a["increments"].shape[1])
             if d is None or a["points"].shape != a["origins"].shape or a["points"].shape[1] != d:
                 raise DataError("points and increments do not fit", got=(a["increments"].shape, a["points"].shape))
-            if not len(a["returns"]) == len(a["ages"]) == len(a["points"]):
+            if not len(a["returns"]) == len(a.get("ages", a["returns"])) == len(a["points"]):
                 raise DataError("beams differ in number", got=len(a["returns"]), wanted=len(a["points"]))
             times = check_times(a["times"])
             return cls(
@@ -163,7 +164,7 @@ class Scans:
                 points=a["points"],
                 origins=a["origins"],
                 returns=a["returns"],
-                ages=a["ages"],
+                ages=a.get("ages"),
                 max_range=float(s[0]),
                 tilt=a.get("tilt"),
                 tilt_sigma=float(s[1]),

@@ -66,7 +66,7 @@ class Cloud:
             steps.points[hit].astype(np.float64),
             steps.origins[hit].astype(np.float64),
             s.astype(np.int64),
-            np.clip(steps.ages[hit] / dt[s], 0.0, 1.0),
+            np.zeros(len(s)) if steps.ages is None else np.clip(steps.ages[hit] / dt[s], 0.0, 1.0),
             chunk,
             rows,
         )

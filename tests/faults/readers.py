@@ -306,6 +306,7 @@ def some_scans(root: Path) -> None:
         points=r.normal(size=(12, 3)).astype(np.float32),
         origins=np.zeros((12, 3), np.float32),
         returns=np.ones(12, np.bool_),
+        ages=np.zeros(12, np.float32),
         max_range=8.0,
         lasting=LEAST,
         tilt=np.zeros((n, 2)),

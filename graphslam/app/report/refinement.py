@@ -42,7 +42,8 @@ def refinement(folder: ReportFolder) -> Markup:
     parts += [_constants(found), *_bias(found)]
     rounds = found.get("rounds") or []
     columns = {
-        **{"distance": "pairs within [m]", "sigma": "σ of a pair [m]", "pairs": "pairs", "passes": "of other passes"},
+        **{"distance": "pairs within [m]", "range_sigma": "σ of a range [m]"},
+        **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other passes"},
         **{"spread": "spread of the residuals [m]", "moved": "path moved by [m]"},
     }
     parts.append(table(rounds, columns) if rounds else missing("rounds of the refinement."))

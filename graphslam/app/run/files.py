@@ -104,7 +104,12 @@ RUN: dict[str, Any] = {
     "imu?": _PART,
     "verdict?": _PART,
     "refine?": {
-        "rounds?": [{"distance": float, "sigma": float, "pairs": int, "passes": int, "spread": float, "moved": float}],
+        "rounds?": [
+            {
+                **{"distance": float, "range_sigma": float, "surface_sigma": float},
+                **{"pairs": int, "passes": int, "spread": float, "moved": float},
+            }
+        ],
         "agreement?": [float],
         "constants?": {str: {"value": float, "sigma": float}},
         "yaw_bias?": [(float, float)],
