@@ -24,7 +24,7 @@ class RefineConfig:
     """In the plane: greatest turn within such a chunk [rad]; a scanner that looks one way soon sees other walls."""
     reach: float = 10.0
     """Chunks whose centres are nearer than this may see the same surfaces [m]."""
-    distances: tuple[float, ...] = (1.0, 0.7, 0.5, 0.4, 0.3)
+    distances: tuple[float, ...] = (1.0, 0.6, 0.4, 0.3)
     """Greatest distance of a pair in each round over all passes [m]."""
     spacing: float = 0.2
     """In the plane: way from node to node [m]. Steps between, whole scans of the same place, follow the odometry."""

@@ -225,15 +225,17 @@ class _Work:
             self.round(*NEAR[-1], passes=False, again=False)
         guides, taken = self.follow_guides()
         for k, distance in enumerate(self.config.distances):
-            self.round(distance, None, passes=True, again=k < KEPT)
+            self.round(distance, None, passes=True, again=k < KEPT, steps=2 if k == 0 else 1)
         return self.result(guides.steps[~taken & guides.far(self.poses)])
 
-    def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool) -> None:
-        """Associate anew, and two Gauss–Newton steps; without a σ the noise comes from the residuals."""
+    def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
+        """Associate anew, and Gauss–Newton steps; without a σ the noise comes from the residuals."""
         if passes:
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
         if again or self.surfaces is None:
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
+            if not self.rounds:
+                self.first = self.surfaces
         self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
         self.found = associate(
             self.cloud,
@@ -245,7 +247,7 @@ class _Work:
             within=self.motion.within if sigma is None else None,
         )
         before = self.poses
-        for _ in range(2):
+        for _ in range(steps):
             r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
@@ -292,15 +294,14 @@ class _Work:
         self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
         return guides, taken
 
-    def agreement(self, poses: Array) -> float:
+    def agreement(self, cloud: Cloud, surfaces: Surfaces, poses: Array) -> float:
         """Share of the source points with a surface within reach that lie on it, to three times the final σ.
 
-        The pairs are found anew at this path, with surfaces made at this path: nothing is kept of how it came about.
+        The pairs are found anew at this path, among surfaces made there: nothing is kept of how it came about.
         """
-        surfaces = find_surfaces(self.cloud, poses, self.config.surface)
-        chunks = chunk_pairs(self.cloud, poses, self.config.reach, passes=True)
+        chunks = chunk_pairs(cloud, poses, self.config.reach, passes=True)
         found = associate(
-            self.cloud,
+            cloud,
             surfaces,
             poses,
             chunks,
@@ -317,6 +318,10 @@ class _Work:
     def result(self, refused: Index) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
+        cloud = self.cloud
+        self.problem.cloud = self.raw
+        before = self.agreement(self.raw, self.first, self.start)
+        self.problem.cloud = cloud
         r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
         solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
@@ -337,7 +342,7 @@ class _Work:
             rounds=tuple(self.rounds),
             parts=solved.parts,
             refused=refused,
-            agreement=(self.agreement(self.start), self.agreement(self.poses)),
+            agreement=(before, self.agreement(self.cloud, self.surfaces, self.poses)),
             scales=self.motion.scales,
             walk=self.motion.walk,
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
