@@ -9,4 +9,5 @@ STUDIES: dict[str, str] = {
     "segslam-mine": "graphslam.app.studies.segslam_mine:STUDY",
     "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
+    "refinement": "graphslam.app.studies.refinement:STUDY",
 }
