@@ -53,7 +53,7 @@ class RefinementStudy(WorldsStudy[RefinementTrialConfig]):
         out = {"paths": tables.means_table(table, quantities), "nees": tables.means_table(table, NEES)}
         out["gains"] = gain_table(table)
         if not timings.empty:
-            out["cpu"] = tables.means_table(timings, ("cpu_share", "seconds_refine"))
+            out["cpu"] = tables.seconds_table(timings)
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""One run of a world refined by its scans: the graph's path, the refined one, and what wrong starts and robots do.
+"""One run of a world refined by its scans: the graph's path, the refined one, what wrong starts do to it.
 
 Beside SegSLAM's own figures: ``loops``, the graph where the refinement begins; ``refined``; ``wrong-N``, the same begun
 at the graph with N wrong loops between far places, each with a small covariance; ``mount``, ``clock``, ``moving``: the
@@ -77,7 +77,7 @@ def run_refinement_trial(config: RefinementTrialConfig, seed: int) -> list[Measu
         if config.drawn:
             rng = SeedTree(seed).child("robot").generator()
             found = {k: float(np.exp(rng.uniform(np.log(a), np.log(b)))) for k, (a, b) in ROBOTS.items()}
-            grid = replace(grid, crawler=crawler_preset(**found), layout=str(rng.choice(list("ABCD"))))
+            grid = replace(grid, crawler=crawler_preset("light", **found), layout=str(rng.choice(list("ABCD"))))
         return list(RefinementTrial(grid, seed, graph=replace(config.graph, grid=grid), study=config).run())
 
 
