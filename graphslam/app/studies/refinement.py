@@ -6,7 +6,7 @@ loops in the start and faults of the robot. Clutter and every sensor error are d
 Quantities
 ----------
 ``ate_start``, ``ate_aligned``, ``height_rmse``, ``heading_rms`` of the path; ``worse``: 1 where the refinement was
-taken and is farther off than its start. ``nees…``: squared error a degree of freedom, mean over the steps of a run, from
+taken and is farther off than its start. ``nees…``: squared error a degree of freedom, mean over the steps, from
 the start and by block; ``nees_relative``: over 30 s. ``entropy_min``: entropy of all scans along the path; of SegSLAM
 the least over its map samples. ``cpu_share``: CPU time by the length of the log.
 """

@@ -1,0 +1,226 @@
+"""The parts of a refinement against plain twins: Jacobians, blocks, noise of pairs, the linear solution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.core.poses import SE2, SE3, group_of
+from graphslam.core.records import Odometry
+from graphslam.frontends.odometry.lasting import LEAST
+from graphslam.refine.motion import MotionModel
+from graphslam.refine.problem import Problem, pair_noise, point_information
+from graphslam.refine.scans import Scans
+from graphslam.refine.surfaces import Association, Cloud, Surfaces
+from graphslam.registration.plane_kernels import Pairs
+
+EPS = 1e-6
+
+
+def some_scans(rng, dim, n=7, beams=9):
+    """Steps that wind, each with beams of several ages."""
+    g = SE2 if dim == 2 else SE3
+    xi = 0.1 * rng.standard_normal((n, g.dof))
+    xi[:, np.arange(g.dof)[g.position][0]] += 0.4
+    u = g.exp(xi)
+    u[0] = g.identity
+    A = 0.02 * rng.standard_normal((n, g.dof, g.dof))
+    times = np.cumsum(rng.uniform(0.3, 0.6, n))
+    return Scans(
+        times=times,
+        odometry=Odometry(times=times, increments=u, covariances=A @ np.swapaxes(A, 1, 2) + 1e-2 * np.eye(g.dof)),
+        offsets=np.arange(n + 1, dtype=np.int64) * beams,
+        points=(3.0 * rng.standard_normal((n * beams, dim))).astype(np.float32),
+        origins=np.zeros((n * beams, dim), np.float32),
+        returns=np.ones(n * beams, bool),
+        ages=rng.uniform(0, 0.3, n * beams).astype(np.float32),
+        max_range=30.0,
+        lasting=LEAST,
+        tilt=0.05 * rng.standard_normal((n, 2)) if dim == 3 else None,
+        tilt_sigma=4e-3,
+        tilt_time=5.0,
+    )
+
+
+def path_of(scans, rng):
+    g = scans.group
+    poses = [g.exp(0.2 * rng.standard_normal(g.dof))]
+    for u in scans.odometry.increments[1:]:
+        poses.append(g.compose(g.compose(poses[-1], u), g.exp(0.03 * rng.standard_normal(g.dof))))
+    return np.array(poses)
+
+
+def some_problem(rng, dim, pairs=40):
+    scans = some_scans(rng, dim)
+    cloud = Cloud.of(scans, chunk_length=1.0, chunk_time=10.0)
+    motion = MotionModel(scans, knot=1.0, bridge=cloud.bridge())
+    normals = rng.standard_normal((len(cloud.points), dim))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    surfaces = Surfaces(normals, np.ones(len(normals), bool), np.arange(len(normals)))
+    p, q = rng.integers(0, len(normals), (2, pairs))
+    other = cloud.step[p] != cloud.step[q]
+    p, q = p[other], q[other]
+    poses = path_of(scans, rng)
+    problem = Problem(motion, cloud, poses[0].copy())
+    states = (0.01 * rng.standard_normal(len(motion.knots)), 0.01 * rng.standard_normal(motion.constants))
+    return problem, surfaces, Pairs(p, q, cloud.step[p], cloud.step[q]), poses, states
+
+
+def moved(problem, poses, states, column, by):
+    n, w, K = len(poses), problem.motion.group.dof, len(problem.motion.knots)
+    step = np.zeros(n * w + K + problem.motion.constants)
+    step[column] = by
+    return problem.moved(poses, states, step)
+
+
+def differences(problem, poses, states, function):
+    """Derivative of a function of path and states by the step, one column at a time."""
+    width = problem.motion.widths.sum()
+    columns = []
+    for c in range(width):
+        up, down = (function(*moved(problem, poses, states, c, s * EPS)) for s in (1, -1))
+        columns.append((up - down) / (2 * EPS))
+    return np.stack(columns, axis=-1)
+
+
+def dense_terms(terms, widths):
+    """Residuals and the whole Jacobian of one kind of factor."""
+    begin = np.cumsum(widths) - widths
+    first = np.cumsum((0, *terms.widths))
+    f, m = terms.r.shape
+    J = np.zeros((f, m, widths.sum()))
+    for u, w in enumerate(terms.widths):
+        for k in range(f):
+            J[k, :, begin[terms.nodes[k, u]] : begin[terms.nodes[k, u]] + w] += terms.J[k, :, first[u] : first[u + 1]]
+    return terms.r, J
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_jacobians_of_motion_gravity_and_gauge(rng, dim):
+    problem, _, _, poses, states = some_problem(rng, dim)
+    motion = problem.motion
+    held = motion.group.compose(poses[0], motion.group.exp(np.full(motion.group.dof, 1e-7)))
+    makers = [lambda p, s, k=k: motion.terms(p, s)[k] for k in range(len(motion.terms(poses, states)))]
+    makers.append(lambda p, s: motion.gauge(p, held))
+    names = set()
+    for make in makers:
+        terms = make(poses, states)
+        names.add(terms.name)
+        _, J = dense_terms(terms, motion.widths)
+        plain = differences(problem, poses, states, lambda p, s, make=make: make(p, s).r)
+        np.testing.assert_allclose(J, plain, atol=2e-5 * max(1.0, np.abs(plain).max()), err_msg=terms.name)
+    wanted = {"odometry", "yaw bias", "yaw bias walk", "constants", "gauge"}
+    assert names == (wanted | {"gravity"} if dim == 3 else wanted)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_one_step_is_that_of_the_dense_problem_and_so_is_the_covariance(rng, dim):
+    problem, surfaces, pairs, poses, states = some_problem(rng, dim)
+    motion = problem.motion
+    w = rng.uniform(10.0, 1000.0, len(pairs.source))
+    w[3] = 0.0
+    solved, step = problem.linearise(poses, states, pairs, surfaces, w, [])
+    size = motion.widths.sum()
+    H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    r = problem.residuals(pairs, surfaces, poses)
+    J = differences(problem, poses, states, lambda p, s: problem.residuals(pairs, surfaces, p))
+    H += J.T @ (w[:, None] * J)
+    g += J.T @ (w * r)
+    assert solved.parts["scans"] == pytest.approx(float(w @ r**2), rel=1e-9)
+    for terms in [*motion.terms(poses, states), motion.gauge(poses, problem.held)]:
+        e, K = dense_terms(terms, motion.widths)
+        H += np.einsum("fmi,fmj->ij", K, K)
+        g += np.einsum("fmi,fm->i", K, e)
+        cost += float(np.sum(e**2))
+    assert sum(solved.parts.values()) - solved.parts["scans"] == pytest.approx(cost, rel=1e-9)
+    wanted = -np.linalg.solve(H, g)
+    np.testing.assert_allclose(step, wanted, atol=1e-6 * np.abs(wanted).max())
+    C, d = np.linalg.inv(H), motion.group.dof
+    blocks = solved.factor.inverse_diagonal_blocks(np.arange(len(poses), dtype=np.int64) * d, d)
+    for k, block in enumerate(blocks):
+        plain = C[k * d : (k + 1) * d, k * d : (k + 1) * d]
+        np.testing.assert_allclose(block, plain, atol=1e-5 * np.abs(C).max())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_distances_of_points_from_planes(rng, dim):
+    problem, surfaces, pairs, poses, _ = some_problem(rng, dim)
+    g, cloud = group_of(poses), problem.cloud
+    for k, r in enumerate(problem.residuals(pairs, surfaces, poses)):
+        p, q = pairs.source[k], pairs.target[k]
+        seen = g.transform(g.inverse(poses[pairs.j[k]]), g.transform(poses[pairs.i[k]], cloud.points[p]))
+        assert r == pytest.approx(float(surfaces.normals[q] @ (seen - cloud.points[q])), abs=1e-9)
+
+
+def drawn_pairs(rng, points, count):
+    """Pairs among some points, with incidences drawn."""
+    p, q = rng.integers(0, points, (2, count))
+    c = rng.uniform(0.05, 1.0, points)
+    mp, mq = np.bincount(p, minlength=points)[p], np.bincount(q, minlength=points)[q]
+    none = np.zeros(count)
+    once = np.column_stack([c[p] ** 2 + c[q] ** 2, np.ones(count), none])
+    spent = np.column_stack([mp * c[p] ** 2 + mq * c[q] ** 2, 0.5 * (mp + mq), none])
+    steps = np.zeros(count, np.int64)
+    return Association(Pairs(p, q, steps, steps), steps, once, spent), c
+
+
+def test_pairs_promise_no_more_than_their_shared_points_allow(rng):
+    found, c = drawn_pairs(rng, 60, 150)
+    separate = rng.permutation(60) < 30  # points are either sources or targets
+    keep = separate[found.pairs.source] & ~separate[found.pairs.target]
+    p, q = found.pairs.source[keep], found.pairs.target[keep]
+    mp, mq = np.bincount(p, minlength=60)[p], np.bincount(q, minlength=60)[q]
+    rho, f = 0.025, 0.01
+    B = np.zeros((len(p), 60))
+    B[np.arange(len(p)), p] = np.sqrt((rho * c[p]) ** 2 + 0.5 * f**2)
+    B[np.arange(len(p)), q] = -np.sqrt((rho * c[q]) ** 2 + 0.5 * f**2)
+    promised = rho**2 * (mp * c[p] ** 2 + mq * c[q] ** 2) + f**2 * 0.5 * (mp + mq)
+    least = np.linalg.eigvalsh(np.diag(promised) - B @ B.T)[0]
+    assert least > -1e-9
+    # without the multiplicities they would promise more
+    once = rho**2 * (c[p] ** 2 + c[q] ** 2) + f**2
+    assert np.linalg.eigvalsh(np.diag(once) - B @ B.T)[0] < -1e-4
+
+
+@pytest.mark.parametrize(("rho", "f"), [(0.025, 0.0), (0.01, 0.01), (0.0, 0.02), (0.05, 0.005)])
+def test_noise_of_ranges_and_surfaces_is_found_from_residuals(rng, rho, f):
+    found, _ = drawn_pairs(rng, 4000, 30000)
+    motion = rng.uniform(0, 1e-4, 30000) * (rng.random(30000) < 0.5)
+    found = replace(found, once=np.column_stack([found.once[:, :2], motion]))
+    sigma = np.sqrt(found.once @ np.array([rho**2, f**2, 1.0]))
+    r = sigma * rng.standard_normal(30000)
+    wild = rng.random(30000) < 0.03
+    r[wild] = rng.uniform(-0.3, 0.3, wild.sum())
+    a, b = np.sqrt(pair_noise(found, r)[:2])
+    assert a == pytest.approx(rho, abs=0.1 * rho + 0.003)
+    assert b == pytest.approx(f, abs=0.15 * f + 0.004)
+
+
+def test_wild_pairs_have_no_information(rng):
+    found, _ = drawn_pairs(rng, 4000, 1000)
+    noise = np.array([0.02**2, 0.0, 1.0])
+    near, far = point_information(found, np.zeros(1000), noise), point_information(found, np.full(1000, 0.5), noise)
+    np.testing.assert_allclose(near, 1.0 / (found.spent @ noise))
+    assert np.all(far < 3e-4 * near)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_beams_are_placed_where_the_motion_within_their_step_was(rng, dim):
+    scans = some_scans(rng, dim)
+    cloud = Cloud.of(scans, chunk_length=1.0, chunk_time=10.0)
+    g, poses = scans.group, path_of(scans, rng)
+    motion = MotionModel(scans, knot=1.0)
+    wrong = motion.corrections(poses)
+    np.testing.assert_allclose(
+        g.compose(scans.odometry.increments[1:], g.exp(wrong[1:])), g.between(poses[:-1], poses[1:]), atol=1e-9
+    )
+    small = 1e-3 * wrong
+    mended = cloud.corrected(small)
+    for k in range(0, len(cloud.points), 5):
+        T = g.exp(-cloud.age[k] * small[cloud.step[k]])
+        np.testing.assert_allclose(mended.points[k], g.transform(T, cloud.points[k]), atol=1e-5)
+    half = replace(cloud, age=np.full(len(cloud.age), 0.5))
+    np.testing.assert_allclose(half.bridge(), 0.25)
+    assert np.all(replace(cloud, age=np.zeros(len(cloud.age))).bridge() == 0)

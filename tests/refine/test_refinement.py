@@ -1,0 +1,161 @@
+"""Whole refinements of drives through a court that nothing was tuned on: errors, honesty, wrong starts, faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.app.studies.refinement import QUICK_WORLDS
+from graphslam.app.studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
+from graphslam.backend.refining import findings_of
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.poses import SE3
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate import segslam_judge as judge
+from graphslam.refine.refine import refine
+from graphslam.refine.scans import Scans
+from tests.refine.world import court_scans
+
+SEEDS = range(40, 46)
+
+
+def error(times, poses, truth):
+    return judge.path_errors(Trajectory(times, poses), truth).aligned
+
+
+@pytest.fixture(scope="module")
+def drives():
+    out = []
+    for seed in SEEDS:
+        scans, start, truth = court_scans(seed)
+        out.append((scans, start, truth, refine(scans, start)))
+    return out
+
+
+def test_dead_reckoning_is_brought_to_the_truth(drives):
+    for scans, start, truth, found in drives:
+        assert error(scans.times, start, truth) > 1.0
+        assert error(scans.times, found.poses, truth) < 0.02
+        assert found.better
+        assert found.agreement[1] > 0.8
+
+
+def test_the_covariance_is_neither_too_small_nor_too_large(drives):
+    """Mean over the drives; with half or twice the covariance it would be outside."""
+    mean = np.mean([nees_of(found, truth)["nees"] for _, _, truth, found in drives])
+    relative = np.mean([nees_of(found, truth)["nees_relative"] for _, _, truth, found in drives])
+    assert 0.65 < mean < 1.9
+    assert 0.3 < relative < 2.0
+
+
+def test_joint_covariance_holds_that_of_each_step(drives):
+    _, _, _, found = drives[0]
+    some = np.array([3, 50, 170])
+    P = found.joint(some).reshape(3, 6, 3, 6)
+    for k, step in enumerate(some):
+        np.testing.assert_allclose(P[k, :, k], found.covariances[step], rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(found.joint(some))[0] > 0
+
+
+def test_motion_noisier_than_stated_is_widened_and_honest():
+    values, scales = [], []
+    for seed in (41, 42, 44):
+        scans, start, truth = court_scans(seed, wheel_sigma=0.06)  # the front end takes 0.02 for it
+        found = refine(scans, start)
+        values.append(nees_of(found, truth)["nees"])
+        scales.append(found.scales)
+    assert np.all(np.array(scales)[:, 1] > 1.5)  # along the way
+    np.testing.assert_allclose(np.array(scales)[:, 0], 1.0, atol=0.3)  # the gyro is as stated
+    assert 0.5 < np.mean(values) < 2.0
+
+
+def test_motion_as_stated_is_not_widened(drives):
+    assert all(np.max(found.scales) < 1.3 for *_, found in drives)
+
+
+def test_lasting_errors_are_found_within_their_sigma(drives):
+    z = []
+    for *_, found in drives:
+        clock, sigma = found.constants["clock"]
+        z.append(clock / sigma)
+        assert sigma < 5e-3
+        assert abs(np.mean(found.yaw_bias[:, 1])) > 1e-3  # the simulated gyro is biased to ruin the path
+    assert np.mean(np.square(z)) < 6.0
+
+
+def test_wrong_loops_and_faults_of_the_robot_do_no_harm():
+    config = replace(QUICK_WORLDS["court-quick"], wrong=(1, 3), faults=FAULTS)
+    rows = {(m.algorithm, m.quantity): m.value for m in run_refinement_trial(config, 7)}
+    clean = rows["refined", "ate_aligned"]
+    assert clean < 0.02
+    for count in (1, 3):
+        assert rows[f"wrong-{count}", "ate_start"] > 0.5  # the start is bent
+        assert rows[f"wrong-{count}", "ate_aligned"] < 2.0 * clean + 0.005
+        assert rows[f"wrong-{count}", "left_apart"] > 0
+    for fault in FAULTS:
+        assert rows[fault, "worse"] == 0
+        assert rows[fault, "ate_aligned"] < 0.03
+
+
+def test_a_scanner_that_is_mounted_askew_is_named():
+    scans, start, _ = court_scans(41)
+    a = np.deg2rad(1.0)
+    R = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    turned = replace(
+        scans, points=(scans.points @ R.T).astype(np.float32), origins=(scans.origins @ R.T).astype(np.float32)
+    )
+    found = refine(turned, start)
+    side, sigma = found.constants["side"]
+    assert side == pytest.approx(-a, abs=0.003)
+    assert sigma < 0.002
+    named = {f.code: f.text for f in findings_of(found)}
+    assert "1.0" in named["refine-side"]
+    assert "refine-side" not in {f.code for f in findings_of(refine(scans, start))}
+
+
+def test_a_clock_that_is_off_is_named(drives):
+    scans, start, _, found = drives[1]
+    late = replace(scans, times=scans.times, odometry=_delayed(scans, 0.05))
+    off, sigma = refine(late, start).constants["clock"]
+    assert abs(off) == pytest.approx(0.05, abs=0.012)
+    assert abs(off) > 5 * sigma
+    assert "refine-clock" not in {f.code for f in findings_of(found)}
+
+
+def _delayed(scans: Scans, by: float):
+    """Increments of a path that is read later."""
+    path = [SE3.identity]
+    for u in scans.odometry.increments[1:]:
+        path.append(SE3.compose(path[-1], u))
+    at = Trajectory(scans.times, np.array(path)).interpolate(np.clip(scans.times - by, scans.times[0], scans.times[-1]))
+    u = scans.odometry.increments.copy()
+    u[1:] = SE3.between(at[:-1], at[1:])
+    return replace(scans.odometry, increments=u)
+
+
+def test_the_same_again_to_the_last_byte(drives):
+    scans, start, _, found = drives[2]
+    again = refine(scans, start.copy())
+    assert again.poses.tobytes() == found.poses.tobytes()
+    assert again.covariances.tobytes() == found.covariances.tobytes()
+
+
+def test_scans_are_read_as_written(drives, tmp_path):
+    scans = drives[0][0]
+    scans.save(tmp_path / "scans.npz")
+    back = Scans.load(tmp_path / "scans.npz")
+    for name in ("times", "offsets", "points", "origins", "returns", "ages", "tilt"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(scans, name))
+    assert back.lasting == scans.lasting
+
+
+def test_what_cannot_be_refined_is_refused(drives):
+    scans, start, _, _ = drives[0]
+    with pytest.raises(GeometryError, match="does not fit"):
+        refine(scans, start[:-1])
+    with pytest.raises(GeometryError, match="does not fit"):
+        refine(scans, np.where(np.arange(len(start))[:, None] == 3, np.nan, start))
+    with pytest.raises(DataError, match="no beam"):
+        refine(replace(scans, returns=np.zeros(len(scans.returns), bool)), start)

@@ -1,0 +1,30 @@
+"""A court small enough to be refined in a second, and robots in it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from graphslam.app.studies.segslam_trial import QUICK
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of, level
+from graphslam.frontends.odometry.recorded import chain
+from graphslam.frontends.odometry.steps import make_steps
+from graphslam.refine.scans import Scans
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import crawler_preset
+
+
+@lru_cache(maxsize=32)
+def court_scans(seed: int, **changes: float) -> tuple[Scans, Array, Array]:
+    """Scans of a drive through the court, its dead reckoning and the truth in the level frame of its first pose."""
+    robot = crawler_preset("light", **{"drift": 0.08, "max_range": 8.0, **changes})
+    log = simulate_crawler(court(seed=seed), seed, robot)
+    steps = make_steps(log, QUICK.steps)
+    assert steps.truth is not None
+    truth = steps.truth.interpolate(steps.times)
+    g = group_of(truth)
+    truth = g.between(np.broadcast_to(level(truth[0]), truth.shape), truth)
+    return Scans.of(steps), chain(steps.odometry).poses, truth
