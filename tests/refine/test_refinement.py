@@ -111,7 +111,7 @@ def test_a_scanner_that_is_mounted_askew_is_named():
     assert side == pytest.approx(-a, abs=0.003)
     assert sigma < 0.002
     named = {f.code: f.text for f in findings_of(found)}
-    assert "1.0" in named["refine-side"]
+    assert "to the side" in named["refine-side"]
     assert "refine-side" not in {f.code for f in findings_of(refine(scans, start))}
 
 
