@@ -11,13 +11,17 @@ import numpy as np
 
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
+from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
+from graphslam.refine.guides import FAR, apart
 from graphslam.refine.refine import Refinement, refine
 from graphslam.refine.scans import Scans
 
@@ -25,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 CONTRADICTED = 3.0
 """χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
+WIDENED = 1.5
+"""σ of the motion that the scans show, in multiples of what is stated, from which it is told."""
 NAMED = {
     "scale": (0.03, "distances of the odometry are {v:.1%} too long (scale of the wheels)", 1.0),
     "side": (
@@ -33,7 +39,7 @@ NAMED = {
         57.29578,
     ),
     "rise": (0.009, "the scanner looks {v:.2f}° above the way that the odometry tells (its mounting)", 57.29578),
-    "clock": (0.02, "the clock of the motion is {v:.0f} ms ahead of that of the scans", 1e3),
+    "clock": (0.02, "the clock of the motion is {v:+.0f} ms ahead of that of the scans", 1e3),
 }
 """Lasting errors that are named: beyond which size, in which words, in multiples of their unit."""
 
@@ -66,6 +72,7 @@ def refine_run(
     m: GlobalMap,
     *,
     gps: bool = False,
+    graph: PoseGraph | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Refined | None, list[Finding]]:
     """Refine the solved map of a run, and say what was found.
@@ -80,6 +87,8 @@ def refine_run(
         Solved.
     gps : bool
         Fixes are in the graph.
+    graph : PoseGraph, optional
+        What the map was solved from: its loops are held against the refined path.
 
     Returns
     -------
@@ -109,7 +118,27 @@ def refine_run(
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("the path is not refined: %s", error)
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
-    return Refined(found, refined, drawn, path), findings_of(found)
+    wrong = None if graph is None else wrong_loops(graph, refined)
+    return Refined(found, refined, drawn, path), findings_of(found, wrong)
+
+
+def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:
+    """Loops and matches of a graph that a refined map contradicts by more than scans could bridge.
+
+    Returns
+    -------
+    list of (i, j, metres, radians)
+        Nodes, and by how much the factor is off; the farthest first.
+    """
+    ends = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and abs(r.i - r.j) > 1]
+    if not ends:
+        return []
+    g, T = group_of(m.node_poses), np.array([r.T_ij for r in ends])
+    i, j = np.array([(r.i, r.j) for r in ends]).T
+    off, turned = apart(g.log(g.between(T, g.between(m.node_poses[i], m.node_poses[j]))), g)
+    wrong = np.flatnonzero((off > FAR[0]) | (turned > FAR[1]))
+    wrong = wrong[np.argsort(-off[wrong], kind="stable")]
+    return [(int(i[k]), int(j[k]), float(off[k]), float(turned[k])) for k in wrong]
 
 
 def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> tuple[Ledger, list[Finding]]:
@@ -149,8 +178,15 @@ SCAN_PAIRS = -1
 """Number of the refinement in a ledger of factors, which are counted from 0."""
 
 
-def findings_of(r: Refinement) -> list[Finding]:
-    """What a refinement says of the run, as lines of the verdict."""
+def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
+    """What a refinement says of the run, as lines of the verdict.
+
+    Parameters
+    ----------
+    r : Refinement
+    wrong : sequence of (i, j, metres, radians), optional
+        Loops of the graph that it contradicts (:func:`wrong_loops`); None: the graph is not known.
+    """
     last = r.rounds[-1]
     text = (
         f"The path was refined by its scans: {last.pairs} points on surfaces of other steps, {last.passes} of them of "
@@ -158,12 +194,19 @@ def findings_of(r: Refinement) -> list[Finding]:
         f"(before: {r.agreement[0]:.0%})."
     )
     out = [Finding("good", "refined", text)]
-    if len(r.refused):
+    if wrong:
+        some = "; ".join(f"x{i} and x{j} by {d:.1f} m, {np.rad2deg(t):.0f}°" for i, j, d, t in wrong[:4])
+        text = (
+            f"{len(wrong)} loops of the graph contradict the scans between their places, and bent its path: nodes "
+            f"{some}. The refined path does not follow them; undo them if the graph shall not, either."
+        )
+        out.append(Finding("look", "refine-contradicted", text))
+    elif wrong is None and len(r.refused):
         a, b = r.times[r.refused].T
         some = "; ".join(f"{x:.0f} s and {y:.0f} s" for x, y in list(zip(a, b))[:4])
         text = (
-            f"{len(r.refused)} pairs of places that the graph drew together contradict the scans between them and were "
-            f"left apart ({some}): look at the loops there."
+            f"{len(r.refused)} pairs of places of the start contradict the scans between them by more than 1 m or 6° "
+            f"and were left apart ({some}): look at its loops there."
         )
         out.append(Finding("look", "refine-contradicted", text))
     if r.motion > CONTRADICTED:
@@ -173,6 +216,10 @@ def findings_of(r: Refinement) -> list[Finding]:
             "trusted."
         )
         out.append(Finding("bad", "refine-motion", text))
+    if (times := float(max(r.scales.max(), r.walk))) > WIDENED:
+        what = "the yaw bias walks" if r.walk >= r.scales.max() else "the motion is"
+        text = f"Scans show that {what} {times:.1f} times as noisy as the log or the front end states; taken as seen."
+        out.append(Finding("look", "refine-widened", text))
     for name, (limit, words, unit) in NAMED.items():
         if name in r.constants:
             v, sigma = r.constants[name]

@@ -73,12 +73,8 @@ class Guides:
         """Which are wrong by more than a path is ever bent within what it knows: more than a scan could bridge."""
         g = group_of(path)
         a, b = self.steps.T
-        e = g.log(g.between(self.poses, g.between(path[a], path[b])))
-        turn = np.delete(e, np.r_[g.position], axis=1)
-        return np.asarray(
-            (np.linalg.norm(e[:, g.position], axis=1) > FAR[0]) | (np.linalg.norm(turn, axis=1) > FAR[1]),
-            dtype=np.bool_,
-        )
+        off, turned = apart(g.log(g.between(self.poses, g.between(path[a], path[b]))), g)
+        return np.asarray((off > FAR[0]) | (turned > FAR[1]), dtype=np.bool_)
 
     def distances(self, path: Array, solved: Solved, width: int) -> Array:
         """Mahalanobis distances ``(m,)``, squared, of the guides from a path whose covariance is known.
@@ -97,6 +93,12 @@ class Guides:
             J = np.concatenate([A[k], np.eye(width)], axis=1)
             out[k] = e[k] @ np.linalg.solve(DOUBT * J @ C @ J.T + own, e[k])
         return out
+
+
+def apart(e: Array, g: Group) -> tuple[Array, Array]:
+    """Way [m] and turn [rad] of tangents ``(m, d)``, each ``(m,)``."""
+    turn = np.delete(e, np.r_[g.position], axis=1)
+    return np.linalg.norm(e[:, g.position], axis=1), np.linalg.norm(turn, axis=1)
 
 
 def _sigmas(g: Group) -> Array:

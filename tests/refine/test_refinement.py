@@ -9,11 +9,13 @@ import pytest
 
 from graphslam.app.studies.refinement import QUICK_WORLDS
 from graphslam.app.studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
-from graphslam.backend.refining import findings_of
+from graphslam.backend.refining import findings_of, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.refine import refine
 from graphslam.refine.scans import Scans
 from tests.refine.world import court_scans
@@ -60,15 +62,17 @@ def test_joint_covariance_holds_that_of_each_step(drives):
 
 
 def test_motion_noisier_than_stated_is_widened_and_honest():
-    values, scales = [], []
+    values, scales, said = [], [], []
     for seed in (41, 42, 44):
         scans, start, truth = court_scans(seed, wheel_sigma=0.06)  # the front end takes 0.02 for it
         found = refine(scans, start)
         values.append(nees_of(found, truth)["nees"])
         scales.append(found.scales)
+        said += [f.code for f in findings_of(found)]
     assert np.all(np.array(scales)[:, 1] > 1.5)  # along the way
     np.testing.assert_allclose(np.array(scales)[:, 0], 1.0, atol=0.3)  # the gyro is as stated
     assert 0.5 < np.mean(values) < 2.0
+    assert said.count("refine-widened") == 3
 
 
 def test_motion_as_stated_is_not_widened(drives):
@@ -97,6 +101,35 @@ def test_wrong_loops_and_faults_of_the_robot_do_no_harm():
     for fault in FAULTS:
         assert rows[fault, "worse"] == 0
         assert rows[fault, "ate_aligned"] < 0.03
+
+
+def test_loops_that_the_refined_path_contradicts_are_named(drives):
+    *_, found = drives[0]
+    nodes = found.poses[::40]
+    graph = PoseGraph(3)
+    graph.structure.append("x", nodes[1])
+    for T in nodes[2:]:
+        graph.structure.append("x", T)
+    for i, j, off in ((0, 3, 0.0), (1, 4, 4.0)):
+        T = SE3.between(nodes[i], nodes[j])
+        T[1] += off
+        graph.add_between(i, j, T, 1e-4 * np.eye(6), evidence="shared-scan")
+    m = GlobalMap(
+        node_times=found.times[::40],
+        node_poses=nodes,
+        node_covariances=found.covariances[::40],
+        trajectory=Trajectory(found.times, found.poses),
+        landmark_ids=np.zeros(0, np.int64),
+        landmarks=np.zeros((0, 3)),
+        landmark_covariances=np.zeros((0, 3, 3)),
+        landmark_hits=np.zeros(0, np.int64),
+    )
+    wrong = wrong_loops(graph, m)
+    assert [(i, j) for i, j, *_ in wrong] == [(1, 4)]
+    assert wrong[0][2] == pytest.approx(4.0)
+    named = {f.code: f.text for f in findings_of(found, wrong)}
+    assert "x1 and x4 by 4.0 m" in named["refine-contradicted"]
+    assert "refine-contradicted" not in {f.code for f in findings_of(found, [])}
 
 
 def test_a_scanner_that_is_mounted_askew_is_named():

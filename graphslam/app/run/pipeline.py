@@ -326,7 +326,7 @@ def _judge(
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     clock, graph_path = time.perf_counter(), global_map.trajectory
     with_gps = solution.T_gps_world is not None
-    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=with_gps)
+    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=with_gps, graph=back.graph)
     ledger = back.graph.ledger
     if refined is not None:
         global_map = refined.map
