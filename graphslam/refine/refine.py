@@ -35,6 +35,8 @@ STILL = 0.01, 1e-4
 """A round moved the path by less than so much [m], or than this share of its length: it stands still."""
 MOST_ROUNDS = 10
 MOST_GATES = 6
+WIDE = 3.0, 2.0
+"""Greatest distances of pairs before those of the configuration, where no guide brought passes together [m]."""
 DOUBTED = 0.2
 """Residuals below this share of the greatest distance of a pair are not doubted."""
 KEPT = 2
@@ -223,9 +225,26 @@ class _Work:
             self.round(distance, sigma, passes=False, again=True)
         while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
             self.round(*NEAR[-1], passes=False, again=False)
+        alone, rounds = (self.poses, self.states), list(self.rounds)
         guides, taken = self.follow_guides()
-        for k, distance in enumerate(self.config.distances):
-            self.round(distance, None, passes=True, again=k < KEPT, steps=2 if k == 0 else 1)
+        found = self.all_passes(self.config.distances, guides, taken)
+        if np.any(~taken & guides.far(found.poses)):
+            # what is wrong in the start may have pulled its other guides with it: once more without any of them, and
+            # from farther away; the path at which the scans agree better is the result
+            self.tell("the start contradicts the scans between: once more without it")
+            self.poses, self.states, self.rounds = *alone, rounds
+            self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
+            wide = tuple(d for d in WIDE if d > self.config.distances[0])
+            other = self.all_passes(wide + self.config.distances, guides, np.zeros(len(guides), bool))
+            if other.agreement[1] > found.agreement[1]:
+                return other
+        return found
+
+    def all_passes(self, distances: tuple[float, ...], guides: Guides, taken: npt.NDArray[np.bool_]) -> Refinement:
+        """Rounds over all passes at falling distances, and the result."""
+        for k, distance in enumerate(distances):
+            again = k < len(distances) - len(self.config.distances) + KEPT
+            self.round(distance, None, passes=True, again=again, steps=2 if k == 0 else 1)
         return self.result(guides.steps[~taken & guides.far(self.poses)])
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
