@@ -18,6 +18,7 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.frontends.odometry.recorded import chain
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel
@@ -217,28 +218,36 @@ class _Work:
         self.states: States = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
         self.rounds: list[Round] = []
         self.surfaces: Surfaces | None = None
+        self.first: Surfaces | None = None
         self.length = float(steps.path_length[-1])
 
     def run(self) -> Refinement:
-        """All rounds."""
-        for distance, sigma in NEAR:
-            self.round(distance, sigma, passes=False, again=True)
-        while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
-            self.round(*NEAR[-1], passes=False, again=False)
-        alone, rounds = (self.poses, self.states), list(self.rounds)
+        """All rounds; from the odometry's path once more where the start turns out to be wrong."""
+        self.neighbours()
         guides, taken = self.follow_guides()
         found = self.all_passes(self.config.distances, guides, taken)
         if np.any(~taken & guides.far(found.poses)):
-            # what is wrong in the start may have pulled its other guides with it: once more without any of them, and
-            # from farther away; the path at which the scans agree better is the result
-            self.tell("the start contradicts the scans between: once more without it")
-            self.poses, self.states, self.rounds = *alone, rounds
+            # what is wrong in the start may have pulled its other guides with it, or have bent the path beyond what
+            # neighbours can mend: once more without any of it; the path at which the scans agree better is the result
+            self.tell("the start contradicts the scans between: once more from the odometry")
+            self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+            self.states = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
             self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
+            self.cloud = self.problem.cloud = self.raw
+            self.rounds = []
+            self.neighbours()
             wide = tuple(d for d in WIDE if d > self.config.distances[0])
             other = self.all_passes(wide + self.config.distances, guides, np.zeros(len(guides), bool))
             if other.agreement[1] > found.agreement[1]:
                 return other
         return found
+
+    def neighbours(self) -> None:
+        """Rounds over neighbours on the way, until the path stands still."""
+        for distance, sigma in NEAR:
+            self.round(distance, sigma, passes=False, again=True)
+        while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
+            self.round(*NEAR[-1], passes=False, again=False)
 
     def all_passes(self, distances: tuple[float, ...], guides: Guides, taken: npt.NDArray[np.bool_]) -> Refinement:
         """Rounds over all passes at falling distances, and the result."""
@@ -253,7 +262,7 @@ class _Work:
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
         if again or self.surfaces is None:
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
-            if not self.rounds:
+            if self.first is None:
                 self.first = self.surfaces
         self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
         self.found = associate(
@@ -337,6 +346,7 @@ class _Work:
     def result(self, refused: Index) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
+        assert self.first is not None
         cloud = self.cloud
         self.problem.cloud = self.raw
         before = self.agreement(self.raw, self.first, self.start)

@@ -14,7 +14,7 @@ from graphslam.solve.registry import make_solver
 
 VERBS = {
     *("compare", "export", "find_loops", "find_study", "first_particles", "join_submaps", "load", "local_maps"),
-    *("localise", "merge", "open_run", "open_study", "run", "simulate", "solve_file", "study"),
+    *("localise", "merge", "open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "study"),
 }
 LISTS = {"front_ends", "joiners", "solvers", "worlds"}
 STREAMS = {

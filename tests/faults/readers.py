@@ -286,7 +286,15 @@ def refined_run(root: Path) -> None:
         )  # fmt: skip
     write_tum(at / "trajectory_graph.tum", run.map.trajectory)
     facts = json.loads((at / "run.json").read_text())
-    turn = {"distance": 0.3, "sigma": 0.03, "pairs": 9, "passes": 4, "spread": 0.02, "moved": 0.01}
+    turn = {
+        "distance": 0.3,
+        "range_sigma": 0.03,
+        "surface_sigma": 0.01,
+        "pairs": 9,
+        "passes": 4,
+        "spread": 0.02,
+        "moved": 0.01,
+    }
     facts["refine"] = {
         "rounds": [turn], "agreement": [0.7, 0.9], "constants": {"scale": {"value": 0.01, "sigma": 0.001}},
         "yaw_bias": [[0.0, 1e-3], [30.0, 2e-3]], "left_apart": [[1.0, 9.0]], "motion_chi2_per_dof": 0.5,
