@@ -279,7 +279,7 @@ class _Work:
             r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
-        if passes:
+        if passes and distance <= self.config.distances[0]:
             self.motion.widen(self.poses, self.states, solved.factor)
         self.noise = noise
         d = self.group.dim
