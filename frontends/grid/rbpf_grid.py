@@ -24,14 +24,15 @@ from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd, Watch
+from graphslam.frontends.base import Watch
 from graphslam.frontends.grid.ancestry import Ancestry
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter import GridFilter, GridParticles, Tally
 from graphslam.frontends.odometry.drift import DriftModel
-from graphslam.frontends.odometry.scan_use import checked_steps, uncorrected, uncorrected_covariance, with_findings
+from graphslam.frontends.odometry.scan_use import uncorrected, uncorrected_covariance, with_findings
 from graphslam.frontends.odometry.steps import StepConfig, Steps
 from graphslam.frontends.segslam.covariance import Drift, exit_covariance
+from graphslam.frontends.stepwise import StepwiseFrontEnd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,22 +252,14 @@ class RbpfGridConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RbpfGrid(FrontEnd):
+class RbpfGrid(StepwiseFrontEnd):
     """The front end ``rbpf-grid``: the whole log as one submap with an evidence grid.
 
     Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion.
     """
 
     config: RbpfGridConfig = field(default_factory=RbpfGridConfig)
-    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "rbpf-grid"
-
-    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
-        """The steps of a log; those of the last one are kept."""
-        if not (self._made and self._made[0] is log):
-            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
-        made: Steps = self._made[1]
-        return made
 
     def submaps(
         self,

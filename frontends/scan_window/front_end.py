@@ -19,14 +19,15 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.odometry.scan_use import checked_steps, scan_findings
+from graphslam.frontends.base import Watch
+from graphslam.frontends.odometry.scan_use import scan_findings
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
 from graphslam.frontends.scan_window.exits import relative_covariance
 from graphslam.frontends.scan_window.followed import once
 from graphslam.frontends.scan_window.tracker import Found, Tracker
+from graphslam.frontends.stepwise import StepwiseFrontEnd
 
 MANY = 0.2
 """Share of lost scans from which a line of the verdict says so."""
@@ -84,7 +85,7 @@ class ScanWindowFrontEndConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class ScanWindow(FrontEnd):
+class ScanWindow(StepwiseFrontEnd):
     """The front end ``scan-window``.
 
     Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. It draws nothing, and
@@ -94,15 +95,7 @@ class ScanWindow(FrontEnd):
     """
 
     config: ScanWindowFrontEndConfig = field(default_factory=ScanWindowFrontEndConfig)
-    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "scan-window"
-
-    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
-        """The steps of a log; those of the last one are kept."""
-        if not (self._made and self._made[0] is log):
-            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
-        made: Steps = self._made[1]
-        return made
 
     def submaps(
         self,

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.frontends.base import FrontEnd, Watch
+from graphslam.frontends.base import Watch
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.odometry.scan_use import checked_steps, with_findings
+from graphslam.frontends.odometry.scan_use import with_findings
 from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
 from graphslam.frontends.scan_window.followed import followed, once
 from graphslam.frontends.segslam.config import SegSlamConfig
 from graphslam.frontends.segslam.result import SegSlamResult
 from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam.frontends.stepwise import StepwiseFrontEnd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +44,7 @@ class SegSlamFrontEndConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SegSlam(FrontEnd):
+class SegSlam(StepwiseFrontEnd):
     """The front end ``segslam``.
 
     Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. Particles decide late
@@ -53,7 +53,6 @@ class SegSlam(FrontEnd):
     """
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
-    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "segslam"
 
     def submaps(
@@ -72,13 +71,6 @@ class SegSlam(FrontEnd):
                 submap = with_findings(submap, result.steps)
             if after is None or submap.key > after.key:
                 yield submap
-
-    def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
-        """The steps of a log; those of the last one are kept."""
-        if not (self._made and self._made[0] is log):
-            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
-        made: Steps = self._made[1]
-        return made
 
     def result(
         self, log: SensorLog, *, seed: SeedTree, drops: DropCounter | None = None, watch: Watch | None = None

@@ -32,16 +32,28 @@ CONTRADICTED = 3.0
 WIDENED = 1.5
 """σ of the motion that the scans show, in multiples of what is stated, from which it is told."""
 NAMED = {
-    "scale": (0.03, "distances of the odometry are {v:.1%} too long (scale of the wheels)", 1.0),
+    "scale": (0.03, "distances of the odometry are {v:.1%} too {sign} (scale of the wheels)", 1.0, ("long", "short")),
     "side": (
         0.009,
-        "the scanner looks {v:.2f}° to the side of the way that the odometry tells (its mounting)",
+        "the scanner looks {v:.2f}° to the {sign} of the way that the odometry tells (its mounting)",
         57.29578,
+        ("left", "right"),
     ),
-    "rise": (0.009, "the scanner looks {v:.2f}° above the way that the odometry tells (its mounting)", 57.29578),
-    "clock": (0.02, "the clock of the motion is {v:+.0f} ms ahead of that of the scans", 1e3),
+    "rise": (
+        0.009,
+        "the scanner looks {v:.2f}° {sign} the way that the odometry tells (its mounting)",
+        57.29578,
+        ("below", "above"),
+    ),
+    "clock": (
+        0.02,
+        "the stamps of the motion are {v:.0f} ms too {sign} beside those of the scans",
+        1e3,
+        ("early", "late"),
+    ),
 }
-"""Lasting errors that are named: beyond which size, in which words, in multiples of their unit."""
+"""Lasting errors that are named: beyond which size, in which words, in multiples of their unit, and what their sign
+means."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +221,13 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
             f"and were left apart ({some}): look at its loops there."
         )
         out.append(Finding("look", "refine-contradicted", text))
+    if r.other is not None and r.other.apart > r.rounds[-1].distance:
+        text = (
+            f"Begun at the graph's path and at the odometry's, the refinement ended {r.other.apart:.2f} m apart. The "
+            f"path from the {'odometry' if r.other.taken else 'graph'} was kept, since its scans agree better "
+            f"({r.other.kept:.1%} of the points against {r.other.left:.1%}): look at the map before you trust it."
+        )
+        out.append(Finding("look", "refine-two-paths", text))
     if r.motion > CONTRADICTED:
         text = (
             f"Scans of other passes bend the motion more than the gyro can (χ²/dof {r.motion:.1f}): a place was taken "
@@ -220,10 +239,10 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
         what = "the yaw bias walks" if r.walk >= r.scales.max() else "the motion is"
         text = f"Scans show that {what} {times:.1f} times as noisy as the log or the front end states; taken as seen."
         out.append(Finding("look", "refine-widened", text))
-    for name, (limit, words, unit) in NAMED.items():
+    for name, (limit, words, unit, signs) in NAMED.items():
         if name in r.constants:
             v, sigma = r.constants[name]
             if abs(v) > limit and abs(v) > 5.0 * sigma:
-                what = words.format(v=v * unit)
+                what = words.format(v=abs(v) * unit, sign=signs[int(v < 0)])
                 out.append(Finding("look", f"refine-{name}", f"Scans and motion differ all along: {what}."))
     return out

@@ -31,9 +31,10 @@ MEDIAN = 0.4549
 RARE = 10.8
 """χ² of one degree of freedom at 99.9 %."""
 SCALE, SIDE, RISE, CLOCK, ROLL, PITCH, BEND, TURN = range(8)
-"""Places of the constant states: scale of distances; direction of motion, to the side and upwards [rad]; clock of the
-motion ahead of the scans [s]; gravity's constant roll and pitch [rad]; what wheels turn too much for each metre [rad/m]
-and for each radian. In 3-D: all but the last two. In 2-D: the first, second, fourth and the last two."""
+"""Places of the constant states: scale of distances; the scanner's direction, to the left of the motion and below it
+[rad]; by how much the motion's stamps are early beside the scans' [s]; gravity's constant roll and pitch [rad]; what
+wheels turn too much for each metre [rad/m] and for each radian. In 3-D: all but the last two. In 2-D: the first,
+second, fourth and the last two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ class MotionModel:
         B[:, g.heading, 0] = -self.dt * (1.0 - share)
         B[:, g.heading, 1] = -self.dt * share
         P = np.arange(g.dof)[g.position]
-        # odometry is measured = true × (1 + s), turned by the direction, ahead by the clock
+        # odometry is measured = true × (1 + s), turned by the direction, stamped early by the clock
         B[:, P, 2 + self.at[SCALE]] = -move
         B[:, P[0], 2 + self.at[SIDE]] = move[:, 1]
         B[:, P[1], 2 + self.at[SIDE]] = -move[:, 0]

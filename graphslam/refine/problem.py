@@ -150,6 +150,14 @@ def point_information(pairs: Association, residuals: Array, noise: Array, least:
     return np.asarray(w / (pairs.spent @ noise))
 
 
+def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> Array:
+    """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
+    out = np.empty(len(pairs.source))
+    t = np.ascontiguousarray(poses[:, : cloud.points.shape[1]])
+    plane_residuals(pairs, rotations(poses), t, cloud.points, surfaces.normals, out)
+    return out
+
+
 class Problem:
     """Scans, motion and gravity on the nodes of a path.
 
@@ -165,13 +173,6 @@ class Problem:
         self.motion, self.cloud, self.held = motion, cloud, held
         self._key: object = None
         self._pattern: Pattern | None = None
-
-    def residuals(self, pairs: Pairs, surfaces: Surfaces, poses: Array) -> Array:
-        """Distances of source points from their surfaces ``(k,)`` [m]."""
-        out = np.empty(len(pairs.source))
-        R, t = rotations(poses), np.ascontiguousarray(poses[:, : self.motion.group.dim])
-        plane_residuals(pairs, R, t, self.cloud.points, surfaces.normals, out)
-        return out
 
     def _pattern_of(self, pairs: Pairs, extra: list[Terms]) -> Pattern:
         key = (id(pairs.source), *(id(t.nodes) for t in extra))

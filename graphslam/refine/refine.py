@@ -23,9 +23,9 @@ from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel
 from graphslam.refine.nodes import find_nodes, path_between, scans_at
-from graphslam.refine.problem import Problem, Solved, States, pair_noise, point_information
+from graphslam.refine.problem import Problem, Solved, States, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
-from graphslam.refine.surfaces import Cloud, Surfaces, associate, chunk_pairs, find_surfaces
+from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 
 log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
@@ -71,6 +71,26 @@ class Round:
     moved: float
 
 
+@dataclass(frozen=True, slots=True)
+class Other:
+    """Two attempts, from the start and from the odometry alone.
+
+    Parameters
+    ----------
+    apart : float
+        RMS distance between their paths [m].
+    kept, left : float
+        Agreement of the scans at the path that was kept, and at the other, to the same noise.
+    taken : bool
+        That from the odometry was kept.
+    """
+
+    apart: float
+    kept: float
+    left: float
+    taken: bool
+
+
 @dataclass(frozen=True)
 class Refinement:
     """A refined path with its uncertainty, and what was found on the way.
@@ -94,6 +114,8 @@ class Refinement:
         Steps that the start drew together although the scans between contradict it.
     agreement : (start, refined)
         Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
+    other : Other or None
+        The second attempt, from the odometry, where the start contradicts the scans.
     scales : (c,)
         By which the σ of the odometry's components were widened, since the scans show more.
     walk : float
@@ -119,6 +141,7 @@ class Refinement:
     parts: dict[str, float]
     refused: Index
     agreement: tuple[float, float]
+    other: Other | None
     scales: Array
     walk: float
     motion: float
@@ -201,6 +224,20 @@ def refine(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    poses: Array
+    states: States
+    cloud: Cloud
+    surfaces: Surfaces
+    chunks: ChunkPairs
+    found: Association
+    noise: Array
+    rounds: list[Round]
+    scales: Array
+    walk: float
+
+
 class _Work:
     """A refinement while it goes on."""
 
@@ -225,22 +262,59 @@ class _Work:
         """All rounds; from the odometry's path once more where the start turns out to be wrong."""
         self.neighbours()
         guides, taken = self.follow_guides()
-        found = self.all_passes(self.config.distances, guides, taken)
-        if np.any(~taken & guides.far(found.poses)):
-            # what is wrong in the start may have pulled its other guides with it, or have bent the path beyond what
-            # neighbours can mend: once more without any of it; the path at which the scans agree better is the result
+        self.all_passes(self.config.distances)
+        other = None
+        if np.any(~taken & guides.far(self.poses)):
             self.tell("the start contradicts the scans between: once more from the odometry")
-            self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
-            self.states = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
-            self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
-            self.cloud = self.problem.cloud = self.raw
-            self.rounds = []
-            self.neighbours()
-            wide = tuple(d for d in WIDE if d > self.config.distances[0])
-            other = self.all_passes(wide + self.config.distances, guides, np.zeros(len(guides), bool))
-            if other.agreement[1] > found.agreement[1]:
-                return other
-        return found
+            other = self.from_odometry()
+            taken = taken & (not other.taken)
+        return self.result(guides.steps[~taken & guides.far(self.poses)], other)
+
+    def from_odometry(self) -> Other:
+        """Once more without the start, whose wrong loops may have pulled its right ones along or bent it too far.
+
+        The path at which the scans agree better is kept.
+        """
+        first = self.attempt()
+        self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        self.states = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
+        self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
+        self.cloud = self.problem.cloud = self.raw
+        self.rounds = []
+        self.neighbours()
+        self.all_passes(tuple(d for d in WIDE if d > self.config.distances[0]) + self.config.distances)
+        second = self.attempt()
+        # the same noise for both, or the blunter path would agree better for that alone
+        noise = np.minimum(first.noise, second.noise)
+        self.motion.scales = np.ones_like(self.motion.scales)
+        a, b = (self.agreement(x.cloud, x.surfaces, x.poses, noise) for x in (first, second))
+        d = self.group.dim
+        apart = float(np.sqrt(np.mean(np.sum((first.poses[:, :d] - second.poses[:, :d]) ** 2, axis=1))))
+        self.take_up(second if b > a else first)
+        return Other(apart, max(a, b), min(a, b), b > a)
+
+    def attempt(self) -> _Attempt:
+        """Where the refinement stands."""
+        assert self.surfaces is not None
+        motion = (self.motion.scales, self.motion.walk)
+        return _Attempt(
+            self.poses,
+            self.states,
+            self.cloud,
+            self.surfaces,
+            self.chunks,
+            self.found,
+            self.noise,
+            self.rounds,
+            *motion,
+        )
+
+    def take_up(self, a: _Attempt) -> None:
+        """Go on from where it stood."""
+        self.poses, self.states, self.surfaces, self.chunks = a.poses, a.states, a.surfaces, a.chunks
+        self.found, self.noise, self.rounds = a.found, a.noise, a.rounds
+        self.cloud = self.problem.cloud = a.cloud
+        self.motion.scales, self.motion.walk = a.scales, a.walk
 
     def neighbours(self) -> None:
         """Rounds over neighbours on the way, until the path stands still."""
@@ -249,12 +323,11 @@ class _Work:
         while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
             self.round(*NEAR[-1], passes=False, again=False)
 
-    def all_passes(self, distances: tuple[float, ...], guides: Guides, taken: npt.NDArray[np.bool_]) -> Refinement:
-        """Rounds over all passes at falling distances, and the result."""
+    def all_passes(self, distances: tuple[float, ...]) -> None:
+        """Rounds over all passes at falling distances."""
         for k, distance in enumerate(distances):
             again = k < len(distances) - len(self.config.distances) + KEPT
             self.round(distance, None, passes=True, again=again, steps=2 if k == 0 else 1)
-        return self.result(guides.steps[~taken & guides.far(self.poses)])
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
         """Associate anew, and Gauss–Newton steps; without a σ the noise comes from the residuals."""
@@ -276,7 +349,7 @@ class _Work:
         )
         before = self.poses
         for _ in range(steps):
-            r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+            r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
         if passes and distance <= self.config.distances[0]:
@@ -306,7 +379,7 @@ class _Work:
         if not len(guides):
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
-        r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+        r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         information = point_information(self.found, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
         taken = np.zeros(len(guides), bool)
         for _ in range(MOST_GATES):
@@ -322,36 +395,32 @@ class _Work:
         self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
         return guides, taken
 
-    def agreement(self, cloud: Cloud, surfaces: Surfaces, poses: Array) -> float:
-        """Share of the source points with a surface within reach that lie on it, to three times the final σ.
+    def agreement(self, cloud: Cloud, surfaces: Surfaces, poses: Array, noise: Array) -> float:
+        """Share of the source points with a surface within reach that lie on it, to three times their σ.
 
         The pairs are found anew at this path, among surfaces made there: nothing is kept of how it came about.
         """
-        chunks = chunk_pairs(cloud, poses, self.config.reach, passes=True)
         found = associate(
             cloud,
             surfaces,
             poses,
-            chunks,
+            chunk_pairs(cloud, poses, self.config.reach, passes=True),
             distance=self.config.distances[0],
             every=4 * self.every,
             within=self.motion.within,
             least_share=0.0,
         )
-        r = self.problem.residuals(found.pairs, surfaces, poses)
-        near = np.maximum(1.0 - r**2 / (9.0 * found.once @ self.noise), 0.0)
+        r = residuals(found.pairs, cloud, surfaces, poses)
+        near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
         weight = 1.0 / found.spent[:, 1]
         return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
-    def result(self, refused: Index) -> Refinement:
+    def result(self, refused: Index, other: Other | None) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
         assert self.first is not None
-        cloud = self.cloud
-        self.problem.cloud = self.raw
-        before = self.agreement(self.raw, self.first, self.start)
-        self.problem.cloud = cloud
-        r = self.problem.residuals(self.found.pairs, self.surfaces, self.poses)
+        before = self.agreement(self.raw, self.first, self.start, self.noise)
+        r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
@@ -371,7 +440,8 @@ class _Work:
             rounds=tuple(self.rounds),
             parts=solved.parts,
             refused=refused,
-            agreement=(before, self.agreement(self.cloud, self.surfaces, self.poses)),
+            agreement=(before, self.agreement(self.cloud, self.surfaces, self.poses, self.noise)),
+            other=other,
             scales=self.motion.scales,
             walk=self.motion.walk,
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),

@@ -75,14 +75,6 @@ def fit_surfaces(points: Array, neighbours: Index, least: int, out_normal: Array
             out_flat[k, 0], out_flat[k, 1], out_flat[k, 2] = w[0], w[0], w[1]
 
 
-@nb.njit(cache=True)
-def count_sources(source: Index, counts: Index) -> None:
-    """Number of pairs of each source point."""
-    counts[:] = 0
-    for s in source:
-        counts[s] += 1
-
-
 @nb.njit(cache=True, fastmath={"contract"})
 def plane_residuals(pairs: Pairs, R: Array, t: Array, points: Array, normals: Array, out: Array) -> None:
     """``n_jᵀ (T_j⁻¹ T_i p - q)`` of every pair.

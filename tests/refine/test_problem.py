@@ -11,7 +11,7 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.refine.motion import MotionModel
-from graphslam.refine.problem import Problem, pair_noise, point_information
+from graphslam.refine.problem import Problem, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs
@@ -124,8 +124,8 @@ def test_one_step_is_that_of_the_dense_problem_and_so_is_the_covariance(rng, dim
     solved, step = problem.linearise(poses, states, pairs, surfaces, w, [])
     size = motion.widths.sum()
     H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
-    r = problem.residuals(pairs, surfaces, poses)
-    J = differences(problem, poses, states, lambda p, s: problem.residuals(pairs, surfaces, p))
+    r = residuals(pairs, problem.cloud, surfaces, poses)
+    J = differences(problem, poses, states, lambda p, s: residuals(pairs, problem.cloud, surfaces, p))
     H += J.T @ (w[:, None] * J)
     g += J.T @ (w * r)
     assert solved.parts["scans"] == pytest.approx(float(w @ r**2), rel=1e-9)
@@ -148,7 +148,7 @@ def test_one_step_is_that_of_the_dense_problem_and_so_is_the_covariance(rng, dim
 def test_distances_of_points_from_planes(rng, dim):
     problem, surfaces, pairs, poses, _ = some_problem(rng, dim)
     g, cloud = group_of(poses), problem.cloud
-    for k, r in enumerate(problem.residuals(pairs, surfaces, poses)):
+    for k, r in enumerate(residuals(pairs, problem.cloud, surfaces, poses)):
         p, q = pairs.source[k], pairs.target[k]
         seen = g.transform(g.inverse(poses[pairs.j[k]]), g.transform(poses[pairs.i[k]], cloud.points[p]))
         assert r == pytest.approx(float(surfaces.normals[q] @ (seen - cloud.points[q])), abs=1e-9)

@@ -11,9 +11,9 @@ from graphslam.core.markup import Markup, is_figure, pairs, table
 
 MEANING = {
     "scale": ("scale of the wheels, distance too long by", "share"),
-    "side": ("mounting: scanner looks to the side of the way", "rad"),
-    "rise": ("mounting: scanner looks above the way", "rad"),
-    "clock": ("clock of the motion ahead of that of the scans", "s"),
+    "side": ("mounting: scanner looks to the left of the way", "rad"),
+    "rise": ("mounting: scanner looks below the way", "rad"),
+    "clock": ("stamps of the motion early beside those of the scans", "s"),
     "roll": ("lasting error of gravity's roll", "rad"),
     "pitch": ("lasting error of gravity's pitch", "rad"),
     "bend": ("wheels turn too much for each metre", "rad/m"),
