@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +44,7 @@ def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
     """(fixes that become factors, fixes withheld)."""
     mask = used_fixes(gps, config)
     used, withheld = gps.take(mask), gps.take(~mask)
-    return (used if config.sigma is None else replace(used, sigma=np.full(len(used.times), config.sigma))), withheld
+    return used.with_sigma(config.sigma), withheld
 
 
 def imus_of(log: SensorLog) -> dict[str, Imu]:

@@ -66,7 +66,7 @@ def ecef_to_geodetic(ecef: ArrayLike) -> Array:
     return np.stack([np.rad2deg(2.0 * np.arctan2(z, D + d)), np.rad2deg(np.arctan2(y, x)), height], -1)
 
 
-def _axes(latitude: float, longitude: float) -> Array:
+def tangent_axes(latitude: float, longitude: float) -> Array:
     """Rows: east, north and up at a place, in Earth-centred axes ``(3, 3)``."""
     lat, lon = np.deg2rad(latitude), np.deg2rad(longitude)
     sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
@@ -90,7 +90,7 @@ def enu_to_geodetic(enu: ArrayLike, latitude: float, longitude: float, height: f
     if p.shape[-1] == 2:
         p = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], -1)
     origin = geodetic_to_ecef([latitude, longitude, height])
-    return ecef_to_geodetic(origin + p @ _axes(latitude, longitude))
+    return ecef_to_geodetic(origin + p @ tangent_axes(latitude, longitude))
 
 
 def geodetic_to_enu(geodetic: ArrayLike, latitude: float, longitude: float, height: float = 0.0) -> Array:
@@ -99,4 +99,4 @@ def geodetic_to_enu(geodetic: ArrayLike, latitude: float, longitude: float, heig
     check_geodetic(g[..., 0], g[..., 1])
     check_geodetic(latitude, longitude)
     origin = geodetic_to_ecef([latitude, longitude, height])
-    return np.asarray((geodetic_to_ecef(g) - origin) @ _axes(latitude, longitude).T)
+    return np.asarray((geodetic_to_ecef(g) - origin) @ tangent_axes(latitude, longitude).T)

@@ -238,12 +238,16 @@ class Gps:
         Standard deviation of each coordinate [m].
     lever : (2,) or (3,)
         Antenna in the base frame [m].
+    covariances : (n, c, c) or None
+        Of a fix whose coordinates are not equally sure, in the frame of the positions [m²]; they stand in place of
+        ``sigma``.
     """
 
     times: Array
     positions: Array
     sigma: Array
     lever: Array
+    covariances: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.times)
@@ -254,10 +258,54 @@ class Gps:
         if np.any(self.sigma <= 0):
             k = int(np.flatnonzero(self.sigma <= 0)[0])
             raise DataError(f"GPS sigma of record {k} is not positive", got=self.sigma[k], wanted="> 0 m")
+        if self.covariances is not None:
+            c = self.positions.shape[1]
+            P = _finite(_array(self.covariances, (n, c, c), "covariances"), "GPS covariance")
+            bad = np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(P).max(axis=(1, 2))
+            bad |= np.linalg.eigvalsh(P)[:, 0] <= 0
+            if np.any(bad):
+                k = int(bad.argmax())
+                raise DataError(
+                    f"GPS covariance of record {k} is not symmetric and positive definite",
+                    got=P[k],
+                    wanted="one that is",
+                )
+            object.__setattr__(self, "covariances", P)
+
+    @classmethod
+    def upright(
+        cls, *, times: Array, positions: Array, horizontal: npt.ArrayLike, vertical: npt.ArrayLike, lever: Array
+    ) -> Gps:
+        """Fixes in space that are less sure, or more, of their height.
+
+        Parameters
+        ----------
+        times, positions, lever
+            As in the class, in space.
+        horizontal, vertical : float or (n,)
+            Standard deviations of x and y, and of z [m].
+        """
+        h, v = (np.broadcast_to(np.asarray(s, dtype=np.float64), len(times)) for s in (horizontal, vertical))
+        P = np.stack([h, h, v], axis=-1)[:, :, None] ** 2 * np.eye(3)
+        return cls(times=times, positions=positions, sigma=h.copy(), lever=lever, covariances=P)
 
     def take(self, index: Any) -> Gps:
         """See :class:`Stream`."""
-        return replace(self, times=self.times[index], positions=self.positions[index], sigma=self.sigma[index])
+        P = None if self.covariances is None else self.covariances[index]
+        return replace(
+            self, times=self.times[index], positions=self.positions[index], sigma=self.sigma[index], covariances=P
+        )
+
+    def with_sigma(self, sigma: float | None) -> Gps:
+        """The same fixes with one standard deviation for all coordinates [m]; None leaves them as they are."""
+        return self if sigma is None else replace(self, sigma=np.full(len(self.times), sigma), covariances=None)
+
+    @property
+    def noise(self) -> Array:
+        """Covariances ``(n, c, c)`` of the fixes [m²]."""
+        if self.covariances is not None:
+            return self.covariances
+        return np.asarray(self.sigma[:, None, None] ** 2 * np.eye(self.positions.shape[1]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

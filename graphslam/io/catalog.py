@@ -65,6 +65,12 @@ READERS: dict[str, Reader] = {
     ),
     "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
     "tuc": Reader("graphslam.io.tuc:read_tuc", ("Lecture_Hall_Input.txt.gz", "Lecture_Hall_Input.txt")),
+    "euroc": Reader("graphslam.io.euroc:read_euroc", ("leica0_sensor.yaml",), named=True),
+    "kitti-gps": Reader("graphslam.io.kitti_gps:read_kitti_gps", ("KittiGps_converted.txt",)),
+    "smartloc": Reader(
+        "graphslam.io.smartloc:read_smartloc",
+        ("Berlin_Potsdamer_Platz_Input.txt.gz", "Berlin_Potsdamer_Platz_Input.txt"),
+    ),
     "carmen": Reader(
         "graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2"), named=True
     ),

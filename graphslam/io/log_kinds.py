@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.gnss import Pseudoranges
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.npz import Field, check_arrays, floats, ints, texts
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
@@ -180,7 +181,28 @@ KINDS: dict[str, Kind] = {
     "compass": Kind(Compass, {**_TIMES, "headings": floats("n"), "sigma": floats("n")}),
     "velocity-controls": Kind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
     "odometry": Kind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
-    "gps": Kind(Gps, {**_TIMES, "positions": floats("n", "c"), "sigma": floats("n"), "lever": floats("c")}),
+    "gps": Kind(
+        Gps,
+        {**_TIMES, "positions": floats("n", "c"), "sigma": floats("n"), "lever": floats("c")},
+        lambda s: {} if s.covariances is None else {"covariances": s.covariances},
+        lambda a: {"covariances": a.get("covariances")},
+        {"covariances": floats("n", "c", "c", optional=True)},
+    ),
+    "pseudoranges": Kind(
+        Pseudoranges,
+        {
+            **_TIMES,
+            "offsets": ints("n+1"),
+            "ranges": floats("q"),
+            "sigmas": floats("q"),
+            "satellites": floats("q", 3),
+            "ids": ints("q"),
+            "systems": ints("q"),
+            "elevation": floats("q"),
+            "density": floats("q"),
+            "lever": floats(3),
+        },
+    ),
     "landmark-observations": Kind(
         LandmarkObservations,
         {

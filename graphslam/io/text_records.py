@@ -42,7 +42,7 @@ def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
 
 
 def read_table(
-    path: str | os.PathLike[str], columns: int, *, separator: str | None = None
+    path: str | os.PathLike[str], columns: int, *, separator: str | None = None, skip: int = 0
 ) -> tuple[Array, npt.NDArray[np.int64]]:
     """Rows of ``columns`` numbers, one a line; blank lines and lines that begin with ``#`` are skipped.
 
@@ -52,6 +52,8 @@ def read_table(
     columns : int
     separator : str, optional
         What stands between numbers, and perhaps after the last one; white space by default.
+    skip : int
+        So many lines at the beginning are no rows.
 
     Returns
     -------
@@ -72,7 +74,7 @@ def read_table(
     lines: list[int] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split() if separator is None else line.strip().removesuffix(separator).split(separator)
-        if not line.strip() or words[0].startswith("#"):
+        if number <= skip or not line.strip() or words[0].startswith("#"):
             continue
         if len(words) != columns:
             raise FormatError(

@@ -33,6 +33,7 @@ from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.config import read_toml
 from graphslam.core.geometry import se2_between
+from graphslam.core.gnss import Pseudoranges
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
@@ -55,8 +56,10 @@ from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
+from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
 from graphslam.io.joined_map import read_joined, write_joined
+from graphslam.io.kitti_gps import read_kitti_gps
 from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.io.log_folder import read_log_mesh, write_log_folder
 from graphslam.io.log_store import load_log, save_log
@@ -65,6 +68,7 @@ from graphslam.io.mrclam import read_mrclam
 from graphslam.io.network_file import read_network
 from graphslam.io.plaza import read_plaza
 from graphslam.io.slsjf import read_slsjf_local_maps
+from graphslam.io.smartloc import read_smartloc
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tuc import read_tuc
 from graphslam.io.tum import read_tum, write_tum
@@ -135,6 +139,13 @@ def a_log() -> SensorLog:
         "wheels": VelocityControls(times=t, speed=np.ones(n), yaw_rate=np.zeros(n)),
         "odometry": Odometry(times=t, increments=q, covariances=np.tile(0.01 * np.eye(6), (n, 1, 1))),
         "gps": Gps(times=t, positions=r.normal(size=(n, 2)), sigma=np.ones(n), lever=np.zeros(2)),
+        "uneven": Gps.upright(
+            times=t, positions=r.normal(size=(n, 3)), horizontal=1.0, vertical=2.0, lever=np.zeros(3)
+        ),
+        "satellites": Pseudoranges(
+            times=t, offsets=np.arange(7), ranges=np.full(6, 2e7), sigmas=np.ones(6), satellites=2e7 * np.ones((6, 3)),
+            ids=np.arange(6), systems=np.ones(6, np.int64), elevation=np.full(6, 0.5), density=np.full(6, 45.0),
+        ),
         "marks": LandmarkObservations(
             times=t, offsets=np.arange(7), ranges=np.ones(6), bearings=np.zeros(6), sigmas=np.full((6, 2), 0.1),
             ids=np.arange(6), max_range=30.0,
@@ -481,6 +492,43 @@ def plaza(root: Path) -> None:
     scipy.io.savemat(root / "Plaza1_.mat", {"GT": gt, "TL": np.array([[6, 1.0, 2.0], [0, 3.0, 4.0]])})
 
 
+def euroc(root: Path) -> None:
+    t = (1.4e9 + 0.005 * np.arange(40)) * 1e9
+    unit = np.column_stack([t, np.tile([0.1, 0, 0, 9.1, 0.1, -3.3], (40, 1))])
+    np.savetxt(root / "imu0_data.csv", unit, delimiter=",", fmt=["%d", *["%.6g"] * 6], header="stamp,w,a")
+    np.savetxt(root / "leica0_data.csv", np.column_stack([t[::10], rng().normal(size=(4, 3))]), "%.17g", ",")
+    densities = "gyroscope_noise_density: 1.7e-4", "gyroscope_random_walk: 2e-5 # [rad]"
+    densities += "accelerometer_noise_density: 2e-3", "accelerometer_random_walk: 3e-3"
+    (root / "imu0_sensor.yaml").write_text("\n".join(densities) + "\n")
+    rows = "1.0, 0.0, 0.0, 0.07,\n 0.0, 1.0, 0.0, -0.02,\n 0.0, 0.0, 1.0, -0.12,\n 0.0, 0.0, 0.0, 1.0"
+    (root / "leica0_sensor.yaml").write_text(f"T_BS:\n  cols: 4\n  data: [{rows}]\n")
+
+
+def kitti_gps(root: Path) -> None:
+    names = "BodyPtx BodyPty BodyPtz BodyPrx BodyPry BodyPrz AccelerometerSigma GyroscopeSigma IntegrationSigma"
+    names += " AccelerometerBiasSigma GyroscopeBiasSigma AverageDeltaT\n"
+    (root / "KittiEquivBiasedImu_metadata.txt").write_text(
+        names + "0 0 0 0 0 0 0.01 0.000175 0 0.000167 2.9e-006 0.01\n"
+    )
+    rows = "".join(f"{46534 + k}.25,{k}.5,{2 * k}.25,0.1\n" for k in range(20))
+    (root / "KittiGps_converted.txt").write_text("Time,X,Y,Z\n" + rows)
+    rows = "".join(f"{46534 + 0.1 * k:.2f} 0.1 0.0 0.1 9.8 0.001 0.0 0.002\n" for k in range(20))
+    head = "Time dt accelX accelY accelZ omegaX omegaY omegaZ\n"
+    (root / "KittiEquivBiasedImu.txt").write_text(head + rows)
+
+
+def smartloc(root: Path) -> None:
+    lines, truth = [], []
+    for k in range(20):
+        t = 0.2 * k
+        lines.append(f"odom3 {t:.1f} 5.8 0 0 0 0 -0.006 0.0025 0.0009 0.0009 4e-06 4e-06 4e-06")
+        for j, (x, y, z) in enumerate([(14.5e6, 2.8e6, 21.8e6), (18.1e6, 11.5e6, 13.7e6), (-5.9e6, -9.5e6, 22.9e6)]):
+            lines.append(f"pseudorange3 {t:.1f} {2e7 + j} 25 {x} {y} {z} {12 + 100 * j} {1 + 3 * (j > 1)} 8.5 49")
+        truth.append(f"point3 {t:.1f} 3785108.1 {899901.5 + k} 5037234.4 0 0 0 0 0 0 0 0 0")
+    (root / "Berlin_Potsdamer_Platz_Input.txt").write_text("\n".join(lines) + "\n")
+    (root / "Berlin_Potsdamer_Platz_GT.txt").write_text("\n".join(truth) + "\n")
+
+
 def slsjf(root: Path) -> None:
     for k in (1, 2):
         r = np.random.default_rng(k)
@@ -619,6 +667,9 @@ READERS: dict[str, Reader] = {
     "lidar-pack": Reader(lidar_pack, read_pack),
     "mrclam": Reader(mrclam, lambda p: read_mrclam(p, robot=2), RANGES),
     "plaza": Reader(plaza, read_plaza, RANGES),
+    "euroc": Reader(euroc, read_euroc),
+    "kitti-gps": Reader(kitti_gps, read_kitti_gps),
+    "smartloc": Reader(smartloc, read_smartloc),
     "slsjf-maps": Reader(slsjf, read_slsjf_local_maps),
     "slsjf-data": Reader(
         slsjf_published, lambda p: (read_slsjf_network(p), read_slsjf_observations(p)), frozenset({"max_range"})

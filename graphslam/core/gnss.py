@@ -1,0 +1,146 @@
+"""Raw measurements of a receiver of satellite navigation: pseudoranges, before anybody made positions of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.geodesy import geodetic_to_ecef, tangent_axes
+from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.reading import usable
+from graphslam.core.records import check_times
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""[m/s]"""
+EARTH_RATE = 7.2921151467e-5
+"""Of the Earth's rotation, as GPS defines it [rad/s]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pseudoranges:
+    """Pseudoranges of several satellites at each epoch (ragged).
+
+    A pseudorange is the distance to the satellite plus what the receiver's clock is fast, times the speed of light.
+    What is known of satellite clocks and of the atmosphere has been taken off.
+
+    Parameters
+    ----------
+    times : (n,)
+        Epochs [s].
+    offsets : (n + 1,) int64
+        Pseudoranges of epoch k are rows ``offsets[k]:offsets[k + 1]``; an epoch may be empty.
+    ranges, sigmas : (q,)
+        Pseudoranges and their stated standard deviations [m].
+    satellites : (q, 3)
+        Where the satellite was when it sent, in Earth-fixed axes of that instant [m].
+    ids, systems : (q,) int64
+        Number of the satellite, unique over all systems; system (one of several, each with a time of its own).
+    elevation : (q,)
+        Of the satellite above the horizon [rad].
+    density : (q,)
+        Carrier-to-noise density ratio C/N0 [dBHz].
+    lever : (3,)
+        Antenna in the base frame [m].
+
+    Raises
+    ------
+    DataError, GeometryError
+    """
+
+    times: Array
+    offsets: npt.NDArray[np.int64]
+    ranges: Array
+    sigmas: Array
+    satellites: Array
+    ids: npt.NDArray[np.int64]
+    systems: npt.NDArray[np.int64]
+    elevation: Array
+    density: Array
+    lever: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        offsets, q = np.ascontiguousarray(self.offsets, dtype=np.int64), len(self.ranges)
+        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
+            raise DataError(
+                "offsets do not partition the pseudoranges", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
+            )
+        object.__setattr__(self, "offsets", offsets)
+        shapes = {"satellites": (q, 3), "lever": (3,)}
+        for name in ("ranges", "sigmas", "satellites", "elevation", "density", "lever"):
+            a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if a.shape != shapes.get(name, (q,)):
+                raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shapes.get(name, (q,)))
+            if not np.all(usable(a)):
+                k = int(np.argwhere(~usable(a))[0][0])
+                raise DataError(f"{name} of pseudorange {k} is not finite", got=a[k], wanted="finite numbers")
+            object.__setattr__(self, name, a)
+        for name in ("ids", "systems"):
+            w = np.ascontiguousarray(getattr(self, name), dtype=np.int64)
+            if w.shape != (q,):
+                raise GeometryError(f"{name} has the wrong shape", got=w.shape, wanted=(q,))
+            object.__setattr__(self, name, w)
+        if np.any(self.sigmas <= 0):
+            k = int(np.flatnonzero(self.sigmas <= 0)[0])
+            raise DataError(f"sigma of pseudorange {k} is not positive", got=self.sigmas[k], wanted="> 0 m")
+
+    @property
+    def epochs(self) -> npt.NDArray[np.int64]:
+        """Epoch of every pseudorange ``(q,)``."""
+        return np.repeat(np.arange(len(self.times)), np.diff(self.offsets))
+
+    def take(self, index: Any) -> Pseudoranges:
+        """See :class:`graphslam.core.records.Stream`."""
+        keep = np.arange(len(self.times))[index]
+        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
+        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
+        names = ("ranges", "sigmas", "satellites", "ids", "systems", "elevation", "density")
+        return replace(self, times=self.times[keep], offsets=offsets, **{n: getattr(self, n)[r] for n in names})
+
+
+@dataclass(frozen=True, slots=True)
+class TangentPlane:
+    """East, north and up at a place: the frame in which positions by satellites are solved for.
+
+    Parameters
+    ----------
+    latitude, longitude : float
+        [deg]
+    height : float
+        Above the ellipsoid [m].
+    """
+
+    latitude: float
+    longitude: float
+    height: float = 0.0
+
+    @property
+    def origin(self) -> Array:
+        """Earth-centred ``(3,)`` [m]."""
+        return geodetic_to_ecef([self.latitude, self.longitude, self.height])
+
+    def from_ecef(self, points: ArrayLike) -> Array:
+        """East, north, up ``(..., 3)`` of Earth-centred points ``(..., 3)``."""
+        axes = tangent_axes(self.latitude, self.longitude)
+        return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ axes.T)
+
+    def satellites(self, sent: ArrayLike) -> Array:
+        """Satellites ``(q, 3)`` in this frame as the axes lie when their signals arrive (east, north, up).
+
+        While a signal travels, the Earth turns on: in axes of the arrival the satellite was farther west by 20 to 30 m.
+        Left out, every position is too far east by as much.
+
+        Parameters
+        ----------
+        sent : (q, 3)
+            Earth-fixed axes of the instant of sending [m].
+        """
+        s = np.asarray(sent, dtype=np.float64)
+        a = EARTH_RATE / SPEED_OF_LIGHT * np.linalg.norm(s - self.origin, axis=-1)
+        c, d = np.cos(a), np.sin(a)
+        return self.from_ecef(np.stack([c * s[..., 0] + d * s[..., 1], c * s[..., 1] - d * s[..., 0], s[..., 2]], -1))

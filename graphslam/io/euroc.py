@@ -1,0 +1,127 @@
+"""EuRoC recordings of a flying robot without its cameras: an IMU, and positions of a prism by a tracking total station.
+
+* ``imu``: angular rates and specific forces. Noise densities and walks are those of the file beside the table, times
+  ``noise_scale``; what σ the biases have at the start the files do not say.
+* ``leica``: positions of the prism, whose place on the body is its lever. The station keeps another clock than the IMU;
+  ``late`` is taken off its stamps.
+
+Stamps are seconds since the first reading of the IMU.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, FormatError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.imu import Imu, ImuNoise
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.reading import read_text, usable
+from graphslam.core.records import Gps
+from graphslam.io.clock import usable_records
+from graphslam.io.text_records import find_text_file, read_table
+
+GYRO_BIAS, FORCE_BIAS = 0.1, 0.3
+"""σ of the biases at the start [rad/s, m/s²]; the files state none."""
+_DENSITIES = {
+    "gyro": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accelerometer": "accelerometer_noise_density",
+    "accelerometer_walk": "accelerometer_random_walk",
+}
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+
+
+def read_euroc(
+    folder: str | os.PathLike[str],
+    *,
+    sigma: float = 0.01,
+    late: float = 0.0,
+    noise_scale: float = 1.0,
+    name: str = "euroc",
+    drops: DropCounter | None = None,
+) -> SensorLog:
+    """Read the log.
+
+    Parameters
+    ----------
+    folder : path
+        Holds ``imu0_data.csv``, ``imu0_sensor.yaml``, ``leica0_data.csv`` and ``leica0_sensor.yaml``, tables plain or
+        compressed.
+    sigma : float
+        Of a coordinate of a position [m]; the recording states none.
+    late : float
+        Taken off the stamps of the positions [s].
+    noise_scale : float
+        Factor on the noise densities of the data sheet.
+    name : str
+        Of the log.
+    drops : DropCounter, optional
+        Counts into this one, besides ``SensorLog.dropped``.
+
+    Raises
+    ------
+    ConfigError, MissingDataError, FormatError, DataError
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise MissingDataError("no such folder", where=str(root), wanted="the folder of a EuRoC recording")
+    if not (sigma > 0 and noise_scale > 0 and np.isfinite([sigma, late, noise_scale]).all()):
+        raise ConfigError(f"sigma = {sigma}, late = {late}, noise_scale = {noise_scale}; wanted σ and scale above 0")
+    counter = DropCounter()
+    stated = read_text(root / "imu0_sensor.yaml")
+    density = {k: _number(stated, word, root / "imu0_sensor.yaml") for k, word in _DENSITIES.items()}
+    noise = ImuNoise(
+        gyro=noise_scale * density["gyro"],
+        gyro_bias=GYRO_BIAS,
+        gyro_walk=density["gyro_walk"],
+        accelerometer=noise_scale * density["accelerometer"],
+        accelerometer_bias=FORCE_BIAS,
+        accelerometer_walk=density["accelerometer_walk"],
+    )
+    a = _table(find_text_file(root, "imu0_data.csv"), 7, "imu", counter)
+    z = _table(find_text_file(root, "leica0_data.csv"), 4, "leica", counter)
+    start = a[0][0, 0]
+    imu = Imu(times=1e-9 * (a[0][:, 0] - start), angular_rate=a[0][:, 1:4], specific_force=a[0][:, 4:], noise=noise)
+    n = len(z[0])
+    prism = _matrix(root / "leica0_sensor.yaml")[:3, 3]
+    at = 1e-9 * (z[0][:, 0] - start) - late
+    leica = Gps(times=at, positions=z[0][:, 1:], sigma=np.full(n, sigma), lever=prism)
+    if drops is not None:
+        drops.counts.update(counter.counts)
+    return SensorLog(
+        name=name,
+        streams={"imu": imu, "leica": leica},
+        read={"imu": a[1], "leica": z[1]},
+        dropped=dict(counter.counts),
+        meta={"source": root.name, "sigma": sigma, "late": late, "noise_scale": noise_scale},
+    )
+
+
+def _table(path: Path, columns: int, stream: str, counter: DropCounter) -> tuple[Array, int]:
+    """Rows that can be used, and how many there were."""
+    table, _ = read_table(path, columns, separator=",")
+    bad = {"a number is not finite": np.asarray(~usable(table[:, 1:]).all(axis=1))}
+    keep = usable_records(table[:, 0], bad, stream=stream, where=str(path), drops=counter)
+    return table[keep], len(table)
+
+
+def _number(text: str, word: str, path: Path) -> float:
+    found = re.search(rf"^{word}:\s*({_NUMBER})", text, re.MULTILINE)
+    if found is None:
+        raise FormatError(f"states no {word}", where=str(path), wanted=f"{word}: a number")
+    return float(found[1])
+
+
+def _matrix(path: Path) -> Array:
+    """``T_BS``, sixteen numbers in brackets."""
+    found = re.search(r"data:\s*\[([^\]]{1,2000})\]", read_text(path))
+    numbers = re.findall(_NUMBER, found[1]) if found else []
+    T = np.array([float(x) for x in numbers])
+    if len(T) != 16 or not np.all(usable(T)):
+        raise FormatError("holds no place of the sensor", where=str(path), got=f"{len(T)} numbers", wanted="16")
+    return T.reshape(4, 4)
