@@ -10,4 +10,5 @@ STUDIES: dict[str, str] = {
     "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
     "refinement": "graphslam.app.studies.refinement:STUDY",
+    "smartloc": "graphslam.app.studies.smartloc:STUDY",
 }
