@@ -20,6 +20,7 @@ STOREY = {
     "graphslam.frontends": 2,
     "graphslam.association": 3,
     "graphslam.solve": 4,
+    "graphslam.skeleton": 4,
     "graphslam.join": 5,
     "graphslam.refine": 5,
     "graphslam.loops": 5,

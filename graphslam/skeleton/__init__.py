@@ -1,0 +1,1 @@
+"""Skeleton networks: measurement nodes collapsed into landmarks, landmarks integrated out, poses relaxed."""

@@ -1,0 +1,534 @@
+"""Numba kernels of what ties a pose alone, or to the next one: odometry and tilt; block-tridiagonal algebra.
+
+Poses are perturbed in the world frame, ``R ← Exp(w) R``, ``p ← p + u``; vectors are ``(N, 6)``: w, then u. A chain of
+blocks is ``diagonal (N, 6, 6)`` and ``upper (N - 1, 6, 6)``, the blocks (i, i + 1). Plain arrays only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class Chain(NamedTuple):
+    """Odometry and tilt of all poses."""
+
+    rotation: Array
+    """(N - 1, 3, 3): turn from each pose to the next, in the body …"""
+    translation: Array
+    """(N - 1, 3): … and its way [m]."""
+    information: Array
+    """(1, 6, 6) or (N - 1, 6, 6): rotation vector, then way."""
+    up: Array
+    """(N, 3): direction up as the body saw it."""
+    up_information: Array
+    """(1,) or (N,) [1/rad²]; zero where nothing was seen."""
+
+
+@nb.njit(cache=True, nogil=True)
+def _log(R, r):
+    """Rotation vector of a rotation matrix, below a half turn."""
+    c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    s = np.sqrt(x * x + y * y + z * z)
+    k = 1.0 + s * s / 6.0 if s < 1e-4 and c > 0.0 else np.arctan2(s, c) / max(s, 1e-300)
+    r[0], r[1], r[2] = k * x, k * y, k * z
+
+
+@nb.njit(cache=True, nogil=True)
+def exp(w, R):
+    """Write ``Exp(w)`` to ``R (3, 3)``."""
+    t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if t2 < 1e-8:
+        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
+    else:
+        t = np.sqrt(t2)
+        a, b = np.sin(t) / t, 2.0 * np.sin(0.5 * t) ** 2 / t2
+    x, y, z = w[0], w[1], w[2]
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+
+
+@nb.njit(cache=True, nogil=True)
+def move(rotation, position, step, scale, rotation_out, position_out):
+    """Move every pose by ``scale * step`` (N, 6); rotations are made orthonormal again to second order."""
+    E = np.empty((3, 3))
+    w = np.empty(3)
+    A = np.empty((3, 3))
+    for i in range(len(position)):
+        for k in range(3):
+            w[k] = scale * step[i, k]
+            position_out[i, k] = position[i, k] + scale * step[i, 3 + k]
+        exp(w, E)
+        for r in range(3):
+            for c in range(3):
+                A[r, c] = E[r, 0] * rotation[i, 0, c] + E[r, 1] * rotation[i, 1, c] + E[r, 2] * rotation[i, 2, c]
+        # A ← A (3 I - Aᵀ A) / 2, one Newton step to the nearest rotation
+        for r in range(3):
+            for c in range(3):
+                s = 0.0
+                for k in range(3):
+                    s += A[r, k] * (A[0, k] * A[0, c] + A[1, k] * A[1, c] + A[2, k] * A[2, c])
+                rotation_out[i, r, c] = 1.5 * A[r, c] - 0.5 * s
+
+
+@nb.njit(cache=True, nogil=True)
+def reckon(rotation, translation, R, p):
+    """Fill ``R (N, 3, 3)`` and ``p (N, 3)`` from their first pose by the chain's increments."""
+    for i in range(len(translation)):
+        for r in range(3):
+            p[i + 1, r] = p[i, r]
+            for c in range(3):
+                p[i + 1, r] += R[i, r, c] * translation[i, c]
+                R[i + 1, r, c] = (
+                    R[i, r, 0] * rotation[i, 0, c] + R[i, r, 1] * rotation[i, 1, c] + R[i, r, 2] * rotation[i, 2, c]
+                )
+
+
+@nb.njit(cache=True, nogil=True)
+def odometry_residual(chain, poses, k, r, J):
+    """Residual (6,) of odometry k and the left half (6, 6) of its Jacobian with respect to pose k + 1.
+
+    By pose k it is minus the same, plus ``Rᵀ (p' - p) ×`` on the turn of pose k; see :func:`linearise`.
+    """
+    Ra, Rb = poses.rotation[k], poses.rotation[k + 1]
+    A = np.empty((3, 3))
+    E = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = Ra[0, i] * Rb[0, j] + Ra[1, i] * Rb[1, j] + Ra[2, i] * Rb[2, j]
+    Z = chain.rotation[k]
+    for i in range(3):
+        for j in range(3):
+            E[i, j] = Z[0, i] * A[0, j] + Z[1, i] * A[1, j] + Z[2, i] * A[2, j]
+    _log(E, r)
+    dx = poses.position[k + 1, 0] - poses.position[k, 0]
+    dy = poses.position[k + 1, 1] - poses.position[k, 1]
+    dz = poses.position[k + 1, 2] - poses.position[k, 2]
+    for i in range(3):
+        r[3 + i] = Ra[0, i] * dx + Ra[1, i] * dy + Ra[2, i] * dz - chain.translation[k, i]
+    # inverse right Jacobian of the rotation residual: I + [r]/2 + c [r]²
+    t2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    t = np.sqrt(t2)
+    c = 1.0 / 12.0 + t2 / 720.0 if t < 1e-2 else 1.0 / t2 - 0.5 * np.cos(0.5 * t) / (t * np.sin(0.5 * t))
+    x, y, z = r[0], r[1], r[2]
+    A[0, 0], A[0, 1], A[0, 2] = 1.0 - c * (y * y + z * z), c * x * y - 0.5 * z, c * x * z + 0.5 * y
+    A[1, 0], A[1, 1], A[1, 2] = c * x * y + 0.5 * z, 1.0 - c * (x * x + z * z), c * y * z - 0.5 * x
+    A[2, 0], A[2, 1], A[2, 2] = c * x * z - 0.5 * y, c * y * z + 0.5 * x, 1.0 - c * (x * x + y * y)
+    for i in range(3):
+        for j in range(3):
+            J[i, j] = A[i, 0] * Rb[j, 0] + A[i, 1] * Rb[j, 1] + A[i, 2] * Rb[j, 2]
+            J[i, 3 + j] = 0.0
+            J[3 + i, j] = 0.0
+            J[3 + i, 3 + j] = Ra[j, i]
+    return dx, dy, dz
+
+
+@nb.njit(cache=True, nogil=True)
+def linearise(chain, poses, blocks, diagonal, upper, g):
+    """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
+
+    Tilt: ``Rᵀ e_z - m`` of two unit vectors, isotropic; in the world its derivative by w is ``e_z × w``.
+    """
+    N = len(poses.position)
+    Jb = np.empty((6, 6))
+    Ja = np.empty((6, 6))
+    OJa = np.empty((6, 6))
+    OJb = np.empty((6, 6))
+    r = np.empty(6)
+    Or = np.empty(6)
+    total = 0.0
+    for k in range(N - 1):
+        dx, dy, dz = odometry_residual(chain, poses, k, r, Jb)
+        O = chain.information[k if len(chain.information) > 1 else 0]
+        for i in range(3):
+            for j in range(3):
+                Ja[i, j] = -Jb[i, j]
+                Ja[i, 3 + j] = 0.0
+                Ja[3 + i, 3 + j] = -Jb[3 + i, 3 + j]
+            # Rᵀ (d × w)
+            a, b, c = Jb[3 + i, 3], Jb[3 + i, 4], Jb[3 + i, 5]
+            Ja[3 + i, 0] = b * dz - c * dy
+            Ja[3 + i, 1] = c * dx - a * dz
+            Ja[3 + i, 2] = a * dy - b * dx
+        for i in range(6):
+            s = 0.0
+            for j in range(6):
+                s += O[i, j] * r[j]
+            Or[i] = s
+            total += r[i] * s
+        for i in range(6):
+            for j in range(6):
+                g[k, i] += Ja[j, i] * Or[j]
+                g[k + 1, i] += Jb[j, i] * Or[j]
+        if not blocks:
+            continue
+        for i in range(6):
+            for j in range(6):
+                s = t = 0.0
+                for m in range(6):
+                    s += O[i, m] * Ja[m, j]
+                    t += O[i, m] * Jb[m, j]
+                OJa[i, j] = s
+                OJb[i, j] = t
+        for i in range(6):
+            for j in range(6):
+                s = t = c = 0.0
+                for m in range(6):
+                    s += Ja[m, i] * OJa[m, j]
+                    t += Jb[m, i] * OJb[m, j]
+                    c += Ja[m, i] * OJb[m, j]
+                diagonal[k, i, j] += s
+                diagonal[k + 1, i, j] += t
+                upper[k, i, j] += c
+    for i in range(N):
+        a = chain.up_information[i if len(chain.up_information) > 1 else 0]
+        R, m3 = poses.rotation[i], chain.up[i]
+        x = R[0, 0] * m3[0] + R[0, 1] * m3[1] + R[0, 2] * m3[2]
+        y = R[1, 0] * m3[0] + R[1, 1] * m3[1] + R[1, 2] * m3[2]
+        z = R[2, 0] * m3[0] + R[2, 1] * m3[1] + R[2, 2] * m3[2]
+        total += a * (x * x + y * y + (1.0 - z) * (1.0 - z))
+        g[i, 0] -= a * y  # e_z × R m
+        g[i, 1] += a * x
+        if blocks:
+            diagonal[i, 0, 0] += a
+            diagonal[i, 1, 1] += a
+    return total
+
+
+@nb.njit(cache=True, nogil=True)
+def product(diagonal, upper, v, begin, end, out):
+    """Write the product of a chain of blocks with ``v (N, 6)`` to the rows ``begin … end - 1`` of ``out``."""
+    N = len(diagonal)
+    for i in range(begin, end):
+        for r in range(6):
+            s = 0.0
+            for c in range(6):
+                s += diagonal[i, r, c] * v[i, c]
+            out[i, r] = s
+        if i + 1 < N:
+            for r in range(6):
+                s = 0.0
+                for c in range(6):
+                    s += upper[i, r, c] * v[i + 1, c]
+                out[i, r] += s
+        if i > 0:
+            for c in range(6):
+                for r in range(6):
+                    out[i, r] += upper[i - 1, c, r] * v[i - 1, c]
+
+
+@nb.njit(cache=True, nogil=True)
+def _cholesky(A):
+    """Lower Cholesky factor in place of a block (6, 6); False where it is not positive definite."""
+    for j in range(6):
+        s = A[j, j]
+        for k in range(j):
+            s -= A[j, k] * A[j, k]
+        if not s > 0.0:
+            return False
+        A[j, j] = np.sqrt(s)
+        over = 1.0 / A[j, j]
+        for i in range(j + 1, 6):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            A[i, j] = s * over
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _solve(L, x):
+    for i in range(6):
+        s = x[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(5, -1, -1):
+        s = x[i]
+        for k in range(i + 1, 6):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+
+
+@nb.njit(cache=True, nogil=True)
+def solve_chain(diagonal, upper, x):
+    """Solve a chain of blocks in place of ``x (N, 6)`` by elimination; ``diagonal`` and ``upper`` are used up.
+
+    Returns the first pose whose block is not positive definite, or -1.
+    """
+    N = len(x)
+    column = np.empty(6)
+    for i in range(N):
+        if not _cholesky(diagonal[i]):
+            return i
+        _solve(diagonal[i], x[i])
+        if i + 1 == N:
+            break
+        U = upper[i].copy()
+        for c in range(6):
+            for r in range(6):
+                column[r] = U[r, c]
+            _solve(diagonal[i], column)
+            for r in range(6):
+                upper[i, r, c] = column[r]
+        for r in range(6):
+            for c in range(6):
+                s = 0.0
+                for k in range(6):
+                    s += U[k, r] * upper[i, k, c]
+                diagonal[i + 1, r, c] -= s
+            for k in range(6):
+                x[i + 1, r] -= U[k, r] * x[i, k]
+    for i in range(N - 2, -1, -1):
+        for r in range(6):
+            for k in range(6):
+                x[i, r] -= upper[i, r, k] * x[i + 1, k]
+    return -1
+
+
+@nb.njit(cache=True, nogil=True)
+def invert_blocks(blocks, begin, end):
+    """Replace blocks (6, 6) by their inverses; returns the first that is not positive definite, or -1."""
+    L = np.empty((6, 6))
+    x = np.empty(6)
+    for i in range(begin, end):
+        L[:] = blocks[i]
+        if not _cholesky(L):
+            return i
+        for c in range(6):
+            x[:] = 0.0
+            x[c] = 1.0
+            _solve(L, x)
+            for r in range(6):
+                blocks[i, r, c] = x[r]
+    return -1
+
+
+@nb.njit(cache=True, nogil=True)
+def multiply_blocks(blocks, v, begin, end, out):
+    """Write ``blocks[i] v[i]`` to the rows ``begin … end - 1`` of ``out (N, 6)``."""
+    for i in range(begin, end):
+        for r in range(6):
+            s = 0.0
+            for c in range(6):
+                s += blocks[i, r, c] * v[i, c]
+            out[i, r] = s
+
+
+@nb.njit(cache=True, nogil=True)
+def forward_pass(sightings, chain_poses, rules, start_seen, D, b, out):
+    """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
+
+    Parameters
+    ----------
+    chain_poses : Poses
+        Their increments are followed.
+    rules : (ago, turn, way, gate)
+        A landmark is old when it was first seen more than ``ago`` poses earlier; prior information of a pose against
+        its prediction [1/rad², 1/m²]; chi-square (3) up to which a sighting is believed.
+    start_seen : (L,) int32
+        -1; the pose that saw each landmark first: out.
+    D, b : (L, 6), (L, 3)
+        Zero; sums of weights and of weighted places: out.
+    out : Poses
+        The first pose is that of the chain.
+
+    Returns
+    -------
+    tied, refused : int
+        Poses that were tied to old landmarks; sightings of old landmarks that were not believed.
+    """
+    ago, turn, way, gate = rules
+    rotation, position = chain_poses.rotation, chain_poses.position
+    N = len(position)
+    A = np.empty((6, 6))
+    x = np.empty(6)
+    w = np.empty(3)
+    E = np.empty((3, 3))
+    T = np.empty((3, 3))
+    Rp = np.empty((3, 3))
+    pp = np.empty(3)
+    most = 0
+    for i in range(N):
+        most = max(most, sightings.first[i + 1] - sightings.first[i])
+    seen = np.empty((most, 8))
+    misfit = np.empty(most)
+    which = np.empty(most, np.int64)
+    believed = np.ones(most, np.bool_)
+    tied = refused = 0
+    for i in range(N):
+        R, p = out.rotation[i], out.position[i]
+        if i == 0:
+            R[:] = rotation[0]
+            p[:] = position[0]
+        else:
+            a, c = rotation[i - 1], rotation[i]
+            Q, q0 = out.rotation[i - 1], out.position[i - 1]
+            for r in range(3):
+                for k in range(3):
+                    T[r, k] = Q[r, 0] * a[k, 0] + Q[r, 1] * a[k, 1] + Q[r, 2] * a[k, 2]
+            for r in range(3):
+                p[r] = q0[r]
+                for k in range(3):
+                    R[r, k] = T[r, 0] * c[0, k] + T[r, 1] * c[1, k] + T[r, 2] * c[2, k]
+                    p[r] += T[r, k] * (position[i, k] - position[i - 1, k])
+        lo, hi = sightings.first[i], sightings.first[i + 1]
+        believed[: hi - lo] = True
+        n = 0
+        for m in range(lo, hi):
+            j = sightings.landmark[m]
+            if start_seen[j] < 0 or i - start_seen[j] <= ago:
+                continue
+            # the running mean D⁻¹ b
+            d0, d1, d2, d3, d4, d5 = D[j, 0], D[j, 1], D[j, 2], D[j, 3], D[j, 4], D[j, 5]
+            xx, xy, xz = d3 * d5 - d4 * d4, d2 * d4 - d1 * d5, d1 * d4 - d2 * d3
+            yy, yz, zz = d0 * d5 - d2 * d2, d2 * d1 - d0 * d4, d0 * d3 - d1 * d1
+            over = 1.0 / (d0 * xx + d1 * xy + d2 * xz)
+            seen[n, 0] = (xx * b[j, 0] + xy * b[j, 1] + xz * b[j, 2]) * over
+            seen[n, 1] = (xy * b[j, 0] + yy * b[j, 1] + yz * b[j, 2]) * over
+            seen[n, 2] = (xz * b[j, 0] + yz * b[j, 1] + zz * b[j, 2]) * over
+            z0, z1, z2 = (
+                np.float64(sightings.points[m, 0]),
+                np.float64(sightings.points[m, 1]),
+                np.float64(sightings.points[m, 2]),
+            )
+            seen[n, 3], seen[n, 4], seen[n, 5] = z0, z1, z2
+            r2 = z0 * z0 + z1 * z1 + z2 * z2
+            seen[n, 6] = sightings.across / r2
+            seen[n, 7] = (sightings.along - seen[n, 6]) / r2
+            which[n] = m - lo
+            n += 1
+        if n >= 3:
+            tied += 1
+            Rp[:] = R
+            pp[:] = p
+            limit = np.inf
+            for step in range(3):
+                A[:] = 0.0
+                x[:] = 0.0
+                for k in range(3):  # prior: the turn and the way since the prediction
+                    A[k, k] = turn
+                    A[3 + k, 3 + k] = way
+                    x[3 + k] = -way * (p[k] - pp[k])
+                for r in range(3):
+                    for k in range(3):
+                        E[r, k] = R[r, 0] * Rp[k, 0] + R[r, 1] * Rp[k, 1] + R[r, 2] * Rp[k, 2]
+                _log(E, w)
+                for k in range(3):
+                    x[k] = -turn * w[k]
+                for e in range(n):
+                    z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                    sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                    sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                    sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                    qx, qy, qz = seen[e, 0] - p[0], seen[e, 1] - p[1], seen[e, 2] - p[2]
+                    ex, ey, ez = qx - sx, qy - sy, qz - sz
+                    d = sx * ex + sy * ey + sz * ez
+                    misfit[e] = al * (ex * ex + ey * ey + ez * ez) + be * d * d
+                if step > 0:
+                    limit = max(gate, 9.0 * np.median(misfit[:n]))
+                for e in range(n):
+                    if misfit[e] > limit:
+                        continue
+                    z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                    sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                    sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                    sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                    qx, qy, qz = seen[e, 0] - p[0], seen[e, 1] - p[1], seen[e, 2] - p[2]
+                    ex, ey, ez = qx - sx, qy - sy, qz - sz
+                    d = be * (sx * ex + sy * ey + sz * ez)
+                    fx, fy, fz = al * ex + d * sx, al * ey + d * sy, al * ez + d * sz
+                    x[0] -= fy * qz - fz * qy
+                    x[1] -= fz * qx - fx * qz
+                    x[2] -= fx * qy - fy * qx
+                    x[3] += fx
+                    x[4] += fy
+                    x[5] += fz
+                    _add_weight(A, qx, qy, qz, sx, sy, sz, (al, be))
+                _cholesky(A)
+                _solve(A, x)
+                for k in range(3):
+                    w[k] = x[k]
+                    p[k] += x[3 + k]
+                exp(w, E)
+                for r in range(3):
+                    for k in range(3):
+                        T[r, k] = E[r, 0] * R[0, k] + E[r, 1] * R[1, k] + E[r, 2] * R[2, k]
+                R[:] = T
+            for e in range(n):
+                z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                ex, ey, ez = seen[e, 0] - p[0] - sx, seen[e, 1] - p[1] - sy, seen[e, 2] - p[2] - sz
+                d = sx * ex + sy * ey + sz * ez
+                if al * (ex * ex + ey * ey + ez * ez) + be * d * d > gate:
+                    believed[which[e]] = False
+                    refused += 1
+        for m in range(lo, hi):
+            if not believed[m - lo]:
+                continue
+            j = sightings.landmark[m]
+            z0, z1, z2 = (
+                np.float64(sightings.points[m, 0]),
+                np.float64(sightings.points[m, 1]),
+                np.float64(sightings.points[m, 2]),
+            )
+            r2 = z0 * z0 + z1 * z1 + z2 * z2
+            al = sightings.across / r2
+            be = (sightings.along - al) / r2
+            sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+            sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+            sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+            D[j, 0] += al + be * sx * sx
+            D[j, 1] += be * sx * sy
+            D[j, 2] += be * sx * sz
+            D[j, 3] += al + be * sy * sy
+            D[j, 4] += be * sy * sz
+            D[j, 5] += al + be * sz * sz
+            ax, ay, az = p[0] + sx, p[1] + sy, p[2] + sz
+            d = be * (sx * ax + sy * ay + sz * az)
+            b[j, 0] += al * ax + d * sx
+            b[j, 1] += al * ay + d * sy
+            b[j, 2] += al * az + d * sz
+            if start_seen[j] < 0:
+                start_seen[j] = i
+    return tied, refused
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
+    """Add ``Jᵀ W J``, J = [[q]× , -I], to a block (6, 6)."""
+    al, be = weight
+    # W = α I + β s sᵀ; columns of Jᵀ: the turn sees a = s × q … (q × w)·s = w·(s × q)
+    cx, cy, cz = sy * qz - sz * qy, sz * qx - sx * qz, sx * qy - sy * qx
+    q2 = qx * qx + qy * qy + qz * qz
+    A[0, 0] += al * (q2 - qx * qx) + be * cx * cx
+    A[1, 1] += al * (q2 - qy * qy) + be * cy * cy
+    A[2, 2] += al * (q2 - qz * qz) + be * cz * cz
+    A[1, 0] += -al * qx * qy + be * cx * cy
+    A[2, 0] += -al * qx * qz + be * cx * cz
+    A[2, 1] += -al * qy * qz + be * cy * cz
+    # lower left: u rows, w columns: -(W [q])
+    A[3, 0] -= be * sx * cx
+    A[3, 1] -= -al * qz + be * sx * cy
+    A[3, 2] -= al * qy + be * sx * cz
+    A[4, 0] -= al * qz + be * sy * cx
+    A[4, 1] -= be * sy * cy
+    A[4, 2] -= -al * qx + be * sy * cz
+    A[5, 0] -= -al * qy + be * sz * cx
+    A[5, 1] -= al * qx + be * sz * cy
+    A[5, 2] -= be * sz * cz
+    A[3, 3] += al + be * sx * sx
+    A[4, 4] += al + be * sy * sy
+    A[5, 5] += al + be * sz * sz
+    A[4, 3] += be * sy * sx
+    A[5, 3] += be * sz * sx
+    A[5, 4] += be * sz * sy

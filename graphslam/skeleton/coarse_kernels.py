@@ -1,0 +1,526 @@
+"""Numba kernels of the keyframe network: the skeleton with every k-th pose kept, and rigid motion between them.
+
+Between the keyframes K and K + 1 a pose moves by ``u_i = Σ h (u_K + w_K × (p_i - p_K))``, ``w_i = Σ h w_K``, h linear
+in the number of the pose. A measurement seen through a keyframe then is ``h ((l - p_K) × w_K - u_K)``, so of each
+landmark and keyframe only ``Σ h W`` is needed. Pose N - 1 belongs to the last interval. Plain arrays only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.skeleton.landmark_kernels import _nine, _seen
+
+Array = npt.NDArray[np.float64]
+
+
+class Table(NamedTuple):
+    """Blocks (row, column), row ≤ column, by open addressing; made by :func:`make_table`."""
+
+    key: npt.NDArray[np.int64]
+    """(2^b,): row · keyframes + column, -1 where free."""
+    place: npt.NDArray[np.int32]
+    """(2^b,)"""
+    block: Array
+    """(capacity, 6, 6)"""
+    count: npt.NDArray[np.int64]
+    """(1,): blocks so far."""
+
+
+@nb.njit(cache=True, nogil=True)
+def make_table(capacity):
+    """An empty table for ``capacity`` blocks."""
+    size = 16
+    while size < 2 * capacity:
+        size *= 2
+    return Table(
+        np.full(size, -1, np.int64),
+        np.zeros(size, np.int32),
+        np.zeros((capacity, 6, 6)),
+        np.zeros(1, np.int64),
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def _find(table, key):
+    """Place of a block; it is made where there is none."""
+    mask = len(table.key) - 1
+    at = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
+    while table.key[at] != key:
+        if table.key[at] < 0:
+            table.key[at] = key
+            table.place[at] = table.count[0]
+            table.count[0] += 1
+            break
+        at = (at + 1) & mask
+    return table.place[at]
+
+
+@nb.njit(cache=True, nogil=True)
+def _grown(table):
+    """The same table with twice the room."""
+    n = table.count[0]
+    big = make_table(2 * len(table.block))
+    big.block[:n] = table.block[:n]
+    keys = np.empty(n, np.int64)
+    for at in range(len(table.key)):
+        if table.key[at] >= 0:
+            keys[table.place[at]] = table.key[at]
+    for i in range(n):
+        _find(big, keys[i])
+    return big
+
+
+@nb.njit(cache=True, nogil=True)
+def keys_of(table):
+    """Keys in the order of the blocks."""
+    keys = np.empty(table.count[0], np.int64)
+    for at in range(len(table.key)):
+        if table.key[at] >= 0:
+            keys[table.place[at]] = table.key[at]
+    return keys
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _sum_interval(sightings, poses, interval, slot, ids, sums):
+    """Sums over the poses of one interval, a row for each landmark seen there; ``slot`` is zero before.
+
+    A row: Σ h₀ W, Σ h₁ W, Σ h₀ h₀ W, Σ h₀ h₁ W, Σ h₁ h₁ W (six figures each), number of sightings.
+
+    Parameters
+    ----------
+    interval : (a, b, end)
+        Keyframes at poses a and b; poses ``a … end - 1``.
+
+    Returns
+    -------
+    int
+        Rows.
+    """
+    a, b, end = interval
+    n = 0
+    for i in range(a, end):
+        h1 = (i - a) / (b - a)
+        h0 = 1.0 - h1
+        h00, h01, h11 = h0 * h0, h0 * h1, h1 * h1
+        R = _nine(poses.rotation, i)
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            e = slot[j]
+            if e == 0:
+                ids[n] = j
+                sums[n] = 0.0
+                n += 1
+                slot[j] = n
+                e = n
+            row = sums[e - 1]
+            bx, by = be * sx, be * sy
+            xx, xy, xz, yy, yz, zz = al + bx * sx, bx * sy, bx * sz, al + by * sy, by * sz, al + be * sz * sz
+            row[0] += h0 * xx
+            row[1] += h0 * xy
+            row[2] += h0 * xz
+            row[3] += h0 * yy
+            row[4] += h0 * yz
+            row[5] += h0 * zz
+            row[6] += h1 * xx
+            row[7] += h1 * xy
+            row[8] += h1 * xz
+            row[9] += h1 * yy
+            row[10] += h1 * yz
+            row[11] += h1 * zz
+            row[12] += h00 * xx
+            row[13] += h00 * xy
+            row[14] += h00 * xz
+            row[15] += h00 * yy
+            row[16] += h00 * yz
+            row[17] += h00 * zz
+            row[18] += h01 * xx
+            row[19] += h01 * xy
+            row[20] += h01 * xz
+            row[21] += h01 * yy
+            row[22] += h01 * yz
+            row[23] += h01 * zz
+            row[24] += h11 * xx
+            row[25] += h11 * xy
+            row[26] += h11 * xz
+            row[27] += h11 * yy
+            row[28] += h11 * yz
+            row[29] += h11 * zz
+            row[30] += 1.0
+    return n
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _interval(c, k, N):
+    """Poses of interval c: its keyframes and the end of its poses."""
+    a = c * k
+    b = min(a + k, N - 1)
+    return a, b, N if b == N - 1 else b
+
+
+@nb.njit(cache=True, nogil=True)
+def _most(first, k, N, begin, end):
+    """Most measurements of an interval ``begin … end - 1``."""
+    most = 1
+    for c in range(begin, end):
+        a, _, e = _interval(c, k, N)
+        most = max(most, first[e] - first[a])
+    return most
+
+
+@nb.njit(cache=True, nogil=True)
+def _weighted(S, qx, qy, qz, X):
+    """``X = S G`` (3, 6), G = [[q]×, -I], of a symmetric S (six figures)."""
+    for r in range(3):
+        if r == 0:
+            a, b, c = S[0], S[1], S[2]
+        elif r == 1:
+            a, b, c = S[1], S[3], S[4]
+        else:
+            a, b, c = S[2], S[4], S[5]
+        X[r, 0] = b * qz - c * qy
+        X[r, 1] = c * qx - a * qz
+        X[r, 2] = a * qy - b * qx
+        X[r, 3], X[r, 4], X[r, 5] = -a, -b, -c
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_lever(qx, qy, qz, X, sign, B):
+    """``B += sign · Gᵀ X``, G = [[q]×, -I]."""
+    for c in range(6):
+        x, y, z = sign * X[0, c], sign * X[1, c], sign * X[2, c]
+        B[0, c] += qz * y - qy * z
+        B[1, c] += qx * z - qz * x
+        B[2, c] += qy * x - qx * y
+        B[3, c] -= x
+        B[4, c] -= y
+        B[5, c] -= z
+
+
+@nb.njit(cache=True, nogil=True)
+def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
+    """Add the measurements' diagonal blocks of ``Pᵀ S P`` of the keyframes ``begin … end - 1`` to ``out (K, 6, 6)``.
+
+    Parameters
+    ----------
+    landmarks : (l (L, 3), D⁻¹ (L, 6))
+    k : int
+        Poses from keyframe to keyframe.
+    """
+    l, Di = landmarks
+    N, K = len(poses.position), len(out)
+    first = max(0, begin - 1)
+    most = _most(sightings.first, k, N, first, min(end, K - 1))
+    slot0, slot1 = np.zeros(len(l), np.int32), np.zeros(len(l), np.int32)
+    ids0, ids1 = np.empty(most, np.int32), np.empty(most, np.int32)
+    sums0, sums1 = np.empty((most, 31)), np.empty((most, 31))
+    X, Y = np.empty((3, 6)), np.empty((3, 6))
+    S, SS = np.empty(6), np.empty(6)
+    n0 = 0
+    for c in range(first, end):
+        n1 = 0
+        if c < K - 1:
+            n1 = _sum_interval(sightings, poses, _interval(c, k, N), slot1, ids1, sums1)
+        if c >= begin:
+            at = min(c * k, N - 1)
+            px, py, pz = poses.position[at, 0], poses.position[at, 1], poses.position[at, 2]
+            for which in range(n0 + n1):
+                if which < n0:
+                    j = ids0[which]
+                    other = slot1[j]
+                    for d in range(6):
+                        S[d] = sums0[which, 6 + d]
+                        SS[d] = sums0[which, 24 + d]
+                    if other > 0:
+                        for d in range(6):
+                            S[d] += sums1[other - 1, d]
+                            SS[d] += sums1[other - 1, 12 + d]
+                else:
+                    j = ids1[which - n0]
+                    if slot0[j] > 0:
+                        continue
+                    for d in range(6):
+                        S[d] = sums1[which - n0, d]
+                        SS[d] = sums1[which - n0, 12 + d]
+                qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
+                # Σ h² W - S D⁻¹ S
+                for col in range(3):
+                    if col == 0:
+                        x, y, z = S[0], S[1], S[2]
+                    elif col == 1:
+                        x, y, z = S[1], S[3], S[4]
+                    else:
+                        x, y, z = S[2], S[4], S[5]
+                    X[0, col] = Di[j, 0] * x + Di[j, 1] * y + Di[j, 2] * z
+                    X[1, col] = Di[j, 1] * x + Di[j, 3] * y + Di[j, 4] * z
+                    X[2, col] = Di[j, 2] * x + Di[j, 4] * y + Di[j, 5] * z
+                SS[0] -= S[0] * X[0, 0] + S[1] * X[1, 0] + S[2] * X[2, 0]
+                SS[1] -= S[0] * X[0, 1] + S[1] * X[1, 1] + S[2] * X[2, 1]
+                SS[2] -= S[0] * X[0, 2] + S[1] * X[1, 2] + S[2] * X[2, 2]
+                SS[3] -= S[1] * X[0, 1] + S[3] * X[1, 1] + S[4] * X[2, 1]
+                SS[4] -= S[1] * X[0, 2] + S[3] * X[1, 2] + S[4] * X[2, 2]
+                SS[5] -= S[2] * X[0, 2] + S[4] * X[1, 2] + S[5] * X[2, 2]
+                _weighted(SS, qx, qy, qz, Y)
+                _add_lever(qx, qy, qz, Y, 1.0, out[c])
+        for e in range(n0):
+            slot0[ids0[e]] = 0
+        slot0, slot1 = slot1, slot0
+        ids0, ids1 = ids1, ids0
+        sums0, sums1 = sums1, sums0
+        n0 = n1
+
+
+@nb.njit(cache=True, nogil=True)
+def keyframe_network(sightings, poses, landmarks, k, count, table):
+    """Add all blocks of ``Pᵀ S P`` that come from measurements to ``table``; returns it, as it may have grown.
+
+    A landmark waits with its sums over each keyframe until it has been seen for the last time; then the pairs of its
+    keyframes are made, and its room is free.
+
+    Parameters
+    ----------
+    landmarks : (l (L, 3), D⁻¹ (L, 6))
+    count : (L,) int32
+        Sightings of each landmark; zero when done.
+    """
+    l, Di = landmarks
+    N = len(poses.position)
+    K = (N - 2) // k + 2
+    most = _most(sightings.first, k, N, 0, K - 1)
+    slot = np.zeros(len(l), np.int32)
+    ids, sums = np.empty(most, np.int32), np.empty((most, 31))
+    head = np.full(len(l), -1, np.int32)
+    room = 4 * most + 16
+    frame, after, kept = np.empty(room, np.int32), np.empty(room, np.int32), np.empty((room, 6))
+    used, free = 0, -1
+    longest = 64
+    X, Y, G = np.empty((longest, 3, 6)), np.empty((longest, 3, 6)), np.empty((longest, 3))
+    chain = np.empty(longest, np.int32)
+    B00, B01, B11 = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    T = np.empty((3, 6))
+    for c in range(K - 1):
+        n = _sum_interval(sightings, poses, _interval(c, k, N), slot, ids, sums)
+        if used + 2 * n > room:  # everything may be new
+            room = 2 * (used + 2 * n)
+            frame, after, kept = _longer(frame, after, kept, room)
+        a, b, _ = _interval(c, k, N)
+        p0, p1 = poses.position[a], poses.position[b]
+        B00[:] = 0.0
+        B01[:] = 0.0
+        B11[:] = 0.0
+        for e in range(n):
+            j = ids[e]
+            slot[j] = 0
+            row = sums[e]
+            qx, qy, qz = l[j, 0] - p0[0], l[j, 1] - p0[1], l[j, 2] - p0[2]
+            rx, ry, rz = l[j, 0] - p1[0], l[j, 1] - p1[1], l[j, 2] - p1[2]
+            _weighted(row[12:18], qx, qy, qz, T)
+            _add_lever(qx, qy, qz, T, 1.0, B00)
+            _weighted(row[18:24], rx, ry, rz, T)
+            _add_lever(qx, qy, qz, T, 1.0, B01)
+            _weighted(row[24:30], rx, ry, rz, T)
+            _add_lever(rx, ry, rz, T, 1.0, B11)
+            for side in range(2):
+                at = head[j]
+                if at < 0 or frame[at] != c + side:
+                    if free >= 0:
+                        new = free
+                        free = after[free]
+                    else:
+                        new = used
+                        used += 1
+                    frame[new] = c + side
+                    after[new] = at
+                    for d in range(6):
+                        kept[new, d] = row[6 * side + d]
+                    head[j] = new
+                else:
+                    for d in range(6):
+                        kept[at, d] += row[6 * side + d]
+            count[j] -= np.int32(row[30])
+            if count[j] > 0:
+                continue
+            # seen for the last time: all pairs of its keyframes
+            f = 0
+            at = head[j]
+            while at >= 0:
+                if f == longest:
+                    longest *= 2
+                    X, Y, G, chain = (
+                        np.empty((longest, 3, 6)),
+                        np.empty((longest, 3, 6)),
+                        np.empty((longest, 3)),
+                        _doubled(chain),
+                    )
+                chain[f] = at
+                f += 1
+                at = after[at]
+            while table.count[0] + f * (f + 1) // 2 > len(table.block):
+                table = _grown(table)
+            for i in range(f):
+                q = poses.position[min(frame[chain[i]] * k, N - 1)]
+                G[i, 0], G[i, 1], G[i, 2] = l[j, 0] - q[0], l[j, 1] - q[1], l[j, 2] - q[2]
+                _weighted(kept[chain[i]], G[i, 0], G[i, 1], G[i, 2], X[i])
+                for d in range(6):
+                    x, y, z = X[i, 0, d], X[i, 1, d], X[i, 2, d]
+                    Y[i, 0, d] = Di[j, 0] * x + Di[j, 1] * y + Di[j, 2] * z
+                    Y[i, 1, d] = Di[j, 1] * x + Di[j, 3] * y + Di[j, 4] * z
+                    Y[i, 2, d] = Di[j, 2] * x + Di[j, 4] * y + Di[j, 5] * z
+            for i in range(f):  # later keyframes come first
+                for i2 in range(i, f):
+                    key = np.int64(frame[chain[i2]]) * K + frame[chain[i]]
+                    _subtract(X[i2], Y[i], table.block[_find(table, key)])
+            for i in range(f):
+                after[chain[i]] = free
+                free = chain[i]
+            head[j] = -1
+        while table.count[0] + 3 > len(table.block):
+            table = _grown(table)
+        table.block[_find(table, np.int64(c) * K + c)] += B00
+        table.block[_find(table, np.int64(c) * K + c + 1)] += B01
+        table.block[_find(table, np.int64(c + 1) * K + c + 1)] += B11
+    return table
+
+
+@nb.njit(cache=True, nogil=True)
+def _subtract(X, Y, B):
+    """``B -= Xᵀ Y`` of two (3, 6)."""
+    for r in range(6):
+        x, y, z = X[0, r], X[1, r], X[2, r]
+        for c in range(6):
+            B[r, c] -= x * Y[0, c] + y * Y[1, c] + z * Y[2, c]
+
+
+@nb.njit(cache=True, nogil=True)
+def _longer(frame, after, kept, room):
+    n = len(frame)
+    f, a, s = np.empty(room, np.int32), np.empty(room, np.int32), np.empty((room, 6))
+    f[:n], a[:n], s[:n] = frame, after, kept
+    return f, a, s
+
+
+@nb.njit(cache=True, nogil=True)
+def _doubled(values):
+    out = np.empty(2 * len(values), np.int32)
+    out[: len(values)] = values
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _carried(A, left, right, h, T):
+    """``T = h · Cₗᵀ A Cᵣ`` with C = [[I, 0], [-[d]×, I]] for the offsets ``left`` and ``right`` from a keyframe."""
+    M = np.empty((6, 6))
+    x, y, z = right[0], right[1], right[2]
+    for r in range(6):  # A Cᵣ: the turn's columns get -A_u [d]
+        a, b, c = A[r, 3], A[r, 4], A[r, 5]
+        M[r, 0] = h * (A[r, 0] - (b * z - c * y))
+        M[r, 1] = h * (A[r, 1] - (c * x - a * z))
+        M[r, 2] = h * (A[r, 2] - (a * y - b * x))
+        M[r, 3], M[r, 4], M[r, 5] = h * a, h * b, h * c
+    x, y, z = left[0], left[1], left[2]
+    for c2 in range(6):  # Cₗᵀ M: the turn's rows get [d] M_u
+        a, b, c = M[3, c2], M[4, c2], M[5, c2]
+        T[0, c2] = M[0, c2] - z * b + y * c
+        T[1, c2] = M[1, c2] + z * a - x * c
+        T[2, c2] = M[2, c2] - y * a + x * b
+        T[3, c2], T[4, c2], T[5, c2] = a, b, c
+
+
+@nb.njit(cache=True, nogil=True)
+def keyframe_chain(position, diagonal, upper, k, out_diagonal, out_upper):
+    """Add ``Pᵀ A P`` of a chain of blocks to ``out_diagonal (K, 6, 6)`` and ``out_upper (K - 1, 6, 6)``."""
+    N, K = len(position), len(out_diagonal)
+    T = np.empty((6, 6))
+    for c in range(K - 1):
+        a, b, end = _interval(c, k, N)
+        for i in range(a, end):
+            h1 = (i - a) / (b - a)
+            h0 = 1.0 - h1
+            d0, d1 = position[i] - position[a], position[i] - position[b]
+            _carried(diagonal[i], d0, d0, h0 * h0, T)
+            out_diagonal[c] += T
+            _carried(diagonal[i], d1, d1, h1 * h1, T)
+            out_diagonal[c + 1] += T
+            _carried(diagonal[i], d0, d1, h0 * h1, T)
+            out_upper[c] += T
+            if i + 1 >= N:
+                continue
+            g1 = (i + 1 - a) / (b - a)
+            g0 = 1.0 - g1
+            e0, e1 = position[i + 1] - position[a], position[i + 1] - position[b]
+            _carried(upper[i], d0, e0, h0 * g0, T)
+            _both(T, out_diagonal[c])
+            _carried(upper[i], d1, e1, h1 * g1, T)
+            _both(T, out_diagonal[c + 1])
+            _carried(upper[i], d0, e1, h0 * g1, T)
+            out_upper[c] += T
+            _carried(upper[i], d1, e0, h1 * g0, T)
+            for r in range(6):
+                for s in range(6):
+                    out_upper[c, r, s] += T[s, r]
+
+
+@nb.njit(cache=True, nogil=True)
+def _both(T, B):
+    for r in range(6):
+        for c in range(6):
+            B[r, c] += T[r, c] + T[c, r]
+
+
+@nb.njit(cache=True, nogil=True)
+def restrict(position, k, r, out):
+    """Write ``Pᵀ r`` to ``out (K, 6)``."""
+    N, K = len(position), len(out)
+    out[:] = 0.0
+    for c in range(K - 1):
+        a, b, end = _interval(c, k, N)
+        for i in range(a, end):
+            h = (i - a) / (b - a)
+            for side in range(2):
+                q = a if side == 0 else b
+                g = 1.0 - h if side == 0 else h
+                x, y, z = (
+                    position[i, 0] - position[q, 0],
+                    position[i, 1] - position[q, 1],
+                    position[i, 2] - position[q, 2],
+                )
+                o = out[c + side]
+                o[0] += g * (r[i, 0] + y * r[i, 5] - z * r[i, 4])
+                o[1] += g * (r[i, 1] + z * r[i, 3] - x * r[i, 5])
+                o[2] += g * (r[i, 2] + x * r[i, 4] - y * r[i, 3])
+                o[3] += g * r[i, 3]
+                o[4] += g * r[i, 4]
+                o[5] += g * r[i, 5]
+
+
+@nb.njit(cache=True, nogil=True)
+def prolong(position, k, x, out):
+    """Add ``P x`` of ``x (K, 6)`` to ``out (N, 6)``."""
+    N, K = len(position), len(x)
+    for c in range(K - 1):
+        a, b, end = _interval(c, k, N)
+        for i in range(a, end):
+            h = (i - a) / (b - a)
+            for side in range(2):
+                q = a if side == 0 else b
+                g = 1.0 - h if side == 0 else h
+                dx, dy, dz = (
+                    position[i, 0] - position[q, 0],
+                    position[i, 1] - position[q, 1],
+                    position[i, 2] - position[q, 2],
+                )
+                v = x[c + side]
+                out[i, 0] += g * v[0]
+                out[i, 1] += g * v[1]
+                out[i, 2] += g * v[2]
+                out[i, 3] += g * (v[3] + v[1] * dz - v[2] * dy)
+                out[i, 4] += g * (v[4] + v[2] * dx - v[0] * dz)
+                out[i, 5] += g * (v[5] + v[0] * dy - v[1] * dx)

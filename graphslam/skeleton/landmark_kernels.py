@@ -1,0 +1,285 @@
+"""Numba kernels of the measurements: landmarks, gradient, diagonal blocks and product of the Schur complement.
+
+The residual of a measurement z (in the body frame) of landmark l from pose (R, p) is ``e = l - p - R z``. Poses are
+perturbed in the world frame about their own position, ``R ← Exp(w) R``, ``p ← p + u``, so with the lever ``q = l - p``
+the residual moves by ``q × w - u + dl``. The lever is the predicted one everywhere: with the measured ``s = R z`` a
+turn of the whole map would cost something, and Gauss-Newton converges linearly. ``s`` belongs only into the weight
+``W = α I + β s sᵀ``, α = 1/(σ_bearing |z|)², α + β |z|² = 1/σ_range². Vectors of poses are ``(N, 6)``: w, then u.
+
+Every kernel works on the poses ``begin … end - 1``; what it adds up over landmarks goes into arrays of the caller.
+Plain arrays only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class Sightings(NamedTuple):
+    """Measurements in pose order."""
+
+    points: npt.NDArray[np.float32]
+    """(M, 3) in the body frame [m]."""
+    landmark: npt.NDArray[np.int32]
+    """(M,)"""
+    first: npt.NDArray[np.int64]
+    """(N + 1,): where the measurements of each pose begin."""
+    along: float
+    """1 / σ_range² [1/m²]."""
+    across: float
+    """1 / σ_bearing² [1/rad²]."""
+
+
+class Poses(NamedTuple):
+    """Poses of the body in the world."""
+
+    rotation: Array
+    """(N, 3, 3)"""
+    position: Array
+    """(N, 3) [m]"""
+
+
+@nb.njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _seen(R, x, y, z, along, across):
+    """``s = R z`` and the two figures of its weight: W = α I + β s sᵀ."""
+    r2 = x * x + y * y + z * z
+    alpha = across / r2
+    beta = (along - alpha) / r2
+    return (
+        R[0] * x + R[1] * y + R[2] * z,
+        R[3] * x + R[4] * y + R[5] * z,
+        R[6] * x + R[7] * y + R[8] * z,
+        alpha,
+        beta,
+    )
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def _nine(R, i):
+    return (R[i, 0, 0], R[i, 0, 1], R[i, 0, 2], R[i, 1, 0], R[i, 1, 1], R[i, 1, 2], R[i, 2, 0], R[i, 2, 1], R[i, 2, 2])
+
+
+@nb.njit(cache=True, nogil=True)
+def count_sightings(landmark, out):
+    """Add one to ``out (L,)`` for each sighting."""
+    for m in range(len(landmark)):
+        out[landmark[m]] += 1
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def sum_landmarks(sightings, poses, begin, end, D, b):
+    """Add ``Σ W`` (xx, xy, xz, yy, yz, zz) to ``D (L, 6)`` and ``Σ W (p + s)`` to ``b (L, 3)``."""
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            D[j, 0] += al + be * sx * sx
+            D[j, 1] += be * sx * sy
+            D[j, 2] += be * sx * sz
+            D[j, 3] += al + be * sy * sy
+            D[j, 4] += be * sy * sz
+            D[j, 5] += al + be * sz * sz
+            ax, ay, az = px + sx, py + sy, pz + sz
+            d = be * (sx * ax + sy * ay + sz * az)
+            b[j, 0] += al * ax + d * sx
+            b[j, 1] += al * ay + d * sy
+            b[j, 2] += al * az + d * sz
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def solve_landmarks(D, b, begin, end):
+    """Replace ``D`` by its inverse and ``b`` by ``l = D⁻¹ b``, for landmarks ``begin … end - 1``."""
+    for j in range(begin, end):
+        a, c, d, e, f, g = D[j, 0], D[j, 1], D[j, 2], D[j, 3], D[j, 4], D[j, 5]
+        xx, xy, xz = e * g - f * f, d * f - c * g, c * f - d * e
+        yy, yz, zz = a * g - d * d, c * d - a * f, a * e - c * c
+        over = 1.0 / (a * xx + c * xy + d * xz)
+        D[j, 0], D[j, 1], D[j, 2] = xx * over, xy * over, xz * over
+        D[j, 3], D[j, 4], D[j, 5] = yy * over, yz * over, zz * over
+        x, y, z = b[j, 0], b[j, 1], b[j, 2]
+        b[j, 0] = D[j, 0] * x + D[j, 1] * y + D[j, 2] * z
+        b[j, 1] = D[j, 1] * x + D[j, 3] * y + D[j, 4] * z
+        b[j, 2] = D[j, 2] * x + D[j, 4] * y + D[j, 5] * z
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gradient(sightings, poses, l, begin, end, g, objective):
+    """Write half the objective's gradient of each pose to ``g (N, 6)`` and ``Σ eᵀ W e`` to ``objective (N,)``."""
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        J = wx = wy = wz = ux = uy = uz = 0.0
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
+            ex, ey, ez = qx - sx, qy - sy, qz - sz
+            d = be * (sx * ex + sy * ey + sz * ez)
+            fx, fy, fz = al * ex + d * sx, al * ey + d * sy, al * ez + d * sz
+            J += ex * fx + ey * fy + ez * fz
+            ux -= fx
+            uy -= fy
+            uz -= fz
+            wx += fy * qz - fz * qy
+            wy += fz * qx - fx * qz
+            wz += fx * qy - fy * qx
+        g[i, 0], g[i, 1], g[i, 2], g[i, 3], g[i, 4], g[i, 5] = wx, wy, wz, ux, uy, uz
+        objective[i] = J
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def landmark_chi2(sightings, poses, l, begin, end, out, count):
+    """Add ``eᵀ W e`` of each measurement to its landmark in ``out (L,)``, and one to ``count (L,)``."""
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            ex, ey, ez = l[j, 0] - px - sx, l[j, 1] - py - sy, l[j, 2] - pz - sz
+            d = sx * ex + sy * ey + sz * ez
+            out[j] += al * (ex * ex + ey * ey + ez * ez) + be * d * d
+            count[j] += 1
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def diagonal(sightings, poses, landmarks, begin, end, blocks):
+    """Add the measurements' diagonal blocks of the Schur complement to ``blocks (N, 6, 6)``.
+
+    Exact where a pose sees each landmark once; otherwise the block is smaller by what the two share.
+
+    Parameters
+    ----------
+    landmarks : (l (L, 3), D⁻¹ (L, 6))
+    """
+    l, Di = landmarks
+    C = np.empty((3, 3))
+    B = np.empty((3, 3))
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            # C = W - W D⁻¹ W, with W a = α a + β s (s·a); t = D⁻¹ s
+            a, c, d, e, f, g = Di[j, 0], Di[j, 1], Di[j, 2], Di[j, 3], Di[j, 4], Di[j, 5]
+            tx, ty, tz = a * sx + c * sy + d * sz, c * sx + e * sy + f * sz, d * sx + f * sy + g * sz
+            k = be - be * be * (sx * tx + sy * ty + sz * tz)
+            h = al * be
+            al2 = al * al
+            xx = al + k * sx * sx - 2.0 * h * sx * tx - al2 * a
+            xy = k * sx * sy - h * (sx * ty + sy * tx) - al2 * c
+            xz = k * sx * sz - h * (sx * tz + sz * tx) - al2 * d
+            yy = al + k * sy * sy - 2.0 * h * sy * ty - al2 * e
+            yz = k * sy * sz - h * (sy * tz + sz * ty) - al2 * f
+            zz = al + k * sz * sz - 2.0 * h * sz * tz - al2 * g
+            qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
+            C[0, 0], C[0, 1], C[0, 2] = xx, xy, xz
+            C[1, 0], C[1, 1], C[1, 2] = xy, yy, yz
+            C[2, 0], C[2, 1], C[2, 2] = xz, yz, zz
+            # B = [q]ᵀ C = -[q] C; blocks: ww = B [q], wu = -B, uu = C
+            for r in range(3):
+                B[0, r] = qz * C[1, r] - qy * C[2, r]
+                B[1, r] = qx * C[2, r] - qz * C[0, r]
+                B[2, r] = qy * C[0, r] - qx * C[1, r]
+            for r in range(3):
+                blocks[i, r, 0] += B[r, 1] * qz - B[r, 2] * qy
+                blocks[i, r, 1] += B[r, 2] * qx - B[r, 0] * qz
+                blocks[i, r, 2] += B[r, 0] * qy - B[r, 1] * qx
+                for k2 in range(3):
+                    blocks[i, r, 3 + k2] -= B[r, k2]
+                    blocks[i, 3 + k2, r] -= B[r, k2]
+                    blocks[i, 3 + r, 3 + k2] += C[r, k2]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gather(sightings, poses, l, v, begin, end, t):
+    """First pass of the product: add ``Σ W (q × w - u)`` to ``t (L, 3)``."""
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
+            ax = qy * wz - qz * wy - ux
+            ay = qz * wx - qx * wz - uy
+            az = qx * wy - qy * wx - uz
+            d = be * (sx * ax + sy * ay + sz * az)
+            t[j, 0] += al * ax + d * sx
+            t[j, 1] += al * ay + d * sy
+            t[j, 2] += al * az + d * sz
+
+
+@nb.njit(cache=True, nogil=True)
+def settle(Di, t, begin, end):
+    """``t ← D⁻¹ t`` for landmarks ``begin … end - 1``."""
+    for j in range(begin, end):
+        x, y, z = t[j, 0], t[j, 1], t[j, 2]
+        t[j, 0] = Di[j, 0] * x + Di[j, 1] * y + Di[j, 2] * z
+        t[j, 1] = Di[j, 1] * x + Di[j, 3] * y + Di[j, 4] * z
+        t[j, 2] = Di[j, 2] * x + Di[j, 4] * y + Di[j, 5] * z
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def scatter(sightings, poses, landmarks, v, begin, end, out):
+    """Second pass: add ``f × q`` and ``-f``, f = W (q × w - u - t), to ``out (N, 6)``.
+
+    Parameters
+    ----------
+    landmarks : (l (L, 3), t (L, 3))
+    """
+    l, t = landmarks
+    for i in range(begin, end):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
+        yx = yy = yz = zx = zy = zz = 0.0
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+            sx, sy, sz, al, be = _seen(
+                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+            )
+            j = sightings.landmark[m]
+            qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
+            ax = qy * wz - qz * wy - ux - t[j, 0]
+            ay = qz * wx - qx * wz - uy - t[j, 1]
+            az = qx * wy - qy * wx - uz - t[j, 2]
+            d = be * (sx * ax + sy * ay + sz * az)
+            fx, fy, fz = al * ax + d * sx, al * ay + d * sy, al * az + d * sz
+            zx -= fx
+            zy -= fy
+            zz -= fz
+            yx += fy * qz - fz * qy
+            yy += fz * qx - fx * qz
+            yz += fx * qy - fy * qx
+        out[i, 0] += yx
+        out[i, 1] += yy
+        out[i, 2] += yz
+        out[i, 3] += zx
+        out[i, 4] += zy
+        out[i, 5] += zz

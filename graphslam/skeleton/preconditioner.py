@@ -1,0 +1,181 @@
+"""Additive preconditioner of the Schur complement: block Jacobi on poses and on keyframes, and a factored network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from graphslam.core.geometry import Array
+from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
+from graphslam.linear.symmetric_factor import elimination_order
+from graphslam.skeleton import chain_kernels as chains
+from graphslam.skeleton import coarse_kernels as kernels
+from graphslam.skeleton.schur import Network, inverse_of
+
+Index = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Which keyframes the preconditioner has.
+
+    Parameters
+    ----------
+    jacobi : int
+        Block Jacobi on a keyframe every so many poses; 0 for none.
+    factored : int
+        A network of keyframes every so many poses, factored; 0 for none.
+    """
+
+    jacobi: int = 0
+    factored: int = 0
+
+
+def levels_for(poses: int) -> Levels:
+    """Levels by size: one factored network up to 2·10⁴ poses, beyond it a sparser one and block Jacobi between."""
+    if poses < 40:
+        return Levels()
+    if poses <= 20_000:
+        return Levels(0, 20)
+    return Levels(10, 80)
+
+
+class KeyframePattern:
+    """Which keyframes share a block, in what order they are eliminated: the same at all poses."""
+
+    def __init__(self, keys: Index, frames: int) -> None:
+        self.keys, self.frames = keys, frames
+        row, column = keys // frames, keys % frames
+        order = elimination_order(row.astype(np.intp), column.astype(np.intp), frames).astype(np.int64)
+        when = np.empty(frames, np.int64)
+        when[order] = np.arange(frames)
+        # each pair stands with the keyframe that is eliminated first, its block transposed where need be
+        self._turned = when[row] > when[column]
+        node, other = np.where(self._turned, column, row), np.where(self._turned, row, column)
+        self._sorted = np.lexsort((other, node))
+        ptr = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=frames))]).astype(np.int64)
+        self._symbolic = BlockSymbolic(order, np.full(frames, 6, np.int64), ptr, other[self._sorted])
+
+    def factor(self, blocks: Array) -> BlockFactor:
+        """Factorise the matrix of ``blocks (nb, 6, 6)``, in the order of the keys."""
+        value = np.where(self._turned[:, None, None], blocks.swapaxes(1, 2), blocks)
+        return self._symbolic.factor(36 * self._sorted, value.ravel())
+
+
+class KeyframeNetwork:
+    """``Pᵀ S P``, factored.
+
+    Parameters
+    ----------
+    network : Network
+    k : int
+        Poses from keyframe to keyframe.
+    pattern : KeyframePattern, optional
+        Of an earlier one of the same problem and k.
+    """
+
+    def __init__(self, network: Network, k: int, pattern: KeyframePattern | None = None) -> None:
+        problem, poses = network.layout.problem, network.poses
+        self.k, self.frames, self.position = k, frames_of(problem.poses, k), poses.position
+        count = network.layout.counts.copy()
+        table = kernels.make_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
+        table = kernels.keyframe_network(
+            problem.sightings, poses, (network.landmarks, network.inverse), k, count, table
+        )
+        keys = kernels.keys_of(table)
+        self.blocks = table.block[: len(keys)]
+        diagonal, upper = chain_of(network, k)
+        c = np.arange(self.frames, dtype=np.int64)
+        order = np.argsort(keys)
+        at = order[np.searchsorted(keys, c * self.frames + c, sorter=order)]
+        self.blocks[at] += diagonal
+        at = order[np.searchsorted(keys, (c * self.frames + c + 1)[:-1], sorter=order)]
+        self.blocks[at] += upper
+        self.pattern = pattern or KeyframePattern(keys, self.frames)
+        self.factor = self.pattern.factor(self.blocks)
+
+    def solve(self, x: Array) -> Array:
+        """``(Pᵀ S P)⁻¹ x`` for ``x (K, 6)``."""
+        return self.factor.solve(x.ravel()).reshape(-1, 6)
+
+    def matrix(self) -> sp.csr_matrix:
+        """``Pᵀ S P``, both triangles."""
+        keys, n = self.pattern.keys, self.frames
+        i, j = np.divmod(keys, n)
+        order = np.lexsort((j, i))
+        ptr = np.concatenate([[0], np.cumsum(np.bincount(i, minlength=n))])
+        upper = sp.bsr_matrix((self.blocks[order], j[order], ptr), shape=(6 * n, 6 * n)).tocsr()
+        diagonal = sp.block_diag(list(self.blocks[order][ptr[:-1]]), format="csr")
+        return sp.csr_matrix(upper + upper.T - diagonal)
+
+    def apply(self, r: Array, out: Array) -> None:
+        """Add ``P (Pᵀ S P)⁻¹ Pᵀ r`` to ``out (N, 6)``."""
+        x = np.empty((self.frames, 6))
+        kernels.restrict(self.position, self.k, r, x)
+        kernels.prolong(self.position, self.k, self.solve(x), out)
+
+
+def frames_of(poses: int, k: int) -> int:
+    """Keyframes: poses 0, k, 2k … and the last one."""
+    return (poses - 2) // k + 2
+
+
+def chain_of(network: Network, k: int) -> tuple[Array, Array]:
+    """Blocks of ``Pᵀ A P`` of what ties a pose alone or to the next: diagonal and upper."""
+    K = frames_of(network.layout.problem.poses, k)
+    diagonal, upper = np.zeros((K, 6, 6)), np.zeros((K - 1, 6, 6))
+    kernels.keyframe_chain(network.poses.position, *network.chain_blocks(), k, diagonal, upper)
+    return diagonal, upper
+
+
+class Preconditioner:
+    """``M⁻¹ r``: the sum of block Jacobi on poses, block Jacobi on keyframes, and a factored network of keyframes.
+
+    Parameters
+    ----------
+    network : Network
+    levels : Levels
+    pattern : KeyframePattern, optional
+        Of an earlier one.
+    """
+
+    def __init__(self, network: Network, levels: Levels, pattern: KeyframePattern | None = None) -> None:
+        self.layout, self.levels, self.position = network.layout, levels, network.poses.position
+        workers = self.layout.workers
+        self.inverse = inverse_of(network.diagonal(), workers, self.layout.ranges, "pose")
+        self.keyframes: Array | None = None
+        self.network: KeyframeNetwork | None = None
+        if levels.jacobi:
+            blocks = chain_of(network, levels.jacobi)[0]
+            half = len(blocks) // 2
+            ranges = [(0, half), (half, len(blocks))]
+            landmarks, sight = (network.landmarks, network.inverse), self.layout.problem.sightings
+            workers.over(
+                lambda a, b: kernels.keyframe_diagonal(sight, network.poses, landmarks, levels.jacobi, a, b, blocks),
+                ranges,
+            )
+            self.keyframes = inverse_of(blocks, workers, ranges, "keyframe")
+        if levels.factored:
+            self.network = KeyframeNetwork(network, levels.factored, pattern)
+
+    @property
+    def pattern(self) -> KeyframePattern | None:
+        """What a later preconditioner of the same problem can take over."""
+        return None if self.network is None else self.network.pattern
+
+    def __call__(self, r: Array) -> Array:
+        """``M⁻¹ r`` for ``r (N, 6)``."""
+        out = np.empty_like(r)
+        self.layout.workers.over(lambda a, b: chains.multiply_blocks(self.inverse, r, a, b, out), self.layout.ranges)
+        if self.keyframes is not None:
+            k, n = self.levels.jacobi, len(self.keyframes)
+            x, y = np.empty((n, 6)), np.empty((n, 6))
+            kernels.restrict(self.position, k, r, x)
+            chains.multiply_blocks(self.keyframes, x, 0, n, y)
+            kernels.prolong(self.position, k, y, out)
+        if self.network is not None:
+            self.network.apply(r, out)
+        return out

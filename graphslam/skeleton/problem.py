@@ -1,0 +1,214 @@
+"""What a skeleton network is made of: measurements of landmarks, odometry, tilt, GPS and a prior, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import CovarianceError, DataError
+from graphslam.core.geometry import Array
+from graphslam.skeleton.chain_kernels import Chain, reckon
+from graphslam.skeleton.landmark_kernels import Poses, Sightings
+
+
+@dataclass(frozen=True, eq=False)
+class SkeletonProblem:
+    """Measurements in pose order, and what ties a pose alone or to the next one.
+
+    World frame: z up. A pose is the body in the world. Covariances are given once for all, or one each.
+
+    Parameters
+    ----------
+    points : (M, 3) float32
+        Measured points in the body frame [m].
+    landmark : (M,) int32
+        Landmark of each, numbered by first sighting (:class:`~graphslam.skeleton.collapse.Collapse`).
+    first : (N + 1,)
+        Where the measurements of each pose begin; the last entry is M.
+    odometry_rotation, odometry_translation : (N - 1, 3, 3), (N - 1, 3)
+        From each pose to the next, in the body frame.
+    odometry_covariance : (6, 6) or (N - 1, 6, 6)
+        Rotation vector [rad], then way [m].
+    range_sigma, bearing_sigma : float
+        Noise of the points along [m] and across [rad] the ray.
+    start_rotation, start_position, start_covariance : (3, 3), (3,), (6, 6)
+        Prior on the first pose: turn in the world frame, then position.
+    up : (N, 3), optional
+        Unit vector up in the body, from an accelerometer.
+    up_sigma : float or (N,)
+        Its noise [rad]; infinite where it was not seen.
+    gps_pose, gps_position : (G,), (G, 3)
+        Which poses have a fix, and where [m]; of the body's origin.
+    gps_covariance : (3, 3) or (G, 3, 3)
+
+    Raises
+    ------
+    DataError
+        Shapes do not fit, numbers are not finite, a point lies in the sensor, landmarks are not numbered by first
+        sighting.
+    CovarianceError
+        A covariance is not positive definite.
+    """
+
+    points: npt.NDArray[np.float32]
+    landmark: npt.NDArray[np.int32]
+    first: npt.NDArray[np.int64]
+    odometry_rotation: Array
+    odometry_translation: Array
+    odometry_covariance: Array
+    range_sigma: float
+    bearing_sigma: float
+    start_rotation: Array
+    start_position: Array
+    start_covariance: Array
+    up: Array | None = None
+    up_sigma: float | Array = np.inf
+    gps_pose: npt.NDArray[np.int64] | None = None
+    gps_position: Array | None = None
+    gps_covariance: Array | None = None
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        for name, kind in (("points", np.float32), ("landmark", np.int32), ("first", np.int64)):
+            put(self, name, np.ascontiguousarray(getattr(self, name), dtype=kind))
+        N = len(self.first) - 1
+        if N < 2:
+            raise DataError("a skeleton network of fewer than two poses", got=N)
+        gps = np.empty(0, np.int64) if self.gps_pose is None else np.asarray(self.gps_pose, dtype=np.int64)
+        put(self, "gps_pose", gps)
+        shapes = {
+            "points": (len(self.landmark), 3),
+            "odometry_rotation": (N - 1, 3, 3),
+            "odometry_translation": (N - 1, 3),
+            "start_rotation": (3, 3),
+            "start_position": (3,),
+            "start_covariance": (6, 6),
+        }
+        if self.up is not None:
+            shapes["up"] = (N, 3)
+        if len(gps):
+            shapes["gps_position"] = (len(gps), 3)
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None or np.shape(value) != shape:
+                raise DataError(f"{name} of a skeleton network", got=np.shape(value), wanted=shape)
+            if name != "points":
+                put(self, name, np.ascontiguousarray(value, dtype=np.float64))
+            if not np.isfinite(getattr(self, name)).all():
+                raise DataError(f"{name} of a skeleton network is not finite")
+        self._check_numbers(N, gps)
+        put(self, "odometry_covariance", np.asarray(self.odometry_covariance, dtype=np.float64).reshape(-1, 6, 6))
+        if len(self.odometry_covariance) not in (1, N - 1):
+            raise DataError("odometry_covariance", got=len(self.odometry_covariance), wanted=f"1 or {N - 1}")
+        if len(gps):
+            cov = np.asarray(self.gps_covariance, dtype=np.float64).reshape(-1, 3, 3)
+            if len(cov) not in (1, len(gps)):
+                raise DataError("gps_covariance", got=len(cov), wanted=f"1 or {len(gps)}")
+            put(self, "gps_covariance", cov)
+        _ = self.odometry_information, self.gps_information, self.start_information
+
+    def _check_numbers(self, N: int, gps: npt.NDArray[np.int64]) -> None:
+        if self.first[0] != 0 or self.first[-1] != len(self.points) or (np.diff(self.first) < 0).any():
+            raise DataError("first of a skeleton network", wanted=f"rising from 0 to {len(self.points)}")
+        if not (self.range_sigma > 0 and self.bearing_sigma > 0 and (np.asarray(self.up_sigma) > 0).all()):
+            raise DataError("noise of a skeleton network", wanted="positive")
+        if np.ndim(self.up_sigma) and np.shape(self.up_sigma) != (N,):
+            raise DataError("up_sigma", got=np.shape(self.up_sigma), wanted=(N,))
+        if len(gps) and (gps.min() < 0 or gps.max() >= N):
+            raise DataError("gps_pose of a pose that is not there", got=int(gps.max()), wanted=f"0 … {N - 1}")
+        block = 1 << 22
+        high = -1
+        for k in range(0, len(self.points), block):
+            near = np.abs(self.points[k : k + block]).max(axis=1) < 1e-6
+            if near.any():
+                raise DataError("a measured point lies in the sensor", where=f"measurement {k + int(near.argmax())}")
+            label = self.landmark[k : k + block]
+            peak = np.maximum.accumulate(np.concatenate([[high], label]))
+            if label.min() < 0 or (label > peak[:-1] + 1).any():
+                raise DataError("landmarks are not numbered by first sighting", wanted="number_by_first_sighting")
+            high = int(peak[-1])
+        object.__setattr__(self, "_landmarks", high + 1)
+
+    @property
+    def poses(self) -> int:
+        """Number of poses N."""
+        return len(self.first) - 1
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements M."""
+        return len(self.points)
+
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks L."""
+        return int(self.__dict__["_landmarks"])
+
+    @property
+    def fixes(self) -> int:
+        """Number of GPS fixes G."""
+        return 0 if self.gps_pose is None else len(self.gps_pose)
+
+    @cached_property
+    def odometry_information(self) -> Array:
+        """(1 or N - 1, 6, 6)"""
+        return _inverse(self.odometry_covariance, "odometry_covariance")
+
+    @cached_property
+    def gps_information(self) -> Array:
+        """(1 or G, 3, 3)"""
+        if self.gps_covariance is None:
+            return np.zeros((1, 3, 3))
+        return _inverse(self.gps_covariance, "gps_covariance")
+
+    @cached_property
+    def start_information(self) -> Array:
+        """(6, 6)"""
+        return _inverse(self.start_covariance, "start_covariance")
+
+    @property
+    def sightings(self) -> Sightings:
+        """The measurements, as the kernels take them."""
+        return Sightings(self.points, self.landmark, self.first, self.range_sigma**-2, self.bearing_sigma**-2)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """Odometry and tilt, as the kernels take them."""
+        if self.up is None:
+            up, weight = np.zeros((self.poses, 3)), np.zeros(1)
+        else:
+            up, weight = self.up, np.atleast_1d(np.asarray(self.up_sigma, dtype=np.float64)) ** -2.0
+        return Chain(self.odometry_rotation, self.odometry_translation, self.odometry_information, up, weight)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the objective: scalars measured, less scalars estimated."""
+        tilts = 0
+        if self.up is not None:
+            tilts = int(np.isfinite(np.broadcast_to(np.asarray(self.up_sigma, np.float64), self.poses)).sum())
+        return 3 * self.measurements + 6 * self.poses + 2 * tilts + 3 * self.fixes - 6 * self.poses - 3 * self.landmarks
+
+    def dead_reckoning(self) -> Poses:
+        """Poses from the prior of the first one and the odometry alone."""
+        R, p = np.empty((self.poses, 3, 3)), np.empty((self.poses, 3))
+        R[0], p[0] = self.start_rotation, self.start_position
+        reckon(self.odometry_rotation, self.odometry_translation, R, p)
+        return Poses(R, p)
+
+    def relabelled(self, landmark: npt.NDArray[np.int32]) -> SkeletonProblem:
+        """The same measurements with other landmarks ``(M,)``, numbered by first sighting."""
+        return replace(self, landmark=landmark)
+
+
+def _inverse(covariance: Array, name: str) -> Array:
+    try:
+        np.linalg.cholesky(covariance)
+        inverse = np.linalg.inv(covariance)
+    except np.linalg.LinAlgError:
+        raise CovarianceError(f"{name} of a skeleton network is not positive definite") from None
+    if not np.isfinite(inverse).all():
+        raise CovarianceError(f"{name} of a skeleton network is not finite")
+    return np.ascontiguousarray(0.5 * (inverse + inverse.swapaxes(-1, -2)))

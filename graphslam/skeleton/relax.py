@@ -1,0 +1,469 @@
+"""Relaxation of a skeleton network: Gauss-Newton with preconditioned conjugate gradients, and its rivals (C5)."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError, SolverError
+from graphslam.core.geometry import Array
+from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.preconditioner import KeyframePattern, Levels, Preconditioner, levels_for
+from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.schur import Layout, Network, Workers, moved
+from graphslam.skeleton.soft import SoftMode, softest_modes
+from graphslam.skeleton.start import chain_start, forward_pass
+from graphslam.skeleton.thinning import ThinnedNetwork
+from graphslam.skeleton.unions import split_wrong_unions
+
+logger = logging.getLogger(__name__)
+Method = Literal["gn", "cg", "blocks", "levels"]
+METHODS: tuple[Method, ...] = ("gn", "cg", "blocks", "levels")
+Start = Literal["forward", "chain", "odometry"]
+STARTS: tuple[Start, ...] = ("forward", "chain", "odometry")
+
+
+@dataclass(frozen=True)
+class RelaxConfig:
+    """How a skeleton network is relaxed.
+
+    Parameters
+    ----------
+    method : {"gn", "cg", "blocks", "levels"}
+        ``gn``: Gauss-Newton; its linear systems by conjugate gradients, the Schur complement applied without being
+        formed. ``cg``: non-linear conjugate gradients, as in the paper. ``blocks``: Gauss-Newton with the thinned
+        network written out. ``levels``: keyframes alone move, rigid motion between them: *approximate*.
+    start : {"forward", "chain", "odometry"}
+        Where it begins: odometry alone; the chain of odometry, tilt and GPS; one walk against older landmarks after it.
+    iterations : int
+        Most Gauss-Newton steps; of ``cg`` most gradients.
+    gain, move : float
+        It has converged when a step is predicted to gain less than ``gain`` (in units of χ²) and moves no pose by more
+        than ``move`` [m]. After two steps that gain less it ends in any case; if poses still moved, ``converged`` is
+        ``"objective"``: long modes are soft (``largest_move``, ``soft``).
+    enough : float
+        It also ends when a step is predicted to gain less than this.
+    levels : Levels, optional
+        Of the preconditioner. Default: by size. ``Levels(-1, 0)`` with ``cg``: no preconditioner at all.
+    rebuild : int
+        Gradients between two preconditioners of ``cg``; 0: the first one is kept.
+    inner : int
+        Most products of one linear system.
+    limit : float
+        Memory that the written-out network may take [bytes].
+    split : bool
+        Look for wrong unions and split them.
+    soft : int
+        How many of the softest modes are told; 0 for none.
+    threads : int
+        The result does not depend on it.
+    """
+
+    method: Method = "gn"
+    start: Start = "forward"
+    iterations: int = 30
+    gain: float = 1e-2
+    move: float = 1e-4
+    enough: float = 0.0
+    levels: Levels | None = None
+    rebuild: int = 10
+    inner: int = 400
+    limit: float = 4e9
+    split: bool = True
+    soft: int = 3
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("method", self.method, METHODS), ("start", self.start, STARTS)):
+            if value not in known:
+                raise ConfigError(f"unknown {name} {value!r} of a relaxation; known: {', '.join(known)}")
+        if self.iterations < 1 or self.inner < 1 or self.threads < 1 or self.gain < 0 or self.move < 0:
+            raise ConfigError("iterations, inner and threads of a relaxation are at least 1, gain and move at least 0")
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of a relaxation.
+
+    Parameters
+    ----------
+    objective, chi2 : float
+        After the step; χ² per degree of freedom.
+    products : int
+        Products with the Schur complement.
+    predicted, gained : float
+        What the linear model promised, and what came.
+    largest_move : float
+        [m]
+    scale : float
+        Share of the step that was taken.
+    seconds : float
+        CPU time since the start.
+    """
+
+    objective: float
+    chi2: float
+    products: int
+    predicted: float
+    gained: float
+    largest_move: float
+    scale: float
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxed:
+    """A relaxed skeleton network.
+
+    Parameters
+    ----------
+    method : str
+    poses : Poses
+    landmarks : (L, 3)
+    landmark : (M,) int32
+        Landmark of each measurement: other than the problem's where unions were split.
+    objective, chi2 : float
+        Sum of squared normalised residuals; per degree of freedom.
+    converged : {"poses", "objective", ""}
+    history : list of Iteration
+    soft : list of SoftMode
+        Approximate.
+    split, refused : int
+        Landmarks that were wrong unions; sightings that the forward pass did not believe.
+    seconds : dict
+        CPU time by stage.
+    approximate : bool
+        True for ``levels``.
+    """
+
+    method: str
+    poses: Poses
+    landmarks: Array
+    landmark: Array
+    objective: float
+    chi2: float
+    converged: str
+    history: list[Iteration]
+    soft: list[SoftMode] = field(default_factory=list)
+    split: int = 0
+    refused: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    approximate: bool = False
+
+    @property
+    def iterations(self) -> int:
+        """Steps."""
+        return len(self.history)
+
+    @property
+    def products(self) -> int:
+        """Products with the Schur complement."""
+        return sum(h.products for h in self.history)
+
+    @property
+    def largest_move(self) -> float:
+        """Largest move of a pose in the last step [m]."""
+        return self.history[-1].largest_move if self.history else 0.0
+
+    @property
+    def predicted(self) -> float:
+        """What the last step was predicted to gain, in units of χ²."""
+        return self.history[-1].predicted if self.history else 0.0
+
+
+class Stages:
+    """CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._begin = self._last = time.process_time()
+
+    def __call__(self, name: str) -> None:
+        """What was done since the last call belongs to ``name``."""
+        now = time.process_time()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+    @property
+    def total(self) -> float:
+        """Since the start."""
+        return time.process_time() - self._begin
+
+
+def relax(
+    problem: SkeletonProblem,
+    config: RelaxConfig | None = None,
+    poses: Poses | None = None,
+    progress: Callable[[Iteration], None] | None = None,
+) -> Relaxed:
+    """Move the poses of a skeleton network to where all its measurements fit best.
+
+    Parameters
+    ----------
+    problem : SkeletonProblem
+    config : RelaxConfig, optional
+    poses : Poses, optional
+        Start from these instead of ``config.start``.
+    progress : callable, optional
+        Called after every step.
+
+    Raises
+    ------
+    IndeterminateError
+        Something does not constrain a pose.
+    SolverError
+        The objective is not finite; or ``blocks`` would need more memory than ``config.limit``.
+    """
+    c = config or RelaxConfig()
+    stages = Stages()
+    refused = 0
+    if poses is None:
+        poses = problem.dead_reckoning() if c.start == "odometry" else chain_start(problem)
+        stages("chain")
+        if c.start == "forward":
+            walk = forward_pass(problem, poses)
+            poses, refused = walk.poses, walk.refused
+            stages("forward pass")
+    workers = Workers(c.threads)
+    try:
+        descent = _Descent(problem, c, workers, poses, stages, progress)
+        descent.run()
+        while c.split and descent.split():
+            descent.run()
+        soft = []
+        if c.soft:
+            soft = softest_modes(descent.network, c.soft)
+            stages("softest modes")
+        network = descent.network
+        return Relaxed(
+            method=c.method,
+            poses=network.poses,
+            landmarks=network.landmarks,
+            landmark=descent.problem.landmark,
+            objective=network.objective,
+            chi2=network.objective / max(1, descent.problem.freedom),
+            converged=descent.converged,
+            history=descent.history,
+            soft=soft,
+            split=descent.found,
+            refused=refused,
+            seconds=stages.seconds,
+            approximate=c.method == "levels",
+        )
+    finally:
+        workers.close()
+
+
+class _Descent:
+    """One descent: the network at the poses so far, and the steps."""
+
+    def __init__(
+        self,
+        problem: SkeletonProblem,
+        config: RelaxConfig,
+        workers: Workers,
+        poses: Poses,
+        stages: Stages,
+        progress: Callable[[Iteration], None] | None,
+    ) -> None:
+        self.problem, self.config, self.workers, self.stages = problem, config, workers, stages
+        self.levels = config.levels or levels_for(problem.poses)
+        self.history: list[Iteration] = []
+        self.converged = ""
+        self.found = 0
+        self._progress = progress
+        self._pattern: KeyframePattern | None = None
+        self._begin(problem, poses)
+
+    def _begin(self, problem: SkeletonProblem, poses: Poses) -> None:
+        self.problem = problem
+        self.layout = Layout(problem, self.workers)
+        self.network = self._network(poses)
+        self._pattern = None
+
+    def _network(self, poses: Poses) -> Network:
+        network = Network(self.layout, poses)
+        self.stages("linearise")
+        return network
+
+    def _preconditioner(self) -> Preconditioner:
+        M = Preconditioner(self.network, self.levels, self._pattern)
+        self._pattern = M.pattern
+        self.stages("preconditioner")
+        return M
+
+    def split(self) -> int:
+        """Split wrong unions at the present poses; how many there were."""
+        landmark, found = split_wrong_unions(self.network)
+        self.stages("wrong unions")
+        self.found += found
+        if found:
+            logger.info("%d landmarks were wrong unions and are split", found)
+            self._begin(self.problem.relabelled(landmark), self.network.poses)
+        return found
+
+    @property
+    def chi2(self) -> float:
+        return self.network.objective / max(1, self.problem.freedom)
+
+    def run(self) -> None:
+        """Steps until nothing is gained."""
+        self.converged = ""
+        if not np.isfinite(self.network.objective):
+            raise SolverError("objective of the skeleton network is not finite at its start")
+        {"gn": self._gauss_newton, "blocks": self._gauss_newton, "levels": self._levels, "cg": self._gradients}[
+            self.config.method
+        ]()
+
+    # ---- Gauss-Newton ------------------------------------------------------------------------------------------
+
+    def _gauss_newton(self) -> None:
+        c = self.config
+        M: Preconditioner | None = None
+        rebuilt = 0
+        for _ in range(c.iterations):
+            last = self.history[-1] if self.history else None
+            close = last is not None and last.predicted < 10.0
+            if M is None or self.chi2 > 1.5 or (last is not None and last.scale < 1.0) or (close and not rebuilt):
+                M = self._preconditioner()
+                rebuilt = int(close)
+            tolerance = 0.01 if self.chi2 > 2.0 else 1e-3 if close else 0.03
+            product = self.network.product
+            if c.method == "blocks":
+                product = ThinnedNetwork(self.network, c.limit).product
+                self.stages("thinning")
+            step, predicted, products = conjugate_gradients(
+                product, M, -self.network.gradient, tolerance, c.inner, 1e-3 * c.gain
+            )
+            self.stages("products")
+            if self._take(step, predicted, products):
+                return
+            if c.split and len(self.history) == 1 and self.split():
+                M = None  # before it, the start bends too many right ones; later, wrong ones have bent the poses
+
+    def _levels(self) -> None:
+        """Steps of the keyframes alone."""
+        if not self.levels.factored:
+            raise ConfigError(f"the method 'levels' needs keyframes; got {self.levels}")
+        for _ in range(self.config.iterations):
+            M = self._preconditioner()
+            assert M.network is not None
+            step = np.zeros_like(self.network.gradient)
+            M.network.apply(-self.network.gradient, step)
+            self.stages("products")
+            if self._take(step, -float(np.einsum("ij,ij->", step, self.network.gradient)), 0):
+                return
+
+    def _take(self, step: Array, predicted: float, products: int) -> bool:
+        """Take a step, halved while the objective rises; True if it was the last one."""
+        c, before = self.config, self.network
+        scale = 1.0
+        while True:
+            there = self._network(moved(before.poses, step, scale))
+            gained = before.objective - there.objective
+            # what rounding makes of the sum of all residuals counts as nothing
+            if gained >= -1e-12 * before.objective * np.sqrt(self.problem.measurements):
+                break
+            scale *= 0.5
+            if scale < 1e-4:
+                self._note(before, products, predicted, 0.0, 0.0, 0.0)
+                return True
+        far = float(np.sqrt(np.max(np.sum(step[:, 3:] ** 2, axis=1)))) * scale
+        self.network = there
+        self._note(there, products, predicted, gained, far, scale)
+        if scale < 1.0 or predicted >= max(c.gain, c.enough):
+            return False
+        last = self.history[-2].predicted if len(self.history) > 1 else np.inf
+        self.converged = "poses" if predicted < c.gain and far < c.move else "objective"
+        return self.converged == "poses" or predicted < c.enough or last < c.gain
+
+    def _note(self, network: Network, products: int, predicted: float, gained: float, far: float, scale: float) -> None:
+        chi2 = network.objective / max(1, self.problem.freedom)
+        self.history.append(
+            Iteration(network.objective, chi2, products, predicted, gained, far, scale, self.stages.total)
+        )
+        logger.info("step %d: %s", len(self.history), self.history[-1])
+        if self._progress is not None:
+            self._progress(self.history[-1])
+
+    # ---- non-linear conjugate gradients ------------------------------------------------------------------------
+
+    def _gradients(self) -> None:
+        """Polak-Ribière; the step length from one product, halved while the objective rises."""
+        c = self.config
+        plain = self.levels.jacobi < 0
+        M: Callable[[Array], Array] | None = None
+        old: tuple[Array, float] | None = None
+        direction: Array | None = None
+        for k in range(c.iterations):
+            if M is None or (not plain and c.rebuild and k % c.rebuild == 0):
+                M = np.copy if plain else self._preconditioner()
+            g = self.network.gradient
+            z = M(g)
+            now = _dot(g, z)
+            beta = 0.0 if old is None else max(0.0, (now - _dot(z, old[0])) / old[1])
+            direction = -z if direction is None or beta == 0.0 else beta * direction - z
+            slope = _dot(g, direction)
+            if slope >= 0.0:
+                direction, slope = -z, -now
+            step = direction * (-slope / _dot(direction, self.network.product(direction)))
+            self.stages("products")
+            old = g, now
+            if self._take(step, -_dot(step, g), 1):
+                return
+
+
+def _dot(a: Array, b: Array) -> float:
+    return float(np.einsum("ij,ij->", a, b))
+
+
+def conjugate_gradients(
+    product: Callable[[Array], Array],
+    M: Callable[[Array], Array],
+    b: Array,
+    tolerance: float,
+    most: int,
+    gain: float,
+) -> tuple[Array, float, int]:
+    """Solve ``S x = b`` by preconditioned conjugate gradients.
+
+    It ends when the residual, in the norm of the preconditioner, has fallen to ``tolerance`` of what it was, or when
+    the last four products together lowered the quadratic by less than ``gain``.
+
+    Returns
+    -------
+    x : (N, 6)
+    predicted : float
+        ``xᵀ b``: by how much the objective falls if it is as the linear model has it.
+    products : int
+    """
+    x = np.zeros_like(b)
+    r = b.copy()
+    z = M(r)
+    d = z.copy()
+    now = first = _dot(r, z)
+    predicted = 0.0
+    gains: list[float] = []
+    while len(gains) < most and now > 0.0:
+        q = product(d)
+        curve = _dot(d, q)
+        if not curve > 0.0:
+            raise SolverError(f"the Schur complement has no positive curvature ({curve:g}) along a direction")
+        a = now / curve
+        x += a * d
+        r -= a * q
+        predicted += a * now
+        gains.append(a * now)
+        z = M(r)
+        new = _dot(r, z)
+        if new <= tolerance**2 * first or sum(gains[-4:]) < gain:
+            break
+        d *= new / now
+        d += z
+        now = new
+    return x, predicted, len(gains)

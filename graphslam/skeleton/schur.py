@@ -1,0 +1,222 @@
+"""The skeleton network at given poses: objective, gradient, and the Schur complement applied without being formed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.core.se3 import matrix_to_quat, so3_left_jacobian_inverse, so3_log
+from graphslam.skeleton import chain_kernels as chains
+from graphslam.skeleton import landmark_kernels as kernels
+from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.problem import SkeletonProblem
+
+Index = npt.NDArray[np.int64]
+
+PARTS = 2
+"""Ranges of poses whose sums over landmarks are kept apart and added in order: results depend on it, not on threads."""
+
+
+class Workers:
+    """Runs a kernel over ranges on some threads; the ranges, and so the results, do not depend on their number."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def over(self, work: Callable[..., Any], ranges: Any) -> list[Any]:
+        """``[work(*r) for r in ranges]``, in that order."""
+        if self._pool is None:
+            return [work(*r) for r in ranges]
+        return [f.result() for f in [self._pool.submit(work, *r) for r in ranges]]
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
+class Layout:
+    """Ranges of poses and of landmarks, and the arrays into which each range of poses sums.
+
+    Landmarks are numbered by first sighting, so the first range of poses sees the first landmarks only.
+    """
+
+    def __init__(self, problem: SkeletonProblem, workers: Workers, parts: int = PARTS) -> None:
+        self.problem, self.workers = problem, workers
+        N, M = problem.poses, problem.measurements
+        cuts = np.searchsorted(problem.first, [M * k // parts for k in range(parts + 1)]).astype(np.int64)
+        cuts[0], cuts[-1] = 0, N
+        self.ranges = [(int(a), int(b)) for a, b in pairwise(cuts)]
+        self.reach = []
+        for _, b in self.ranges:
+            at = problem.landmark[problem.first[self.ranges[len(self.reach)][0]] : problem.first[b]]
+            seen = int(at.max(initial=-1)) + 1
+            self.reach.append(max(seen, self.reach[-1] if self.reach else 0))
+        L = problem.landmarks
+        step = max(1, -(-L // 4))
+        self.landmark_ranges = [(a, min(a + step, L)) for a in range(0, L, step)]
+
+        self.counts = np.zeros(L, dtype=np.int32)
+        kernels.count_sightings(problem.landmark, self.counts)
+
+    def sums(self, width: int) -> list[Array]:
+        """A zero array ``(landmarks in reach, width)`` for each range of poses; the last one has all landmarks."""
+        return [np.zeros((r, width)) for r in self.reach]
+
+    def total(self, sums: list[Array]) -> Array:
+        """Sum over the ranges, in their order, in the last array."""
+        out = sums[-1]
+
+        def add(a: int, b: int) -> None:
+            for part in sums[:-1]:
+                out[a : min(b, len(part))] += part[a:b]
+
+        self.workers.over(add, self.landmark_ranges)
+        return out
+
+
+class Network:
+    """Landmarks, objective and gradient of a skeleton network at some poses.
+
+    Attributes
+    ----------
+    landmarks : (L, 3)
+        Best places of the landmarks, given the poses.
+    objective : float
+        Sum of squared normalised residuals.
+    gradient : (N, 6)
+        Half its derivative by the poses (turn, then way, in the world frame), with the landmarks following.
+    """
+
+    def __init__(self, layout: Layout, poses: Poses) -> None:
+        self.layout, self.poses = layout, poses
+        problem = layout.problem
+        sight = problem.sightings
+        D, b = layout.sums(6), layout.sums(3)
+        layout.workers.over(
+            lambda k: kernels.sum_landmarks(sight, poses, *layout.ranges[k], D[k], b[k]), _each(layout.ranges)
+        )
+        self.inverse, self.landmarks = layout.total(D), layout.total(b)
+        layout.workers.over(
+            lambda a, e: kernels.solve_landmarks(self.inverse, self.landmarks, a, e), layout.landmark_ranges
+        )
+        N = problem.poses
+        g, each = np.empty((N, 6)), np.empty(N)
+        layout.workers.over(lambda a, e: kernels.gradient(sight, poses, self.landmarks, a, e, g, each), layout.ranges)
+        self.objective = float(np.sum(each)) + self._add_chain(g, None, None)
+        self.gradient = g
+        self._blocks: tuple[Array, Array] | None = None
+
+    def _add_chain(self, g: Array, diagonal: Array | None, upper: Array | None) -> float:
+        """Add what ties a pose alone or to the next; returns its objective."""
+        problem, poses = self.layout.problem, self.poses
+        blocks = diagonal is not None
+        none = np.empty((0, 6, 6))
+        total = chains.linearise(
+            problem.chain, poses, blocks, none if diagonal is None else diagonal, none if upper is None else upper, g
+        )
+        return float(total) + add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
+
+    def chain_blocks(self) -> tuple[Array, Array]:
+        """Blocks ``(N, 6, 6)`` and ``(N - 1, 6, 6)`` of what ties a pose alone or to the next."""
+        if self._blocks is None:
+            N = self.layout.problem.poses
+            diagonal, upper = np.zeros((N, 6, 6)), np.zeros((N - 1, 6, 6))
+            self._add_chain(np.zeros((N, 6)), diagonal, upper)
+            self._blocks = diagonal, upper
+        return self._blocks
+
+    def diagonal(self) -> Array:
+        """Diagonal blocks ``(N, 6, 6)`` of the Schur complement."""
+        layout = self.layout
+        blocks = self.chain_blocks()[0].copy()
+        landmarks = (self.landmarks, self.inverse)
+        layout.workers.over(
+            lambda a, e: kernels.diagonal(layout.problem.sightings, self.poses, landmarks, a, e, blocks), layout.ranges
+        )
+        return blocks
+
+    def product(self, v: Array) -> Array:
+        """Schur complement times ``v (N, 6)``."""
+        layout = self.layout
+        sight, work = layout.problem.sightings, layout.workers
+        parts = layout.sums(3)
+        work.over(
+            lambda k: kernels.gather(sight, self.poses, self.landmarks, v, *layout.ranges[k], parts[k]),
+            _each(layout.ranges),
+        )
+        t = layout.total(parts)
+        work.over(lambda a, e: kernels.settle(self.inverse, t, a, e), layout.landmark_ranges)
+        diagonal, upper = self.chain_blocks()
+        out = np.empty_like(v)
+
+        def spread(a: int, e: int) -> None:
+            chains.product(diagonal, upper, v, a, e, out)
+            kernels.scatter(sight, self.poses, (self.landmarks, t), v, a, e, out)
+
+        work.over(spread, layout.ranges)
+        return out
+
+
+def _each(ranges: list[tuple[int, int]]) -> list[tuple[int]]:
+    return [(k,) for k in range(len(ranges))]
+
+
+def add_fixes(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array | None) -> float:
+    """Add GPS to gradient and blocks; its objective."""
+    if not problem.fixes:
+        return 0.0
+    at = problem.gps_pose
+    r = poses.position[at] - problem.gps_position
+    info = np.broadcast_to(problem.gps_information, (len(r), 3, 3))
+    f = np.einsum("nij,nj->ni", info, r)
+    rows = np.zeros((len(r), 6))
+    rows[:, 3:] = f
+    np.add.at(g, at, rows)
+    if diagonal is not None:
+        wide = np.zeros((len(r), 6, 6))
+        wide[:, 3:, 3:] = info
+        np.add.at(diagonal, at, wide)
+    return float(np.einsum("ni,ni->", r, f))
+
+
+def add_start(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array | None) -> float:
+    """Add the prior on the first pose to gradient and blocks; its objective."""
+    w = so3_log(matrix_to_quat(poses.rotation[0] @ problem.start_rotation.T))
+    r = np.concatenate([w, poses.position[0] - problem.start_position])
+    J = np.eye(6)
+    J[:3, :3] = so3_left_jacobian_inverse(w)
+    f = problem.start_information @ r
+    g[0] += J.T @ f
+    if diagonal is not None:
+        diagonal[0] += J.T @ problem.start_information @ J
+    return float(r @ f)
+
+
+def moved(poses: Poses, step: Array, scale: float = 1.0) -> Poses:
+    """Poses after a step ``(N, 6)``."""
+    R, p = np.empty_like(poses.rotation), np.empty_like(poses.position)
+    chains.move(poses.rotation, poses.position, step, scale, R, p)
+    return Poses(R, p)
+
+
+def inverse_of(blocks: Array, workers: Workers, ranges: list[tuple[int, int]], what: str) -> Array:
+    """Replace blocks ``(n, 6, 6)`` by their inverses.
+
+    Raises
+    ------
+    IndeterminateError
+        One is not positive definite.
+    """
+    bad = [k for k in workers.over(lambda a, b: chains.invert_blocks(blocks, a, b), ranges) if k >= 0]
+    if bad:
+        raise IndeterminateError(f"{what} {min(bad)} of the skeleton network is not constrained", (f"x{min(bad)}",))
+    return blocks

@@ -1,0 +1,102 @@
+"""Where the relaxation begins: the chain of odometry with tilt and GPS, then one walk against older landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.errors import IndeterminateError
+from graphslam.core.geometry import Array
+from graphslam.skeleton import chain_kernels as kernels
+from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.schur import add_fixes, add_start, moved
+
+
+def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
+    """Optimum of odometry, tilt, GPS and prior alone: Gauss-Newton from dead reckoning, block by block along the chain.
+
+    A step that raises the objective is halved. It ends when a step gains less than 0.1 %, or after ``iterations``.
+    """
+    poses = problem.dead_reckoning()
+    N = problem.poses
+    objective, g, diagonal, upper = _linearised(problem, poses)
+    for _ in range(iterations):
+        step = -g
+        bad = kernels.solve_chain(diagonal, upper, step)
+        if bad >= 0:
+            raise IndeterminateError(f"pose {bad} of the chain is not constrained", (f"x{bad}",))
+        scale = 1.0
+        while True:
+            there = moved(poses, step, scale)
+            after, g, diagonal, upper = _linearised(problem, there)
+            if after <= objective or scale < 1e-3:
+                break
+            scale *= 0.5
+        if after > objective:
+            break
+        poses, gain, objective = there, objective - after, after
+        if gain < 1e-3 * after + 1e-9 * N:
+            break
+    return poses
+
+
+def _linearised(problem: SkeletonProblem, poses: Poses) -> tuple[float, Array, Array, Array]:
+    N = problem.poses
+    g, diagonal, upper = np.zeros((N, 6)), np.zeros((N, 6, 6)), np.zeros((N - 1, 6, 6))
+    total = kernels.linearise(problem.chain, poses, True, diagonal, upper, g)
+    total += add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
+    return float(total), g, diagonal, upper
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What :func:`forward_pass` did.
+
+    Parameters
+    ----------
+    poses : Poses
+    tied : int
+        Poses that were tied to landmarks of an earlier pass.
+    refused : int
+        Sightings of such landmarks that were not believed.
+    """
+
+    poses: Poses
+    tied: int
+    refused: int
+
+
+def forward_pass(
+    problem: SkeletonProblem,
+    chain: Poses,
+    *,
+    ago: int = 50,
+    turn_sigma: float = 2e-3,
+    way_sigma: float = 0.03,
+    gate: float = 16.27,
+) -> Walk:
+    """Walk once along the poses and tie each to the landmarks that were first seen more than ``ago`` poses before.
+
+    A pose is predicted by the chain's increment. Where three old landmarks or more are in view, three Gauss-Newton
+    steps place it against their running means; a landmark whose misfit is above ``gate`` and above nine times the
+    median of those in view has no part in the second and third. A sighting that is then above ``gate`` is *refused*:
+    it is not added to the mean of its landmark, so a wrong correspondence bends neither this pose nor a later one.
+
+    Parameters
+    ----------
+    problem : SkeletonProblem
+    chain : Poses
+    ago : int
+    turn_sigma, way_sigma : float
+        How far a pose may move from its prediction [rad, m].
+    gate : float
+        Chi-square of three scalars; 16.27 is passed by 99.9 %.
+    """
+    N, L = problem.poses, problem.landmarks
+    out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
+    seen, D, b = np.full(L, -1, dtype=np.int32), np.zeros((L, 6)), np.zeros((L, 3))
+    rules = (int(ago), float(turn_sigma) ** -2, float(way_sigma) ** -2, float(gate))
+    tied, refused = kernels.forward_pass(problem.sightings, chain, rules, seen, D, b, out)
+    return Walk(out, int(tied), int(refused))

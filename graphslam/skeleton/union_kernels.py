@@ -1,0 +1,101 @@
+"""Numba kernels that find wrong unions of measurements and take them apart. Plain arrays only."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from graphslam.skeleton.landmark_kernels import _nine, _seen
+
+
+@nb.njit(cache=True, nogil=True)
+def count_passes(landmark, first, gap, last, passes):
+    """``passes[j]``: how often landmark j came into view after ``gap`` poses or more without it."""
+    for i in range(len(first) - 1):
+        for m in range(first[i], first[i + 1]):
+            j = landmark[m]
+            if last[j] < 0 or i - last[j] > gap:
+                passes[j] += 1
+            last[j] = i
+
+
+@nb.njit(cache=True, nogil=True)
+def worst_in_view(landmark, first, ratio, out):
+    """``out[j]``: the largest ``ratio (L,)`` of all landmarks that some pose sees together with landmark j."""
+    for i in range(len(first) - 1):
+        worst = 0.0
+        for m in range(first[i], first[i + 1]):
+            worst = max(worst, ratio[landmark[m]])
+        if worst > 0.0:
+            for m in range(first[i], first[i + 1]):
+                out[landmark[m]] = max(out[landmark[m]], worst)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def split_labels(sightings, poses, wrong, rules, landmark, n):
+    """Give every track of a wrong landmark a number of its own, from ``n`` on. Returns the count of all labels.
+
+    A track is a run of sightings within one pass that lie in one place: each is compared with the last one of the
+    track, in the world and in units of the noise of both. The first track keeps the number.
+
+    Parameters
+    ----------
+    wrong : (L,) bool
+    rules : (gap, gate)
+        Poses without a sighting between two passes; chi-square (3) up to which two sightings are one place.
+    landmark : (M,) changed
+    n : int
+    """
+    gap, gate = rules
+    room = 64
+    label, last, after = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    place = np.empty((room, 3))
+    used = 0
+    head = np.full(len(wrong), -1, np.int32)
+    for i in range(len(sightings.first) - 1):
+        R = _nine(poses.rotation, i)
+        px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
+        for m in range(sightings.first[i], sightings.first[i + 1]):
+            j = landmark[m]
+            if not wrong[j]:
+                continue
+            sx, sy, sz, al, be = _seen(
+                R,
+                np.float64(sightings.points[m, 0]),
+                np.float64(sightings.points[m, 1]),
+                np.float64(sightings.points[m, 2]),
+                sightings.along,
+                sightings.across,
+            )
+            best, least = -1, 2.0 * gate
+            at = head[j]
+            while at >= 0:
+                if i - last[at] <= gap and last[at] < i:  # a pose sees a thing once
+                    ex, ey, ez = place[at, 0] - px - sx, place[at, 1] - py - sy, place[at, 2] - pz - sz
+                    d = sx * ex + sy * ey + sz * ez
+                    misfit = al * (ex * ex + ey * ey + ez * ez) + be * d * d
+                    if misfit < least:
+                        best, least = at, misfit
+                at = after[at]
+            if best < 0:
+                if used == room:
+                    room *= 2
+                    longer = np.empty((3, room), np.int32)
+                    longer[0, :used], longer[1, :used], longer[2, :used] = label, last, after
+                    label, last, after = longer[0].copy(), longer[1].copy(), longer[2].copy()
+                    wider = np.empty((room, 3))
+                    wider[:used] = place
+                    place = wider
+                best = used
+                used += 1
+                if head[j] < 0:
+                    label[best] = j
+                else:
+                    label[best] = n
+                    n += 1
+                after[best] = head[j]
+                head[j] = best
+            last[best] = i
+            place[best, 0], place[best, 1], place[best, 2] = px + sx, py + sy, pz + sz
+            landmark[m] = label[best]
+    return n

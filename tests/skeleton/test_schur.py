@@ -1,0 +1,114 @@
+"""Landmarks, gradient, product and keyframe network of a skeleton network against dense matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.preconditioner import KeyframeNetwork, Levels, Preconditioner, chain_of, frames_of
+from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.schur import Layout, Network, Workers
+from tests.reference import dense_skeleton as dense
+
+
+def close(a: np.ndarray, b: np.ndarray, tolerance: float) -> bool:
+    return float(np.abs(a - b).max()) <= tolerance * float(np.abs(b).max())
+
+
+def test_the_twins_jacobian_is_that_of_its_residual(problem: SkeletonProblem, poses: Poses) -> None:
+    landmarks = dense.best_landmarks(problem, poses)
+    J = dense.rows(problem, poses, landmarks).jacobian
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        x = rng.standard_normal(J.shape[1])
+        h = 1e-6
+        ahead = dense.rows(problem, *dense.moved(poses, landmarks, h * x)).residual
+        back = dense.rows(problem, *dense.moved(poses, landmarks, -h * x)).residual
+        # the turn of a measurement's noise with its pose is not a part of the residual in the body frame
+        assert close((ahead - back) / (2 * h), J @ x, 1e-6)
+
+
+def test_landmarks_and_objective(problem: SkeletonProblem, network: Network, written_out: dense.Rows) -> None:
+    assert close(network.landmarks, dense.best_landmarks(problem, network.poses), 1e-12)
+    assert network.objective == pytest.approx(float(written_out.residual @ written_out.residual), rel=1e-12)
+
+
+def test_gradient_against_matrix_and_differences(network: Network, written_out: dense.Rows) -> None:
+    _, g = dense.schur(written_out, len(network.poses.position))
+    assert close(network.gradient.ravel(), g, 1e-9)
+    rng = np.random.default_rng(1)
+    from graphslam.skeleton.schur import moved
+
+    for _ in range(3):
+        v = rng.standard_normal(network.gradient.shape)
+        h = 1e-5
+        up, down = (Network(network.layout, moved(network.poses, s * h * v)).objective for s in (1, -1))
+        assert (up - down) / (4 * h) == pytest.approx(float(np.sum(network.gradient * v)), rel=1e-6)
+
+
+def test_product_against_dense_schur_complement(network: Network, written_out: dense.Rows) -> None:
+    S, _ = dense.schur(written_out, len(network.poses.position))
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        v = rng.standard_normal(network.gradient.shape)
+        assert close(network.product(v).ravel(), S @ v.ravel(), 1e-10)
+    N = len(S) // 6
+    blocks = np.array([S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(N)])
+    assert close(network.diagonal(), blocks, 1e-10)
+
+
+@pytest.mark.parametrize("k", [1, 4, 7, 19, 95, 200])
+def test_keyframe_network_is_the_restricted_schur_complement(network: Network, written_out: dense.Rows, k: int) -> None:
+    N = len(network.poses.position)
+    S, _ = dense.schur(written_out, N)
+    P = dense.interpolation(network.poses, k)
+    assert P.shape[1] == 6 * frames_of(N, k)
+    coarse = KeyframeNetwork(network, k)
+    wanted = P.T @ S @ P
+    assert close(coarse.matrix().toarray(), wanted, 1e-8)
+    r = np.random.default_rng(3).standard_normal((N, 6))
+    out = np.zeros_like(r)
+    coarse.apply(r, out)
+    assert close(out.ravel(), P @ np.linalg.solve(wanted, P.T @ r.ravel()), 1e-6)
+    jacobi = Preconditioner(network, Levels(k, 0))
+    blocks = np.array([wanted[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(len(wanted) // 6)])
+    assert close(np.linalg.inv(jacobi.keyframes), blocks, 1e-7)
+
+
+def test_the_chain_alone_is_restricted_as_well(network: Network) -> None:
+    N = len(network.poses.position)
+    diagonal, upper = network.chain_blocks()
+    A = np.zeros((6 * N, 6 * N))
+    for i in range(N):
+        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = diagonal[i]
+        if i + 1 < N:
+            A[6 * i : 6 * i + 6, 6 * i + 6 : 6 * i + 12] = upper[i]
+            A[6 * i + 6 : 6 * i + 12, 6 * i : 6 * i + 6] = upper[i].T
+    P = dense.interpolation(network.poses, 10)
+    wanted = P.T @ A @ P
+    D, U = chain_of(network, 10)
+    for c in range(len(D)):
+        assert close(D[c], wanted[6 * c : 6 * c + 6, 6 * c : 6 * c + 6], 1e-9)
+        if c + 1 < len(D):
+            assert close(U[c], wanted[6 * c : 6 * c + 6, 6 * c + 6 : 6 * c + 12], 1e-9)
+
+
+def test_preconditioner_is_symmetric_and_positive(network: Network) -> None:
+    M = Preconditioner(network, Levels(4, 16))
+    rng = np.random.default_rng(4)
+    a, b = (rng.standard_normal(network.gradient.shape) for _ in range(2))
+    assert np.sum(a * M(b)) == pytest.approx(np.sum(b * M(a)), rel=1e-9)
+    assert np.sum(a * M(a)) > 0
+
+
+def test_threads_change_no_byte(problem: SkeletonProblem, poses: Poses) -> None:
+    found = []
+    for threads in (1, 2, 3):
+        network = Network(Layout(problem, Workers(threads)), poses)
+        v = np.sin(np.arange(network.gradient.size)).reshape(-1, 6)
+        M = Preconditioner(network, Levels(4, 16))
+        made = (network.landmarks, network.gradient, network.product(v), network.diagonal(), M(v))
+        found.append((network.objective, *(x.tobytes() for x in made)))
+        network.layout.workers.close()
+    assert found[0] == found[1] == found[2]
