@@ -27,7 +27,7 @@ class Table(NamedTuple):
     """(2^b,)"""
     block: Array
     """(capacity, 6, 6)"""
-    count: npt.NDArray[np.int64]
+    filled: npt.NDArray[np.int64]
     """(1,): blocks so far."""
 
 
@@ -53,8 +53,8 @@ def _find(table, key):
     while table.key[at] != key:
         if table.key[at] < 0:
             table.key[at] = key
-            table.place[at] = table.count[0]
-            table.count[0] += 1
+            table.place[at] = table.filled[0]
+            table.filled[0] += 1
             break
         at = (at + 1) & mask
     return table.place[at]
@@ -63,7 +63,7 @@ def _find(table, key):
 @nb.njit(cache=True, nogil=True)
 def _grown(table):
     """The same table with twice the room."""
-    n = table.count[0]
+    n = table.filled[0]
     big = make_table(2 * len(table.block))
     big.block[:n] = table.block[:n]
     keys = np.empty(n, np.int64)
@@ -78,7 +78,7 @@ def _grown(table):
 @nb.njit(cache=True, nogil=True)
 def keys_of(table):
     """Keys in the order of the blocks."""
-    keys = np.empty(table.count[0], np.int64)
+    keys = np.empty(table.filled[0], np.int64)
     for at in range(len(table.key)):
         if table.key[at] >= 0:
             keys[table.place[at]] = table.key[at]
@@ -363,7 +363,7 @@ def keyframe_network(sightings, poses, landmarks, k, count, table):
                 chain[f] = at
                 f += 1
                 at = after[at]
-            while table.count[0] + f * (f + 1) // 2 > len(table.block):
+            while table.filled[0] + f * (f + 1) // 2 > len(table.block):
                 table = _grown(table)
             for i in range(f):
                 q = poses.position[min(frame[chain[i]] * k, N - 1)]
@@ -382,7 +382,7 @@ def keyframe_network(sightings, poses, landmarks, k, count, table):
                 after[chain[i]] = free
                 free = chain[i]
             head[j] = -1
-        while table.count[0] + 3 > len(table.block):
+        while table.filled[0] + 3 > len(table.block):
             table = _grown(table)
         table.block[_find(table, np.int64(c) * K + c)] += B00
         table.block[_find(table, np.int64(c) * K + c + 1)] += B01

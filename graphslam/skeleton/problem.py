@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,9 +66,9 @@ class SkeletonProblem:
     start_covariance: Array
     up: Array | None = None
     up_sigma: float | Array = np.inf
-    gps_pose: npt.NDArray[np.int64] | None = None
-    gps_position: Array | None = None
-    gps_covariance: Array | None = None
+    gps_pose: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    gps_position: Array = field(default_factory=lambda: np.empty((0, 3)))
+    gps_covariance: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -77,7 +77,7 @@ class SkeletonProblem:
         N = len(self.first) - 1
         if N < 2:
             raise DataError("a skeleton network of fewer than two poses", got=N)
-        gps = np.empty(0, np.int64) if self.gps_pose is None else np.asarray(self.gps_pose, dtype=np.int64)
+        gps = np.asarray(self.gps_pose, dtype=np.int64)
         put(self, "gps_pose", gps)
         shapes = {
             "points": (len(self.landmark), 3),
@@ -86,11 +86,10 @@ class SkeletonProblem:
             "start_rotation": (3, 3),
             "start_position": (3,),
             "start_covariance": (6, 6),
+            "gps_position": (len(gps), 3),
         }
         if self.up is not None:
             shapes["up"] = (N, 3)
-        if len(gps):
-            shapes["gps_position"] = (len(gps), 3)
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is None or np.shape(value) != shape:
@@ -103,11 +102,10 @@ class SkeletonProblem:
         put(self, "odometry_covariance", np.asarray(self.odometry_covariance, dtype=np.float64).reshape(-1, 6, 6))
         if len(self.odometry_covariance) not in (1, N - 1):
             raise DataError("odometry_covariance", got=len(self.odometry_covariance), wanted=f"1 or {N - 1}")
-        if len(gps):
-            cov = np.asarray(self.gps_covariance, dtype=np.float64).reshape(-1, 3, 3)
-            if len(cov) not in (1, len(gps)):
-                raise DataError("gps_covariance", got=len(cov), wanted=f"1 or {len(gps)}")
-            put(self, "gps_covariance", cov)
+        cov = np.asarray(self.gps_covariance, dtype=np.float64).reshape(-1, 3, 3)
+        if len(cov) not in (1, len(gps)):
+            raise DataError("gps_covariance", got=len(cov), wanted=f"1 or {len(gps)}")
+        put(self, "gps_covariance", cov)
         _ = self.odometry_information, self.gps_information, self.start_information
 
     def _check_numbers(self, N: int, gps: npt.NDArray[np.int64]) -> None:
@@ -150,7 +148,7 @@ class SkeletonProblem:
     @property
     def fixes(self) -> int:
         """Number of GPS fixes G."""
-        return 0 if self.gps_pose is None else len(self.gps_pose)
+        return len(self.gps_pose)
 
     @cached_property
     def odometry_information(self) -> Array:
@@ -160,8 +158,6 @@ class SkeletonProblem:
     @cached_property
     def gps_information(self) -> Array:
         """(1 or G, 3, 3)"""
-        if self.gps_covariance is None:
-            return np.zeros((1, 3, 3))
         return _inverse(self.gps_covariance, "gps_covariance")
 
     @cached_property

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
@@ -144,7 +145,7 @@ class Relaxed:
     method: str
     poses: Poses
     landmarks: Array
-    landmark: Array
+    landmark: npt.NDArray[np.int32]
     objective: float
     chi2: float
     converged: str

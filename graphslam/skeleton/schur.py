@@ -55,7 +55,7 @@ class Layout:
         cuts = np.searchsorted(problem.first, [M * k // parts for k in range(parts + 1)]).astype(np.int64)
         cuts[0], cuts[-1] = 0, N
         self.ranges = [(int(a), int(b)) for a, b in pairwise(cuts)]
-        self.reach = []
+        self.reach: list[int] = []
         for _, b in self.ranges:
             at = problem.landmark[problem.first[self.ranges[len(self.reach)][0]] : problem.first[b]]
             seen = int(at.max(initial=-1)) + 1

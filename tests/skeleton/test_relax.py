@@ -187,7 +187,8 @@ def test_a_pose_that_nothing_holds_is_named(problem: SkeletonProblem) -> None:
         problem.relabelled(np.arange(problem.measurements, dtype=np.int32)),
         odometry_covariance=loose,
         up=None,
-        gps_pose=None,
+        gps_pose=np.empty(0, int),
+        gps_position=np.empty((0, 3)),
     )
     with pytest.raises(IndeterminateError, match="pose 4"):
         relax(alone, RelaxConfig(start="odometry", levels=Levels()))
