@@ -54,6 +54,8 @@ MESH_WORLDS: dict[str, MeshWorld] = {
     "building": MeshWorld("graphslam.sim.building", "building"),
     "court": MeshWorld("graphslam.sim.court", "court"),
 }
+CAMPUS = "campus"
+"""Streets and buildings, with a robot of their own (:mod:`graphslam.sim.campus`)."""
 
 
 def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
@@ -102,16 +104,17 @@ def simulate(
     Parameters
     ----------
     world : str
-        ``landmark-field``, ``garage``, ``mine``, ``building``; ``court``, the small one.
+        ``landmark-field``, ``garage``, ``mine``, ``building``; ``court``, the small one; ``campus``.
     seed : int
         Of every error, and of what can be moved in the world.
     preset : str, optional
         Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard``
-        confuse an association. Of the robot in the other worlds: ``light``, ``full``, ``two-scanners``.
+        confuse an association. Of the campus: ``full``, ``three-blocks``, ``block``, ``quick``. Of the robot in the
+        other worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
         Of the garage: ``A``, ``B`` or ``C``.
     world_seed : int, optional
-        Of what can be moved in a world of triangles, where it shall not be ``seed``.
+        Of what can be moved in a world of triangles, and of the campus, where it shall not be ``seed``.
     progress : bool
         Show a progress bar on stderr.
     **changes
@@ -129,17 +132,31 @@ def simulate(
         if layout is not None or world_seed is not None:
             raise ConfigError(f"world {world!r} has neither layout nor world_seed")
         return WORLDS[world](preset, seed, changes)
-    if world not in MESH_WORLDS:
-        raise UnknownNameError("world", world, [*WORLDS, *MESH_WORLDS])
-    from graphslam.sim.crawler import crawler_preset, simulate_crawler
-
-    config = crawler_preset(preset or "light", **changes)
+    if world not in MESH_WORLDS and world != CAMPUS:
+        raise UnknownNameError("world", world, [*WORLDS, *MESH_WORLDS, CAMPUS])
     moved = seed if world_seed is None else world_seed
     for name, value in (("seed", seed), ("world_seed", moved)):
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
             raise ConfigError(f"{name} = {value}; wanted a whole number ≥ 0")
+    if world == CAMPUS:
+        return _campus(preset, seed, moved, changes, layout=layout, progress=progress)
+    from graphslam.sim.crawler import crawler_preset, simulate_crawler
+
+    config = crawler_preset(preset or "light", **changes)
     log = simulate_crawler(mesh_world(world, layout=layout, seed=moved), seed, config, progress=progress)
     return replace(log, meta={**log.meta, "made_with": {"name": world, "layout": layout, "seed": moved}})
+
+
+def _campus(
+    preset: str | None, seed: int, world_seed: int, changes: dict[str, Any], *, layout: str | None, progress: bool
+) -> SensorLog:
+    from graphslam.sim.campus import simulate_campus
+    from graphslam.sim.campus_config import campus_preset
+
+    if layout is not None:
+        raise ConfigError(f"world {CAMPUS!r} has no layouts: leave {layout!r} out, and choose a size by its preset")
+    log = simulate_campus(campus_preset(preset or "full", **changes), seed, world_seed=world_seed, progress=progress)
+    return replace(log, meta={**log.meta, "made_with": {"name": CAMPUS, "seed": world_seed}})
 
 
 def world_of(log: SensorLog) -> World:
@@ -153,6 +170,11 @@ def world_of(log: SensorLog) -> World:
     made = log.meta.get("made_with")
     if not isinstance(made, dict):
         raise ConfigError(f"log {log.name!r} does not say which world it was recorded in")
+    if made.get("name") == CAMPUS:
+        from graphslam.sim.campus_config import campus_preset
+        from graphslam.sim.campus_world import campus
+
+        return campus(campus_preset(**log.meta["config"]), seed=int(made.get("seed", 0)))
     return mesh_world(str(made.get("name")), layout=made.get("layout"), seed=int(made.get("seed", 0)))
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from graphslam.core.errors import MissingDataError
+from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import element, items, join, table
-from graphslam.core.records import Stream
+from graphslam.core.records import Stream, check_times
 from graphslam.core.trajectory import Trajectory
 
 
@@ -29,6 +30,46 @@ class DropCounter:
 
 
 @dataclass(frozen=True, slots=True)
+class BeamLabels:
+    """Which thing that moves each beam of a stream met.
+
+    Parameters
+    ----------
+    times : (n,)
+        Stamps of the records.
+    labels : (n, m) int16
+        Number of the thing; -1: nothing, or something that stands still.
+
+    Raises
+    ------
+    DataError
+    """
+
+    times: Array
+    labels: npt.NDArray[np.int16]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        labels = np.asarray(self.labels)
+        if labels.ndim != 2 or len(labels) != len(self.times) or labels.dtype.kind not in "iu":
+            raise DataError("labels do not fit the records", got=labels.shape, wanted=f"({len(self.times)}, m), whole")
+        object.__setattr__(self, "labels", np.ascontiguousarray(labels, dtype=np.int16))
+
+    def of(self, times: Array) -> npt.NDArray[np.int16]:
+        """Labels ``(k, m)`` of the records with these stamps ``(k,)``, for instance of a part of the log.
+
+        Raises
+        ------
+        DataError
+            A stamp that no record has.
+        """
+        k = np.clip(np.searchsorted(self.times, times), 0, max(len(self.times) - 1, 0))
+        if len(times) and (not len(self.times) or np.any(self.times[k] != times)):
+            raise DataError("a stamp that no labelled record has", got=len(times), wanted="stamps of the stream")
+        return self.labels[k]
+
+
+@dataclass(frozen=True, slots=True)
 class Truth:
     """What a simulator or a surveyor knows.
 
@@ -39,11 +80,14 @@ class Truth:
     landmark_ids : (n,) int64
     landmarks : (n, dim)
         True positions in the same frame.
+    moving : mapping of str to BeamLabels
+        By stream of beams: which of them met something that moves.
     """
 
     trajectory: Trajectory
     landmark_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    moving: Mapping[str, BeamLabels] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

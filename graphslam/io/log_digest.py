@@ -40,7 +40,8 @@ def log_digest(log: SensorLog) -> dict[str, str]:
     if log.truth is not None:
         d, t = Digest(), log.truth
         path = {f.name: getattr(t.trajectory, f.name) for f in dataclasses.fields(t.trajectory)}
-        d.add_all({**path, "landmark_ids": t.landmark_ids, "landmarks": t.landmarks})
+        moving = {f"moving {k}": v.labels for k, v in t.moving.items()}
+        d.add_all({**path, "landmark_ids": t.landmark_ids, "landmarks": t.landmarks, **moving})
         out["(truth)"] = f"{len(t.trajectory.times)} records, blake2b {d.text()}"
     known = {k: np.asarray(log.meta[k], dtype=np.float64) for k in META if k in log.meta}
     if known:

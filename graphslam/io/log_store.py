@@ -15,8 +15,8 @@ from typing import Any
 
 from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError
-from graphslam.core.log import SensorLog, Truth
-from graphslam.core.npz import floats, ints
+from graphslam.core.log import BeamLabels, SensorLog, Truth
+from graphslam.core.npz import check_arrays, floats, ints
 from graphslam.core.reading import inside
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
@@ -106,7 +106,7 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
     truth = None
     if index.get("truth") is not None:
         path = inside(root, index["truth"], where)
-        truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT, fields=_TRUTH)))
+        truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT), str(path)))
     return SensorLog(
         name=index["name"],
         streams=streams,
@@ -143,11 +143,18 @@ def _truth_arrays(truth: Truth) -> dict[str, Any]:
         "landmark_ids": truth.landmark_ids,
         "landmarks": truth.landmarks,
     }
+    for name, moving in truth.moving.items():
+        arrays |= {f"moving.{name}": moving.labels, f"moving-times.{name}": moving.times}
     return arrays if t.covariances is None else {**arrays, "covariances": t.covariances}
 
 
-def _truth(a: Arrays) -> Truth:
+def _truth(arrays: Arrays, where: str) -> Truth:
+    names = [k.removeprefix("moving.") for k in arrays if k.startswith("moving.")]
+    moving = {f"moving.{k}": ints("n" + k, "m" + k) for k in names}
+    moving |= {f"moving-times.{k}": floats("n" + k) for k in names}
+    a = check_arrays(arrays, {**_TRUTH, **moving}, where)
     return Truth(
+        moving={k: BeamLabels(a[f"moving-times.{k}"], a[f"moving.{k}"]) for k in names},
         trajectory=Trajectory(a["times"], a["poses"], a.get("covariances")),
         landmark_ids=a["landmark_ids"],
         landmarks=a["landmarks"],

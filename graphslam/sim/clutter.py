@@ -19,13 +19,14 @@ class KeepClear:
 
     Parameters
     ----------
-    route : Route
+    way : Route or (n, 3)
+        The way, or points close together on all ways there are [m].
     margin : float
         Free space on either side of the way's middle line [m].
     """
 
-    def __init__(self, route: Route, margin: float = 1.2) -> None:
-        self._points = route.positions(route.every(0.25))
+    def __init__(self, way: Route | Array, margin: float = 1.2) -> None:
+        self._points = way.positions(way.every(0.25)) if isinstance(way, Route) else way
         self.margin = margin
 
     def distance(self, centre: Sequence[float], size: Sequence[float], yaw: float, floor: float) -> float:

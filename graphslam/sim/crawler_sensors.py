@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.signal import lfilter
@@ -20,6 +22,7 @@ from graphslam.sim.drive import Motion
 from graphslam.sim.raycast import RayCaster
 
 _BEAMS_AT_ONCE = 1 << 18
+Nearer: TypeAlias = Callable[[int, Array, Array, Array], Array]
 
 
 def scan_world(
@@ -54,12 +57,46 @@ def scan_world(
         spin=np.mod(turn * times, 2.0 * np.pi),
         spin_rate=np.full(len(times), turn),
     )
-    exact = np.empty((len(times), c.beams))
-    chunk = max(_BEAMS_AT_ONCE // c.beams, 1)
-    with tqdm(total=len(times), desc="casting beams", unit="scan", disable=not progress) as bar:
-        for k in range(0, len(times), chunk):
-            part = slice(k, min(k + chunk, len(times)))
-            exact[part] = caster.ranges(scan_rays(scans, motion, part)).reshape(-1, c.beams)
+    return cast_scans(scans, motion, caster, config, seeds, progress=progress)
+
+
+def cast_scans(
+    scans: RangeScans,
+    motion: Motion,
+    caster: RayCaster,
+    config: CrawlerConfig,
+    seeds: SeedTree,
+    *,
+    nearer: Nearer | None = None,
+    progress: bool = False,
+) -> RangeScans:
+    """Scans with the ranges that their beams measure, with the noise, losses and limits of a configuration.
+
+    Parameters
+    ----------
+    scans : RangeScans
+        Stamps, directions and angles of the head; its ranges are not read.
+    motion : Motion
+    caster : RayCaster
+    config : CrawlerConfig
+    seeds : SeedTree
+    nearer : callable, optional
+        Given the first scan of a part, its rays ``(k · m, 6)``, their times and their exact ranges, both ``(k · m,)``
+        (NaN: nothing met), returns the ranges where something that moves is in front.
+    progress : bool
+        Show a progress bar on stderr.
+    """
+    c, n, m = config, len(scans.times), len(scans.beam_times)
+    exact = np.empty((n, m))
+    chunk = max(_BEAMS_AT_ONCE // m, 1)
+    with tqdm(total=n, desc="casting beams", unit="scan", disable=not progress) as bar:
+        for k in range(0, n, chunk):
+            part = slice(k, min(k + chunk, n))
+            rays = scan_rays(scans, motion, part)
+            found = caster.ranges(rays)
+            if nearer is not None:
+                found = nearer(k, rays, (scans.times[part, None] + scans.beam_times).ravel(), found)
+            exact[part] = found.reshape(-1, m)
             bar.update(part.stop - part.start)
 
     rng = seeds.generator()

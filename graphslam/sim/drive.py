@@ -183,8 +183,9 @@ class Motion:
 
     def poses(self, t: ArrayLike) -> Array:
         """``T_world_base`` ``(n, 7)`` at times ``(n,)`` [s]."""
-        w = self._way(self._progress(t)[0])
-        return np.concatenate([w[..., :3], euler_to_quat(w[..., 3], w[..., 4], w[..., 5])], -1)
+        angles = self._angles(np.asarray(t, dtype=np.float64))[0]
+        position = self._way(self._progress(t)[0])[..., :3]
+        return np.concatenate([position, euler_to_quat(angles[..., 0], angles[..., 1], angles[..., 2])], -1)
 
     def velocities(self, t: ArrayLike) -> Array:
         """World velocities of the base ``(n, 3)`` [m/s]."""
@@ -198,10 +199,7 @@ class Motion:
 
     def rotation(self, t: ArrayLike) -> tuple[Array, Array]:
         """Angular rates [rad/s] and angular accelerations [rad/s²] in the base frame, each ``(n, 3)``."""
-        u, du, ddu = self._progress(t)
-        w, w1 = self._way(u)[..., 3:], self._way1(u)[..., 3:]
-        d1 = w1 * du[..., None]
-        d2 = self._way2(u)[..., 3:] * du[..., None] ** 2 + w1 * ddu[..., None]
+        w, d1, d2 = self._angles(np.asarray(t, dtype=np.float64))
         pitch, roll = w[..., 1], w[..., 2]
         (yaw1, pitch1, roll1), (yaw2, pitch2, roll2) = np.moveaxis(d1, -1, 0), np.moveaxis(d2, -1, 0)
         sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
@@ -216,6 +214,13 @@ class Motion:
             -1,
         )
         return rate, change
+
+    def _angles(self, t: Array) -> tuple[Array, Array, Array]:
+        """Yaw, pitch and roll ``(n, 3)`` [rad], and their first two derivatives by time."""
+        u, du, ddu = self._progress(t)
+        w1 = self._way1(u)[..., 3:]
+        d1 = w1 * du[..., None]
+        return self._way(u)[..., 3:], d1, self._way2(u)[..., 3:] * du[..., None] ** 2 + w1 * ddu[..., None]
 
     def trajectory(self) -> Trajectory:
         """The drive at ``config.rate``, from 0 up to the last whole period."""

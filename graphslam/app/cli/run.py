@@ -156,12 +156,19 @@ def demo(
 
 
 def simulate(
-    world: str = typer.Argument(..., help="Name of the world: landmark-field, garage, mine, building or court."),
+    world: str = typer.Argument(
+        ..., help="Name of the world: landmark-field, garage, mine, building, court or campus."
+    ),
     out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),
     layout: str | None = typer.Option(None, help="Layout of the garage: A, B or C."),
     preset: str | None = typer.Option(
-        None, help="Landmark field: A, B, C, demo or quick. Other worlds: light, full or two-scanners."
+        None,
+        help="Landmark field: A, B, C, demo or quick. Campus: full, three-blocks, block or quick. "
+        "Other worlds: light, full or two-scanners.",
+    ),
+    world_seed: int | None = typer.Option(
+        None, help="Seed of the place alone: sessions with one of these and different --seed share a place."
     ),
     setting: list[str] = typer.Option(
         [], "--set", help="Set one parameter of the world or the robot, as name=value. May be repeated."
@@ -175,7 +182,8 @@ def simulate(
     changes: dict[str, Any] = {}
     for text in setting:
         changes |= parse_setting(text)
-    log = make(world, seed=seed, preset=preset, layout=layout, progress=not as_json, **changes)
+    place = {} if world_seed is None else {"world_seed": world_seed}
+    log = make(world, seed=seed, preset=preset, layout=layout, progress=not as_json, **place, **changes)
     write_simulated(log, out)
     streams = {name: len(s.times) for name, s in log.streams.items()}
     rows = [{"stream": k, "records": v} for k, v in streams.items()]
