@@ -15,12 +15,13 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_transform
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.evaluate.without_truth import correlated_dof, two_sided
-from graphslam.graph.factors.gps import GpsRecord, gps_terms
-from graphslam.graph.gps import lever_arm
+from graphslam.graph.factors.gps import GpsRecord, antenna_terms
+from graphslam.graph.gps import arm_jacobian, datum_columns, lever_arm
 from graphslam.graph.pose_graph import PoseGraph
 
 Ints = npt.NDArray[np.int64]
@@ -33,9 +34,9 @@ class GpsInnovations:
     Parameters
     ----------
     times : (n,)
-    innovations : (n, 2)
+    innovations : (n, dim)
         Fix less prediction [m].
-    covariance : (2n, 2n)
+    covariance : (dim n, dim n)
         Joint covariance of all innovations: path, datum, local path of the submap (lever), bias of the segment, and
         the fix itself.
     unpredicted : int
@@ -50,41 +51,51 @@ class GpsInnovations:
     confidence: float = 0.95
 
     @property
+    def dim(self) -> int:
+        """Coordinates of a fix."""
+        return self.innovations.shape[1]
+
+    @property
     def blocks(self) -> Array:
-        """Covariance of every innovation by itself ``(n, 2, 2)``."""
-        n = len(self.times)
-        return self.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n), :]
+        """Covariance of every innovation by itself ``(n, dim, dim)``."""
+        n, d = len(self.times), self.dim
+        return self.covariance.reshape(n, d, n, d)[np.arange(n), :, np.arange(n), :]
 
     @property
     def normalised(self) -> Array:
-        """Innovations over their own covariance ``(n, 2)``: each N(0, I), but correlated with each other."""
+        """Innovations over their own covariance ``(n, dim)``: each N(0, I), but correlated with each other."""
         return np.asarray(np.linalg.solve(np.linalg.cholesky(self.blocks), self.innovations[..., None])[..., 0])
 
     @property
     def whitened(self) -> Array:
-        """Innovations given all earlier ones ``(n, 2)``: independent N(0, 1) if everything stated is right."""
+        """Innovations given all earlier ones ``(n, dim)``: independent N(0, 1) if everything stated is right."""
         L = np.linalg.cholesky(self.covariance)
-        return np.asarray(np.linalg.solve(L, self.innovations.ravel()).reshape(-1, 2))
+        return np.asarray(np.linalg.solve(L, self.innovations.ravel()).reshape(-1, self.dim))
 
     @property
     def nis(self) -> Array:
-        """Normalised innovation squared of every fix ``(n,)``, two degrees of freedom each."""
+        """Normalised innovation squared of every fix ``(n,)``, as many degrees of freedom as it has coordinates."""
         return np.asarray(np.sum(self.normalised**2, axis=1))
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the innovations' lengths [m]."""
+        return float(np.sqrt(np.mean(np.sum(self.innovations**2, axis=1))))
 
     def tests(self) -> pd.DataFrame:
         """Two tests, one row each: ``value`` is 1 if the prediction is honest, ``low … high`` its two-sided bounds.
 
-        ``each`` is the mean NIS/2 of the fixes by themselves, bounds by :func:`correlated_dof`: are the predicted
-        covariances of the right size? ``joint`` is the NIS of all of them together over 2n, bounds by ``χ²_2n``: are
-        they also correlated as the model says? ``autocorrelation`` is the lag-1 correlation of what stands in the row,
-        over neighbours in time; ``white`` the 95 % limit of its absolute value for independent ones.
+        ``each`` is the mean NIS by dimension of the fixes by themselves, bounds by :func:`correlated_dof`: are the
+        predicted covariances of the right size? ``joint`` is the NIS of all of them together over dim n, bounds by χ²:
+        are they also correlated as the model says? ``autocorrelation`` is the lag-1 correlation of what stands in the
+        row, over neighbours in time; ``white`` the 95 % limit of its absolute value for independent ones.
         """
-        n = len(self.times)
+        n, d = len(self.times), self.dim
         rows = []
         close = np.diff(self.times) < 2.0 * np.median(np.diff(self.times)) if n > 1 else np.zeros(0, dtype=bool)
-        parts = (("each", self.normalised, correlated_dof(self.covariance, 2)), ("joint", self.whitened, 2.0 * n))
+        parts = (("each", self.normalised, correlated_dof(self.covariance, d)), ("joint", self.whitened, float(d * n)))
         for name, y, dof in parts:
-            value = float(np.sum(y**2) / (2 * n))
+            value = float(np.sum(y**2) / (d * n))
             low, high, verdict = two_sided(value, dof, self.confidence)
             pairs = y[1:][close] * y[:-1][close]
             rows.append(
@@ -96,9 +107,9 @@ class GpsInnovations:
                     "verdict": verdict,
                     "dof": dof,
                     "fixes": n,
-                    "inside": float(np.mean(np.sum(y**2, axis=1) < stats.chi2.ppf(self.confidence, 2))),
+                    "inside": float(np.mean(np.sum(y**2, axis=1) < stats.chi2.ppf(self.confidence, d))),
                     "autocorrelation": float(np.sum(pairs) / np.sum(y[1:][close] ** 2)) if len(pairs) else np.nan,
-                    "white": float(1.96 / np.sqrt(2 * len(pairs))) if len(pairs) else np.nan,
+                    "white": float(1.96 / np.sqrt(d * len(pairs))) if len(pairs) else np.nan,
                     "confidence": self.confidence,
                 }
             )
@@ -133,10 +144,8 @@ def gps_innovations(
     Raises
     ------
     DataError
-        The graph has no datum, is in space, or no fix lies inside a submap's path.
+        The graph has no datum, or no fix lies inside a submap's path.
     """
-    if graph.dim != 2:
-        raise DataError("withheld fixes are predicted in the plane only", got=f"a graph of {graph.dim} dimensions")
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:
         raise DataError("withheld fixes cannot be predicted: the graph has no GPS datum", wanted="a graph with GPS")
@@ -144,51 +153,38 @@ def gps_innovations(
     found = node >= 0
     if not np.any(found):
         raise DataError("no withheld fix lies inside a submap's path", got=len(gps.times))
-    times, z = gps.times[found], gps.positions[found, :2] - graph.gps_origin
+    d = graph.dim
+    times, z = gps.times[found], gps.positions[found, :d] - graph.gps_origin
     node, arm = node[found], arm[found]
     n = len(times)
     bias = _biases(graph, times, bias_sigma, segment_gap)
-    own = bias < len(values.biases)
-    with_bias = np.where(own, bias, -1)
-    predicted = se2_transform(se2_compose(np.broadcast_to(values.datum, (n, 3)), values.poses[node]), arm)
-    known = with_bias >= 0
-    given = np.zeros((n, 2))
-    given[known] = values.biases[with_bias[known]]
-    predicted += given
-    _, J = gps_terms(
-        values.poses[node], values.datum, given, arm, predicted
-    )  # where the fix should be, not where it is
-    J[~known, :, 6:] = 0.0
-    R = rotation2(values.datum[2]) @ rotation2(values.poses[node, 2])  # base frame → GPS frame
-    if bias_sigma is not None or len(values.biases):
-        J[:, :, 6:8] = np.where((bias >= 0)[:, None, None], np.swapaxes(R, 1, 2), 0.0)
+    own = (bias >= 0) & (bias < len(values.biases))
+    predicted, by = antenna_terms(values.poses[node], values.datum, values.tilt, arm)
+    predicted[own] += values.biases[bias[own]]
 
-    # everything the innovations depend on: nodes, datum, biases; the first base is fixed and has no column
-    pose_columns = np.where(node[:, None] > 0, 3 * (node[:, None] - 1) + np.arange(3), -1)
-    datum_columns = np.tile(lay.start("datum") + np.arange(3), (n, 1))
-    bias_columns = np.where((own & (bias >= 0))[:, None], lay.start("bias") + 2 * bias[:, None] + np.arange(2), -1)
-    columns = np.concatenate([pose_columns, datum_columns, bias_columns], axis=1)
+    # everything the innovations depend on: nodes, datum, tilt, biases; the first base is fixed and has no column
+    base = datum_columns(graph, node)
+    columns = np.concatenate([base, lay.at("bias", np.where(own, bias, -1))], axis=1)
+    J = np.concatenate([by[:, :, : base.shape[1]], np.tile(np.eye(d), (n, 1, 1))], axis=2)
     needed, at = np.unique(columns, return_inverse=True)
     at = at.reshape(columns.shape)
     first = int(needed[0] < 0)
-    A = np.zeros((n, 2, len(needed)))
+    A = np.zeros((n, d, len(needed)))
     np.put_along_axis(A, np.broadcast_to(at[:, None], J.shape).copy(), J, axis=2)
-    jacobian = A[:, :, first:].reshape(2 * n, -1)
+    jacobian = A[:, :, first:].reshape(d * n, -1)
     S = jacobian @ graph.covariance().columns(needed[first:]) @ jacobian.T
-    fresh = bias[~own]
-    if len(fresh):
+    S = S.reshape(n, d, n, d)
+    new = (bias >= 0) & ~own
+    if np.any(new):
         assert bias_sigma is not None
-        rows = np.flatnonzero(~own)
-        same = fresh[:, None] == fresh[None]
-        cross = bias_sigma**2 * same[:, :, None, None] * (np.swapaxes(R[rows], 1, 2)[:, None] @ R[rows][None])
-        ix = (2 * rows[:, None] + np.arange(2)).ravel()
-        S[np.ix_(ix, ix)] += cross.transpose(0, 2, 1, 3).reshape(len(ix), -1)
-    S += arm_cov[np.ix_(np.repeat(found, 2), np.repeat(found, 2))]
-    noise = gps.sigma[found] if sigma is None else np.full(n, sigma)
-    S[np.arange(2 * n), np.arange(2 * n)] += np.repeat(noise**2, 2)
-
-    turned = np.einsum("kij,kjm->kim", R, S.reshape(n, 2, 2 * n)).reshape(2 * n, n, 2)
-    S = np.einsum("mkj,kij->mki", turned, R).reshape(2 * n, 2 * n)
+        same = (bias[:, None] == bias[None]) & new[:, None]
+        S += bias_sigma**2 * same[:, None, :, None] * np.eye(d)[None, :, None, :]
+    turn = by[:, :, :2] if d == 2 else by[:, :, 3:6]  # the node's axes in the GPS frame
+    arm_cov = arm_cov.reshape(len(found), d, len(found), d)[np.ix_(found, np.arange(d), found, np.arange(d))]
+    S += np.einsum("aij,ajbk,bmk->aibm", turn, arm_cov, turn, optimize=True)
+    each = gps.noise[found][:, :d, :d] if sigma is None else np.tile(sigma**2 * np.eye(d), (n, 1, 1))
+    S[np.arange(n), :, np.arange(n)] += each
+    S = S.reshape(d * n, d * n)
     return GpsInnovations(
         times=times,
         innovations=z - predicted,
@@ -199,12 +195,12 @@ def gps_innovations(
 
 
 def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
-    """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(2n, 2n)``.
+    """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
 
     Fixes of one stretch of path, from a node to the next, share what the path has lost since the node.
     """
-    n = len(gps.times)
-    node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, 2)), np.zeros((2 * n, 2 * n))
+    n, d = len(gps.times), graph.dim
+    node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, d)), np.zeros((d * n, d * n))
     for k, s in enumerate(graph.submaps):
         path = s.trajectory
         if path is None or not len(path):
@@ -218,37 +214,35 @@ def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
             if len(rows):
                 T, P = s.local(gps.times[rows], at[rows])
                 node[rows] = s.nodes[i]
-                arm[rows], _ = lever_arm(T, None, gps.lever[:2])
-                ix = (2 * rows[:, None] + np.arange(2)).ravel()
-                cov[np.ix_(ix, ix)] = _arm_covariance(T, P, gps.lever[:2])
+                arm[rows], _ = lever_arm(T, None, gps.lever[:d])
+                ix = (d * rows[:, None] + np.arange(d)).ravel()
+                cov[np.ix_(ix, ix)] = _arm_covariance(T, P, gps.lever[:d])
     return node, arm, cov
 
 
 def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
-    """Joint covariance ``(2q, 2q)`` of the antenna at several poses ``(q, 3)`` of one stretch of path.
+    """Joint covariance ``(dim q, dim q)`` of the antenna at several poses ``(q, 3|7)`` of one stretch of path.
 
     The path is told by its marginals; between them it is taken as a process whose error is carried along and grows,
     ``ξ_j = Ad(T_ij⁻¹) ξ_i + w``, as that of dead reckoning does.
     """
-    q = len(T)
+    q, group = len(T), group_of(T)
+    d, dof = group.dim, group.dof
     if P is None:
-        return np.zeros((2 * q, 2 * q))
-    G = np.zeros((q, 2, 3))
-    G[:, :, :2] = rotation2(T[:, 2])
-    G[:, :, 2] = rotation2(T[:, 2]) @ np.array([-lever[1], lever[0]])
-    joint = np.zeros((q, 3, q, 3))
+        return np.zeros((d * q, d * q))
+    G = arm_jacobian(T, lever)
+    joint = np.zeros((q, dof, q, dof))
     for j in range(q):
         joint[j, :, j] = P[j]
         if j == 0:
             continue
-        ad = se2_adjoint(se2_inverse(se2_between(T[j - 1], T[j])))
+        ad = group.adjoint(group.inverse(group.between(T[j - 1], T[j])))
         carried = ad @ joint[j - 1, :, j - 1] @ ad.T
         values, vectors = np.linalg.eigh(P[j] - carried)
         joint[j, :, j] = carried + (vectors * np.maximum(values, 0.0)) @ vectors.T  # an error never shrinks by itself
         joint[j, :, :j] = np.einsum("ij,jkl->ikl", ad, joint[j - 1, :, :j])
         joint[:j, :, j] = joint[j, :, :j].transpose(1, 2, 0)
-    out = np.einsum("aij,ajbk->aibk", G, joint)
-    return np.asarray(np.einsum("aibk,bmk->aibm", out, G).reshape(2 * q, 2 * q))
+    return np.asarray(np.einsum("aij,ajbk,bmk->aibm", G, joint, G, optimize=True).reshape(d * q, d * q))
 
 
 def _biases(graph: PoseGraph, times: Array, bias_sigma: float | None, gap: float) -> Ints:

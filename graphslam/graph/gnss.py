@@ -16,9 +16,10 @@ from graphslam.core.geometry import Array
 from graphslam.core.gnss import Pseudoranges, TangentPlane
 from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry
+from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.odometer import OdometerPriorRecord, OdometerRecord
-from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeBatch, PseudorangeRecord, SatelliteBiasRecord
-from graphslam.graph.gps import start_datum
+from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
+from graphslam.graph.gps import datum_columns, start_datum
 from graphslam.graph.graph_record import GraphRecord
 from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners
 
@@ -300,36 +301,28 @@ def antenna_positions(graph: GraphRecord, nodes: npt.ArrayLike, arm: Array) -> t
     Parameters
     ----------
     nodes : (k,) int
-    arm : (3,)
+    arm : (dim,)
         In the frames of the nodes [m].
 
     Returns
     -------
-    positions : (k, 3)
+    positions : (k, dim)
         Counted from the origin of the GPS frame.
-    covariances : (k, 3, 3)
+    covariances : (k, dim, dim)
         Of nodes, datum and tilt together.
 
     Raises
     ------
     DataError
-        The graph has no datum, or is not in space.
+        The graph has no datum.
     """
-    values, lay = graph.values, graph.flat().layout
-    if values.datum is None or graph.dim != 3:
-        raise DataError("positions in the GPS frame need a graph in space with GPS", got=f"{graph.dim} dimensions")
-    at = np.asarray(nodes, dtype=np.int64)
-    tilt = values.tilt
-    records = [PseudorangeRecord(0, int(n), 0.0, arm, np.zeros(3), 0.0, 1.0, 0, 0, tilt=tilt is not None) for n in at]
-    y, J = PseudorangeBatch(records, lay).antennas(
-        values.poses[at], np.broadcast_to(values.datum, (len(at), 4)),
-        np.broadcast_to(np.zeros(2) if tilt is None else tilt, (len(at), 2)),
-    )  # fmt: skip
-    words = ("datum",) if tilt is None else ("datum", "tilt")
-    columns = np.concatenate([lay.at("x", at), *(lay.at(w, np.zeros(len(at), int)) for w in words)], axis=1)
+    values, at = graph.values, np.asarray(nodes, dtype=np.int64)
+    if values.datum is None:
+        raise DataError("positions in the GPS frame need a datum", wanted="a graph with fixes or pseudoranges")
+    y, J = antenna_terms(values.poses[at], values.datum, values.tilt, np.broadcast_to(arm, (len(at), graph.dim)))
+    columns = datum_columns(graph, at)
     needed, place = np.unique(columns, return_inverse=True)
     place = place.reshape(columns.shape) - int(needed[0] < 0)
     S = graph.covariance().columns(needed[needed >= 0])
     J = np.where(columns[:, None] < 0, 0.0, J[:, :, : columns.shape[1]])
-    P = np.array([j @ S[np.ix_(p, p)] @ j.T for j, p in zip(J, np.maximum(place, 0))])
-    return y, P
+    return y, np.array([j @ S[np.ix_(p, p)] @ j.T for j, p in zip(J, np.maximum(place, 0))])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.config import spelled
 from graphslam.core.errors import ConfigError, DataError, GeometryError
@@ -18,7 +19,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, antenna_terms
+from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.noise import Robust, whitener
 from graphslam.graph.submap_node import SubmapNode
 
@@ -68,6 +70,8 @@ class Fix:
     sigma: float
     lever: Array
     config: GpsConfig
+    uneven: Array | None = None
+    """Covariance of its coordinates where they are not equally sure."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,20 +123,36 @@ def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array,
         ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, in space ``R [-[l]× | I]``: the derivative of
         ``T Exp(ξ) · lever``.
     """
-    group = group_of(T)
-    dim = group.dim
-    arm = group.transform(T, np.broadcast_to(lever, (len(T), dim)))
+    dim = group_of(T).dim
+    arm = group_of(T).transform(T, np.broadcast_to(lever, (len(T), dim)))
     if covariances is None:
         return arm, np.zeros((len(T), dim, dim))
-    G = np.zeros((len(T), dim, group.dof))
-    if dim == 2:
+    G = arm_jacobian(T, lever)
+    return arm, G @ covariances @ np.swapaxes(G, 1, 2)
+
+
+def arm_jacobian(T: Array, lever: Array) -> Array:
+    """Derivative ``(q, dim, dof)`` of ``T Exp(ξ) · lever``."""
+    group = group_of(T)
+    G = np.zeros((len(T), group.dim, group.dof))
+    if group.dim == 2:
         R = rotation2(T[:, 2])
         G[:, :, :2] = R
         G[:, :, 2] = R @ np.array([-lever[1], lever[0]])
     else:
         R = quat_to_matrix(T[:, 3:])
         G[:, :, :3], G[:, :, 3:] = -R @ skew(lever), R
-    return arm, G @ covariances @ np.swapaxes(G, 1, 2)
+    return G
+
+
+def datum_columns(graph: GraphRecord, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Columns ``(k, c)`` of what an antenna at nodes ``(k,)`` depends on: node, datum, tilt if there is one; -1: held.
+
+    They stand in the order of :func:`~graphslam.graph.factors.gps.antenna_terms`.
+    """
+    lay, one = graph.flat().layout, np.zeros(len(nodes), dtype=np.int64)
+    words = ("datum", "tilt") if lay.count("tilt") else ("datum",)
+    return np.concatenate([lay.at("x", nodes), *(lay.at(w, one) for w in words)], axis=1)
 
 
 def spread(points: Array) -> float:
@@ -187,8 +207,10 @@ class GpsFixes:
         for t in gps.times:
             g.ledger.check(f"GPS fix at {t:.3f} s", [stream], (float(t), float(t)))
         fixes = []
-        for t, p, s in zip(gps.times.tolist(), gps.positions, gps.sigma.tolist()):
-            fixes.append(Fix(g.next_factor(), t, p, s, gps.lever, self.config))
+        uneven = None if self.config.sigma is not None else gps.covariances
+        for k, (t, p, s) in enumerate(zip(gps.times.tolist(), gps.positions, gps.sigma.tolist())):
+            P = None if uneven is None else uneven[k]
+            fixes.append(Fix(g.next_factor(), t, p, s, gps.lever, self.config, P))
             g.ledger.spend(fixes[-1].factor_id, f"GPS fix at {t:.3f} s", [stream], (t, t))
         self.waiting = sorted([*self.waiting, *fixes], key=lambda f: f.time)
         for s in g.submaps:
@@ -221,11 +243,26 @@ class GpsFixes:
             g.note("datum", fixes=len(self.tied), T_gps_world=start.tolist())
         for t in sorted(self.tied, key=lambda t: t.fix.time):
             bias = self._bias_of(t.fix)
-            W = whitener(t.covariance, what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
+            W = whitener(self._in_its_frame(t), what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
             z = t.fix.position - g.gps_origin
-            tilt = g.structure.count("tilt") > 0
-            g.insert(GpsRecord(t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, t.fix.config.robust, bias, tilt=tilt))
+            tilt, uneven = g.structure.count("tilt") > 0, t.fix.uneven is not None
+            kernel = t.fix.config.robust
+            g.insert(
+                GpsRecord(
+                    t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, kernel, bias, tilt=tilt, uneven=uneven
+                )
+            )  # fmt: skip
         self.tied = []
+
+    def _in_its_frame(self, t: TiedFix) -> Array:
+        """Covariance of a fix with its arm: in the node's frame, or in that of an uneven fix."""
+        if t.fix.uneven is None:
+            return t.covariance
+        values = self.graph.values
+        assert values.datum is not None
+        J = antenna_terms(values.poses[[t.node]], values.datum, values.tilt, t.arm[None])[1][0]
+        turn = J[:, :2] if self.graph.dim == 2 else J[:, 3:6]  # the node's axes in the GPS frame
+        return np.asarray(t.fix.uneven + turn @ t.covariance @ turn.T)
 
     def leave(self, s: SubmapNode) -> None:
         """Take out the fixes of a submap that goes: their arms come from its trajectory."""
@@ -240,7 +277,8 @@ class GpsFixes:
     def tidy(self) -> None:
         """A datum that no fix holds any more goes, and the biases with it."""
         g = self.graph
-        if g.structure.count("datum") and not any(isinstance(r, GpsRecord) for r in g.records.values()):
+        holders = (GpsRecord, PseudorangeRecord)
+        if g.structure.count("datum") and not any(isinstance(r, holders) for r in g.records.values()):
             for fid in [k for k, r in g.records.items() if isinstance(r, BiasPriorRecord)]:
                 g.ledger.refund(fid)
                 del g.records[fid]
@@ -271,7 +309,8 @@ class GpsFixes:
                 dropped.append((f.factor_id, "outside the submap's trajectory"))
                 continue
             sigma = f.sigma if f.config.sigma is None else f.config.sigma
-            covariance = sigma**2 * np.eye(len(f.lever)) + cov[0]
+            # of a fix that is not equally sure in all directions the arm's alone, until the datum says how to turn it
+            covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
             self.tied.append(TiedFix(f, s.nodes[int(at[0])], arm[0], covariance))
         return dropped
 
@@ -284,7 +323,8 @@ class GpsFixes:
         fixes = np.array([t.fix.position for t in self.tied]) - origin
         if min(spread(world[:, :2]), spread(fixes[:, :2])) < baseline:  # only a level way says where north is
             return None
-        sigma = np.array([np.sqrt(t.covariance[0, 0]) for t in self.tied])
+        fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.tied]
+        sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.tied, fix)])
         level = start_datum(world[:, :2], fixes[:, :2], sigma)
         if group.dim == 2:
             return level

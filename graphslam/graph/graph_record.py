@@ -19,6 +19,7 @@ from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsFixes
 from graphslam.graph.imu import ImuUnits
@@ -448,6 +449,6 @@ class GraphRecord:
         if not self.structure.count("tilt"):
             self.structure.append("tilt", np.zeros(2))
             for fid, r in self.records.items():
-                if isinstance(r, GpsRecord) and self.dim == 3:
+                if isinstance(r, (GpsRecord, PseudorangeRecord)) and self.dim == 3:
                     self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed
             self.revision += 1

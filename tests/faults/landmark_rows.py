@@ -191,6 +191,7 @@ GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
     ("error that lasts 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", "chi2|consistency-test"),
     ("error that lasts 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
     ("only at the start", _gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
+    ("off by 1 km, constantly", _gps(lambda g, _: replace(g, positions=g.positions + [800.0, -600.0])), "handled", ""),
     ("no fix at all", _gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
 ]
 FIT = "calibration|residuals|sightings-not-used"

@@ -4,9 +4,11 @@ A fix at time t inside submap k sees the antenna at ``arm = T_start_body(t) · l
 so the world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first
 base stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is solved for, not assumed.
 
-The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix is equally
-uncertain in all directions, so rotating it changes nothing, and there the uncertainty of the arm (from the submap's own
-trajectory) has a constant covariance that is simply added to it.
+The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix that is
+equally uncertain in all directions may be turned as one likes, and there the uncertainty of the arm (from the submap's
+own trajectory) has a constant covariance that is simply added to it. A fix with a covariance of its own has its
+residual in the frame where that is constant, ``r = T_gps_world x_k arm + bias - z``; the arm's is turned into it as the
+map lies when the fix enters.
 
 In space the datum is ``[x, y, z, ψ]``: the GPS frame (east, north, up) and the level frame of the first base differ by
 a turn about the vertical and a shift. Where the graph knows the tilt of its first base
@@ -56,6 +58,8 @@ class GpsRecord:
         GPS segment whose bias it carries.
     tilt : bool
         The graph knows where up is, and the level datum is turned by it.
+    uneven : bool
+        Residual and whitener are in the GPS frame, since coordinates there are not equally sure.
     """
 
     factor_id: int
@@ -68,6 +72,7 @@ class GpsRecord:
     bias: int | None = None
     group: str = "gps"
     tilt: bool = False
+    uneven: bool = False
 
     @property
     def rows(self) -> int:
@@ -167,6 +172,56 @@ def gps_terms_in_space(
     return arm - q, J
 
 
+def antenna_terms(
+    poses: Array, datum: Array, tilt: Array | None, arm: Array, level: npt.NDArray[np.bool_] | None = None
+) -> tuple[Array, Array]:
+    """Antennas in the GPS frame, and their Jacobians.
+
+    Parameters
+    ----------
+    poses : (k, 3) or (k, 7)
+    datum : (3,) or (4,)
+    tilt : (2,) or None
+        Not in the plane.
+    arm : (k, dim)
+        In the frames of the poses.
+    level : (k,) bool, optional
+        Rows that take the z axis of the first base for up, whatever the tilt.
+
+    Returns
+    -------
+    positions : (k, dim)
+    J : (k, dim, 6) or (k, dim, 12)
+        On (pose 3, datum 3), or on (pose 6, datum 4, tilt 2).
+    """
+    k = len(poses)
+    if poses.shape[1] == 3:
+        Rx, RD = rotation2(poses[:, 2]), rotation2(datum[2])
+        lever = np.einsum("kij,kj->ki", Rx, arm)
+        a = poses[:, :2] + lever
+        J = np.zeros((k, 2, 6))
+        J[:, :, :2], J[:, :, 3:5] = RD @ Rx, RD
+        J[:, :, 2] = np.stack([-lever[:, 1], lever[:, 0]], -1) @ RD.T
+        J[:, :, 5] = np.stack([-a[:, 1], a[:, 0]], -1) @ RD.T
+        return a @ RD.T + datum[:2], J
+    R = quat_to_matrix(poses[:, 3:])
+    a = (R @ arm[..., None])[..., 0] + poses[:, :3]
+    known = np.full(k, tilt is not None) if level is None or tilt is None else ~level
+    E, J_r = up_turn(np.zeros(2) if tilt is None else tilt)
+    Et = np.where(known[:, None, None], E.T, np.eye(3))
+    w = (Et @ a[..., None])[..., 0]  # in the level frame at the first base
+    c, s = np.cos(datum[3]), np.sin(datum[3])
+    Rz = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    v = w @ Rz.T
+    J = np.zeros((k, 3, 12))
+    J[:, :, :3], J[:, :, 3:6] = -Rz @ Et @ R @ skew(arm), Rz @ Et @ R
+    J[:, :, 6:9] = np.eye(3)
+    J[:, 0, 9], J[:, 1, 9] = -v[:, 1], v[:, 0]
+    # (Exp(τ) Exp(J_r δ))ᵀ a = w - (J_r δ) × w
+    J[:, :, 10:] = np.where(known[:, None, None], Rz @ skew(w) @ J_r, 0.0)
+    return v + datum[:3], J
+
+
 def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
     """``T_gps_world`` ``(7,)`` of a datum ``[x, y, z, heading]`` and of the tilt of the first base."""
     pose = upright(datum[:3], datum[3])
@@ -191,6 +246,7 @@ class GpsBatch(UniformBatch):
         super().__init__(records, layout)
         self._arm = np.array([r.arm for r in records]).reshape(-1, layout.dim)
         self._z = np.array([r.z for r in records]).reshape(-1, layout.dim)
+        self._uneven = np.array([r.uneven for r in records], dtype=np.bool_)
 
     @staticmethod
     def keys(record: GpsRecord) -> Sequence[int | None]:
@@ -199,7 +255,21 @@ class GpsBatch(UniformBatch):
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""
-        x, datum, bias, tilt = blocks
+        r, J = self._in_node_frame(*blocks)
+        some = np.flatnonzero(self._uneven)
+        if len(some):
+            x, datum, bias, tilt = blocks
+            known, d = self._rows[some, 3] >= 0, self.dim
+            up = tilt[some[np.argmax(known)]] if d == 3 else None
+            y, by = antenna_terms(x[some], datum[0], up, self._arm[some], ~known)
+            r[some] = y + bias[some] - self._z[some]
+            split = 6 if d == 2 else 10
+            I = np.where((self._rows[some, 2] >= 0)[:, None, None], np.eye(d), 0.0)
+            J[some] = np.concatenate([by[:, :, :split], I, by[:, :, split:]], axis=2)
+        return r, J
+
+    def _in_node_frame(self, x: Array, datum: Array, bias: Array, tilt: Array) -> tuple[Array, Array]:
+        """Residuals and Jacobians as if all were equally uncertain in all directions."""
         if self.dim == 2:
             r, J = gps_terms(x, datum[0], bias, self._arm, self._z)
             J[self._rows[:, 2] < 0, :, 6:] = 0.0
@@ -216,6 +286,8 @@ class GpsBatch(UniformBatch):
     @classmethod
     def gtsam(cls, record: GpsRecord, origin: Array) -> gtsam.NonlinearFactor:
         """A custom factor in scalars: every fix hangs on the datum, so that this runs more often than anything else."""
+        if record.uneven:
+            return super().gtsam(record, origin)
         names = record.variables()
         free = [n for n in names if n != "x0"]
         terms = _in_the_plane(free, record, origin) if record.rows == 2 else _in_space(names, record, origin)

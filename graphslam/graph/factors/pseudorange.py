@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.se3 import skew
-from graphslam.graph.factors.attitude import up_turn
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.factors.range import TOUCHING, antennas
+from graphslam.graph.factors.gps import antenna_terms
+from graphslam.graph.factors.range import TOUCHING
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.variables import VariableKind, register_variable
 
@@ -123,7 +122,8 @@ class PseudorangeBatch(UniformBatch):
         J = np.zeros((k, 1, 6 + 4 + 2 + 1 + 1 + 2))
         if not k:
             return np.zeros((0, 1)), J
-        y, by = self.antennas(x, datum, tilt)
+        known = self._rows[:, 5] >= 0
+        y, by = antenna_terms(x, datum[0], tilt[np.argmax(known)], self._arm, ~known)
         d = y - self._satellite
         length = np.linalg.norm(d, axis=1)
         n = (d / np.maximum(length, TOUCHING)[:, None])[:, None]
@@ -132,30 +132,6 @@ class PseudorangeBatch(UniformBatch):
         J[:, :, 10] = 1.0
         J[:, 0, 12:14] = self._rows[:, 3:5] >= 0
         return (length + clock[:, 0] + bias[:, 0] + system[:, 0] - self._z)[:, None], J
-
-    def antennas(self, x: Array, datum: Array, tilt: Array) -> tuple[Array, Array]:
-        """Antennas ``(k, 3)`` in the GPS frame, and their Jacobians ``(k, 3, 12)`` on (pose 6, datum 4, tilt 2).
-
-        Parameters
-        ----------
-        x : (k, 7)
-        datum : (k, 4)
-        tilt : (k, 2)
-            One for all; not looked at where a record knows of none.
-        """
-        known = (self._rows[:, 5] >= 0)[:, None, None]
-        E, J_r = up_turn(tilt[np.argmax(known)])
-        a, J_a = antennas(x, self._arm)
-        Et = np.where(known, E.T, np.eye(3))
-        w = (Et @ a[..., None])[..., 0]  # in the level frame at the first base
-        c, s = np.cos(datum[0, 3]), np.sin(datum[0, 3])
-        Rz = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        v = w @ Rz.T
-        J = np.zeros((len(x), 3, 12))
-        J[:, :, :6], J[:, :, 6:9] = Rz @ Et @ J_a, np.eye(3)
-        J[:, 0, 9], J[:, 1, 9] = -v[:, 1], v[:, 0]
-        J[:, :, 10:] = np.where(known, Rz @ skew(w) @ J_r, 0.0)  # (Exp(τ) Exp(J_r δ))ᵀ a = w - (J_r δ) × w
-        return v + datum[:, :3], J
 
 
 @dataclass(frozen=True, slots=True, eq=False)

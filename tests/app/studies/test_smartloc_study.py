@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.app.studies import smartloc
 from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.smartloc import CAUCHY, STUDY, Score, chosen, halves, scored, settings_of, solve_street
+from graphslam.app.studies.smartloc import CAUCHY, STUDY, Score, chosen, scored, settings_of, windows
+from graphslam.app.studies.study import open_study
 from graphslam.core.errors import GraphSlamError
 from graphslam.io.catalog import load
 from graphslam.sim.satellites import SatelliteConfig, simulate_satellites
@@ -30,42 +31,34 @@ def test_the_quick_one_runs_by_its_command(tmp_path: Path):
         app, ["study", "smartloc", "--quick", "--trials", "1", "--out", str(tmp_path / "s"), "--json"]
     )
     assert out.exit_code == 0, out.output
-    json.loads(out.stdout)
-    table = smartloc_table(tmp_path / "s")
+    said = json.loads(out.stdout)
+    assert "gauss-markov" in str(said)
+    table = open_study(tmp_path / "s").table
     naive, honest = (table[table["algorithm"] == a].set_index("quantity")["value"] for a in ("naive", "gauss-markov"))
     assert honest["nees"] < 0.2 * naive["nees"]
     assert honest["bias_sigma"] in (2.5, 5.0)
     assert {"rmse", "nees", "sigma", "rmse_chosen", "nees_chosen"} <= set(naive.index)
 
 
-def smartloc_table(folder: Path):
-    from graphslam.app.studies.study import open_study
-
-    return open_study(folder).table
-
-
-def test_the_halves_share_no_record():
+def test_parts_share_no_record():
     log = simulate_satellites(1, SatelliteConfig(seconds=40.0))
-    a, b = halves(log)
+    parts = windows(log, 4)
     for name in ("odometry", "pseudoranges", "reference"):
-        both = np.concatenate([a[name].times, b[name].times])
-        np.testing.assert_array_equal(both, log[name].times)
-        assert len(a[name].times) == 20
+        np.testing.assert_array_equal(np.concatenate([p[name].times for p in parts]), log[name].times)
+        assert [len(p[name].times) for p in parts] == [10, 10, 10, 10]
 
 
 def test_least_error_among_the_honest_is_chosen(monkeypatch):
     """And where none is honest, the one nearest to it."""
     scores = {1.0: Score(2.0, 30.0, 0.3, (0, 0)), 2.0: Score(6.0, 1.3, 5.0, (0, 0)), 3.0: Score(5.0, 0.8, 6.0, (0, 0))}
-    monkeypatch.setattr(smartloc, "solve_street", lambda log, config: config)
-    monkeypatch.setattr(smartloc, "scored", lambda log, config, every: scores[config.sigma_scale])
-    log = simulate_satellites(1, SatelliteConfig(seconds=10.0))
-    assert chosen(log, {"sigma_scale": (1.0, 2.0, 3.0)}, 1) == ({"sigma_scale": 3.0}, scores[3.0])
+    monkeypatch.setattr(smartloc, "scored", lambda logs, settings, every: scores[settings["sigma_scale"]])
+    assert chosen([], {"sigma_scale": (1.0, 2.0, 3.0)}, 1) == ({"sigma_scale": 3.0}, scores[3.0])
     scores[3.0] = replace(scores[3.0], nees=0.1)
     scores[2.0] = replace(scores[2.0], nees=2.0)
-    assert chosen(log, {"sigma_scale": (1.0, 2.0, 3.0)}, 1)[0] == {"sigma_scale": 2.0}
+    assert chosen([], {"sigma_scale": (1.0, 2.0, 3.0)}, 1)[0] == {"sigma_scale": 2.0}
     monkeypatch.setattr(smartloc, "scored", lambda *_: (_ for _ in ()).throw(GraphSlamError("none")))
     with pytest.raises(GraphSlamError, match="no settings"):
-        chosen(log, {"sigma_scale": (1.0,)}, 1)
+        chosen([], {"sigma_scale": (1.0,)}, 1)
 
 
 def test_settings_are_all_combinations():
@@ -76,9 +69,9 @@ def test_settings_are_all_combinations():
 def test_some_of_the_recorded_street(data_dir):
     """Forty seconds of it: with biases the error is less, and the covariance says how large it is."""
     log = load("smartloc-gnss").slice(150.0, 190.0)
-    naive = scored(log, solve_street(log, smartloc.config_of({})), 10)
+    naive = scored([log], {}, 10)
     settings = {CAUCHY: 1.0, "density_scale": 10.0, "bias_sigma": 5.0, "bias_time": 15.0, "bias_every": 1.0}
-    honest = scored(log, solve_street(log, smartloc.config_of(settings)), 10)
+    honest = scored([log], settings, 10)
     assert naive.nees > 100.0
     assert honest.nees < 4.0
     assert honest.rmse < min(naive.rmse, 12.0)

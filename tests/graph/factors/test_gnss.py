@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from graphslam.app.studies.smartloc import scored, solve_street
+from graphslam.app.studies.smartloc import errors, score_of, solve_street
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.gnss import SPEED_OF_LIGHT, TangentPlane
 from graphslam.core.poses import SE3
@@ -118,7 +118,7 @@ def test_positions_are_honest_where_the_noise_is_as_stated():
 def test_what_is_stated_matters():
     """The stated σ alone, for signals that come round corners: far off, and sure of it."""
     log = simulate_satellites(3, SatelliteConfig(seconds=60.0, step=2.0))
-    naive, honest = (scored(log, solve_street(log, c), 1) for c in (PseudorangeConfig(), TRUE))
+    naive, honest = (score_of([errors(log, solve_street(log, c), 1)]) for c in (PseudorangeConfig(), TRUE))
     assert naive.nees > 50.0 > 5.0 > honest.nees
     assert honest.rmse < naive.rmse
 
@@ -127,7 +127,7 @@ def test_the_turn_of_the_earth_is_not_left_out():
     """Satellites as they stand in the file put the car twenty metres to the east."""
     config = SatelliteConfig(seconds=30.0, step=2.0, sigma=0.5, bias_sigma=0.5, density=(50.0, 52.0))
     log = simulate_satellites(5, config)
-    here = scored(log, solve_street(log, PseudorangeConfig()), 1)
+    here = score_of([errors(log, solve_street(log, PseudorangeConfig()), 1)])
     assert here.rmse < 3.0
 
     class Still(TangentPlane):
@@ -140,7 +140,7 @@ def test_the_turn_of_the_earth_is_not_left_out():
         graph.add_attitude(n, DOWN, 0.02, evidence="prior")
     add_pseudoranges(graph, log["pseudoranges"], Still(*log.meta["plane"]), nodes)
     BatchSolver(graph).update()
-    assert scored(log, graph, 1).mean[0] > 10.0
+    assert score_of([errors(log, graph, 1)]).mean[0] > 10.0
 
 
 def test_a_receiver_alone_on_its_antenna():
