@@ -57,6 +57,8 @@ class RelaxConfig:
         Most products of one linear system.
     limit : float
         Memory that the written-out network may take [bytes].
+    halve : bool
+        Halve a step that raises the objective; if not, it is taken as it is.
     split : bool
         Look for wrong unions and split them.
     soft : int
@@ -75,6 +77,7 @@ class RelaxConfig:
     rebuild: int = 10
     inner: int = 400
     limit: float = 4e9
+    halve: bool = True
     split: bool = True
     soft: int = 3
     threads: int = 1
@@ -130,6 +133,8 @@ class Relaxed:
         Landmark of each measurement: other than the problem's where unions were split.
     objective, chi2 : float
         Sum of squared normalised residuals; per degree of freedom.
+    gradient : float
+        Length of half the gradient.
     converged : {"poses", "objective", ""}
     history : list of Iteration
     soft : list of SoftMode
@@ -148,6 +153,7 @@ class Relaxed:
     landmark: npt.NDArray[np.int32]
     objective: float
     chi2: float
+    gradient: float
     converged: str
     history: list[Iteration]
     soft: list[SoftMode] = field(default_factory=list)
@@ -248,6 +254,7 @@ def relax(
             landmark=descent.problem.landmark,
             objective=network.objective,
             chi2=network.objective / max(1, descent.problem.freedom),
+            gradient=float(np.linalg.norm(network.gradient)),
             converged=descent.converged,
             history=descent.history,
             soft=soft,
@@ -368,7 +375,7 @@ class _Descent:
             there = self._network(moved(before.poses, step, scale))
             gained = before.objective - there.objective
             # what rounding makes of the sum of all residuals counts as nothing
-            if gained >= -1e-12 * before.objective * np.sqrt(self.problem.measurements):
+            if not c.halve or gained >= -1e-12 * before.objective * np.sqrt(self.problem.measurements):
                 break
             scale *= 0.5
             if scale < 1e-4:

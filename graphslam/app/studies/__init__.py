@@ -10,5 +10,6 @@ STUDIES: dict[str, str] = {
     "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
     "refinement": "graphslam.app.studies.refinement:STUDY",
+    "scale": "graphslam.app.studies.scale:STUDY",
     "smartloc": "graphslam.app.studies.smartloc:STUDY",
 }

@@ -1,0 +1,325 @@
+"""Skeleton networks of growing size, from dead reckoning to the optimum, in CPU seconds and peak memory; beside GTSAM.
+
+    python -m tests.benchmarks.bench_scale [--quick] [--poses 10000,100000,1000000] [--threads 1] [--gtsam 10000]
+
+The laps world (``graphslam/sim/laps.py``): twelve laps of one route, 100 measurements a pose, so 10⁴, 10⁵ and 10⁶ poses
+have 10⁶, 10⁷ and 10⁸ measurements. Each size is a process of its own that first runs a small world, so that nothing is
+compiled while the clock runs. Printed of each: time by stage; when χ²/dof was within 1 % of its end value, and when a
+step gained less than one unit of χ²; the largest move of the last step; distances to the truth; how far the softest
+modes still move (approximate); costs per measurement, and their growth from size to size (the exponent).
+
+``--gtsam N`` solves the same network of N poses with GTSAM's Gauss-Newton, by MULTIFRONTAL_CHOLESKY and
+MULTIFRONTAL_SOLVER, each ordered by COLAMD and METIS, from dead reckoning with the landmarks at their best places, and
+from our forward pass. Each is a process with a limit on time and memory (``--seconds``, ``--gigabytes``), and ends when
+an iteration gains less than 10⁻⁵ of the objective. Its factors measure bearing and range instead of a point, so
+objectives are compared as ours, at its poses.
+
+``--quick``: 1,200 and 4,800 poses, GTSAM's Cholesky at 600 from dead reckoning. Exit code 1 if we end above the
+optimum: if χ²/dof is above that of the truth, or the objective above GTSAM's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+SOLVERS = ("MULTIFRONTAL_CHOLESKY", "MULTIFRONTAL_SOLVER")
+ORDERINGS = ("COLAMD", "METIS")
+
+
+def peak() -> float:
+    """Largest memory of this process so far [GB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))))
+
+
+def ours(poses: int, threads: int) -> dict[str, Any]:
+    """Draw, collapse, relax, then the unit costs."""
+    from graphslam.sim.laps import LapsConfig, draw_laps
+    from graphslam.skeleton.collapse import Collapse
+    from graphslam.skeleton.preconditioner import Levels, Preconditioner
+    from graphslam.skeleton.relax import RelaxConfig, relax
+    from graphslam.skeleton.schur import Layout, Network, Workers
+
+    config = RelaxConfig(threads=threads)
+    for levels in (Levels(0, 20), Levels(10, 80)):
+        relax(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels, threads=threads))
+    world = draw_laps(LapsConfig(poses=poses))
+    collapse = Collapse(int(world.first[-1]))
+    seconds = 0.0
+    for a, b in world.correspondences():  # drawing them is not the collapse
+        begin = time.process_time()
+        collapse.add(a, b)
+        seconds += time.process_time() - begin
+    begin = time.process_time()
+    landmark, count = collapse.landmarks()
+    seconds += time.process_time() - begin
+    problem = world.problem(landmark)
+    wall = time.perf_counter()
+    found = relax(problem, config)
+    wall = time.perf_counter() - wall
+    total = sum(found.seconds.values())
+    history = [(h.seconds, h.objective, h.chi2, h.products, h.predicted, h.largest_move) for h in found.history]
+    end = found.chi2
+    within = next(h[0] for h in history if h[2] <= 1.01 * end)
+    settled = next((h[0] for h in history if h[4] < 1.0), None)
+    reckoned, truth = problem.dead_reckoning(), world.truth
+    top = peak()
+
+    workers = Workers(threads)
+    layout = Layout(problem, workers)
+    costs = {"collapse": seconds}
+    begin = time.process_time()
+    network = Network(layout, found.poses)
+    costs["linearise"] = time.process_time() - begin
+    network.chain_blocks()
+    v = network.gradient + 1.0
+    begin = time.process_time()
+    for _ in range(3):
+        network.product(v)
+    costs["product"] = (time.process_time() - begin) / 3
+    begin = time.process_time()
+    M = Preconditioner(network, Levels(10, 80))
+    costs["preconditioner"] = time.process_time() - begin
+    begin = time.process_time()
+    M(v)
+    costs["apply"] = time.process_time() - begin
+    at_truth = Network(layout, truth).objective
+    workers.close()
+    return {
+        "poses": poses,
+        "measurements": problem.measurements,
+        "landmarks": count,
+        "seconds": total,
+        "wall": wall,
+        "stages": found.seconds,
+        "within": within,
+        "settled": settled,
+        "history": history,
+        "converged": found.converged,
+        "objective": found.objective,
+        "chi2": end,
+        "chi2_truth": at_truth / problem.freedom,
+        "largest_move": found.largest_move,
+        "predicted": found.predicted,
+        "reckoned": rms(reckoned.position, truth.position),
+        "rms": rms(found.poses.position, truth.position),
+        "soft": [(m.rms, m.largest, m.pose) for m in found.soft],
+        "costs": {k: v / problem.measurements * 1e9 for k, v in costs.items()},
+        "peak": top,
+        "peak_all": peak(),
+        "products": found.products,
+    }
+
+
+def theirs(poses: int, solver: str, ordering: str, start: str, gigabytes: float) -> dict[str, Any]:
+    """The same network with GTSAM's factors and its Gauss-Newton."""
+    import gtsam
+
+    from graphslam.core.se3 import matrix_to_quat
+    from graphslam.sim.laps import LapsConfig, draw_laps
+    from graphslam.skeleton.landmark_kernels import Poses
+    from graphslam.skeleton.schur import Layout, Network, Workers
+    from graphslam.skeleton.start import chain_start, forward_pass
+
+    problem = (world := draw_laps(LapsConfig(poses=poses))).problem()
+    at = problem.dead_reckoning() if start == "odometry" else forward_pass(problem, chain_start(problem)).poses
+    layout = Layout(problem, Workers(1))
+    landmarks = Network(layout, at).landmarks
+    limit = int(gigabytes * 1e9)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+    begin = time.process_time()
+    N, L = problem.poses, problem.landmarks
+    noise = gtsam.noiseModel
+    z = problem.points.astype(np.float64)
+    sight = noise.Diagonal.Sigmas(np.array([problem.bearing_sigma] * 2 + [problem.range_sigma]))
+    graph = gtsam.NonlinearFactorGraph()
+    ranges = np.linalg.norm(z, axis=1)
+    for i in range(N):
+        for m in range(problem.first[i], problem.first[i + 1]):
+            key = N + int(problem.landmark[m])
+            graph.add(gtsam.BearingRangeFactor3D(i, key, gtsam.Unit3(z[m]), float(ranges[m]), sight))
+    step = noise.Gaussian.Covariance(problem.odometry_covariance[0])
+    turns = matrix_to_quat(problem.odometry_rotation)
+    for k in range(N - 1):
+        x, y, q, w = turns[k]
+        turn = gtsam.Rot3.Quaternion(w, x, y, q)
+        graph.add(gtsam.BetweenFactorPose3(k, k + 1, gtsam.Pose3(turn, problem.odometry_translation[k]), step))
+    assert problem.up is not None
+    tilt = noise.Isotropic.Sigma(2, float(problem.up_sigma))
+    for i in range(N):
+        up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+        graph.add(gtsam.AttitudeFactorPose3(i, up, tilt, gtsam.Unit3(problem.up[i])))
+    fix = noise.Gaussian.Covariance(problem.gps_covariance[0])
+    for g in range(problem.fixes):
+        graph.add(gtsam.GPSFactor(int(problem.gps_pose[g]), problem.gps_position[g], fix))
+    first = gtsam.Pose3(gtsam.Rot3(problem.start_rotation), problem.start_position)
+    graph.add(gtsam.PriorFactorPose3(0, first, noise.Gaussian.Covariance(problem.start_covariance)))
+    values = gtsam.Values()
+    for i in range(N):
+        values.insert(i, gtsam.Pose3(gtsam.Rot3(at.rotation[i]), at.position[i]))
+    for j in range(L):
+        values.insert(N + j, landmarks[j])
+    built = time.process_time() - begin
+
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setLinearSolverType(solver)
+    parameters.setOrderingType(ordering)
+    parameters.setRelativeErrorTol(1e-5)
+    begin = time.process_time()
+    optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
+    last, times = optimizer.error(), []
+    for _ in range(20):
+        optimizer.iterate()
+        times.append(time.process_time() - begin)
+        now = optimizer.error()
+        if not last - now > 1e-5 * now:
+            break
+        last = now
+    seconds = time.process_time() - begin
+    result = optimizer.values()
+    R = np.array([result.atPose3(i).rotation().matrix() for i in range(N)])
+    p = np.array([result.atPose3(i).translation() for i in range(N)])
+    top = peak()
+    objective = Network(layout, Poses(R, p)).objective
+    return {
+        "solver": solver,
+        "ordering": ordering,
+        "start": start,
+        "build": built,
+        "seconds": seconds,
+        "iterations": times,
+        "objective": objective,
+        "error": 2.0 * now,
+        "rms": rms(p, world.truth.position),
+        "peak": top,
+    }
+
+
+def child(kind: str, *arguments: str, timeout: float | None = None) -> tuple[dict[str, Any] | None, str]:
+    """One run in a fresh process; None and the reason where it does not end."""
+    command = [sys.executable, "-m", "tests.benchmarks.bench_scale", "--child", kind, *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT)
+    except subprocess.TimeoutExpired:
+        return None, f"not done after {timeout:.0f} s of wall time"
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
+        return None, last[:200]
+    return json.loads(done.stdout.splitlines()[-1]), ""
+
+
+def show(r: dict[str, Any]) -> None:
+    """One size."""
+    print(
+        f"\n{r['poses']:,} poses, {r['measurements']:,} measurements, {r['landmarks']:,} landmarks\n"
+        f"  from dead reckoning ({r['reckoned']:.2f} m rms to the truth) to the end: {r['seconds']:.1f} CPU s "
+        f"({r['wall']:.1f} s wall), peak {r['peak']:.2f} GB, {len(r['history'])} steps, {r['products']} products; "
+        f"ends in {r['converged'] or 'nothing'}\n"
+        f"  χ²/dof within 1 % of its end after {r['within']:.1f} s; a step gains less than 1 after "
+        + (f"{r['settled']:.1f} s" if r["settled"] is not None else "-")
+        + f"; last step: predicted {r['predicted']:.1e}, largest move {r['largest_move']:.1e} m\n"
+        f"  χ²/dof {r['chi2']:.6f} (at the truth {r['chi2_truth']:.6f}); {r['rms']:.3f} m rms to the truth"
+    )
+    if r["soft"]:
+        modes = ", ".join(f"{a:.3f} m rms and at most {b:.3f} m (pose {i})" for a, b, i in r["soft"])
+        print(f"  softest modes, for one unit of χ² (approximate, lower bounds): {modes}")
+    print("  stages [s]: " + ", ".join(f"{k} {v:.2f}" for k, v in r["stages"].items()))
+    print("  step: CPU s, objective, χ²/dof, products, predicted gain, largest move")
+    for k, (t, J, chi2, n, gain, far) in enumerate(r["history"], 1):
+        print(f"  {k:3d}: {t:8.2f}  {J:.6e}  {chi2:.6f}  {n:3d}  {gain:.2e}  {far:.2e} m")
+    print("  ns per measurement: " + ", ".join(f"{k} {v:.1f}" for k, v in r["costs"].items()), flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--poses", default="10000,100000,1000000")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--gtsam", type=int, default=0, help="poses of the network that GTSAM solves as well")
+    parser.add_argument("--starts", default="odometry,forward", help="from where GTSAM starts")
+    parser.add_argument("--seconds", type=float, default=1800.0, help="wall time for one run of GTSAM")
+    parser.add_argument("--gigabytes", type=float, default=10.0, help="address space for one run of GTSAM")
+    parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.child:
+        kind, n, *rest = args.child
+        made = (
+            ours(int(n), int(rest[0])) if kind == "ours" else theirs(int(n), rest[0], rest[1], rest[2], float(rest[3]))
+        )
+        print(json.dumps(made))
+        return 0
+    sizes = [1200, 4800] if args.quick else [int(n) for n in args.poses.split(",") if n]
+    beside = 600 if args.quick else args.gtsam
+    starts, solvers = (args.starts.split(","), SOLVERS) if not args.quick else (["odometry"], SOLVERS[:1])
+    failed, runs = 0, {}
+    for n in sizes:
+        r, why = child("ours", str(n), str(args.threads))
+        if r is None:
+            print(f"{n} poses: failed: {why}")
+            failed += 1
+            continue
+        runs[n] = r
+        show(r)
+        failed += r["chi2"] > r["chi2_truth"]
+    done = sorted(runs)
+    for a, b in pairwise(done):
+        larger = np.log(runs[b]["measurements"] / runs[a]["measurements"])
+        costs = runs[a]["costs"], runs[b]["costs"]
+        slopes = {k: 1.0 + np.log(costs[1][k] / costs[0][k]) / larger for k in costs[0]}
+        print(
+            f"\ngrowth from {a:,} to {b:,} poses (1 = linear): " + ", ".join(f"{k} {v:.2f}" for k, v in slopes.items())
+        )
+    if beside:
+        mine = runs.get(beside)
+        if mine is None:
+            mine, why = child("ours", str(beside), "1")
+            assert mine is not None, why
+        print(
+            f"\nGTSAM, {beside:,} poses (ours: {mine['seconds']:.2f} CPU s, {mine['peak']:.2f} GB, objective "
+            f"{mine['objective']:.3f})"
+        )
+        best: float | None = None
+        for start in starts:
+            for solver in solvers:
+                for ordering in ORDERINGS:
+                    g, why = child(
+                        "theirs", str(beside), solver, ordering, start, str(args.gigabytes), timeout=args.seconds
+                    )
+                    name = f"  {solver} {ordering:6} from {start}"
+                    if g is None:
+                        print(f"{name}: {why}", flush=True)
+                        continue
+                    if start == "odometry":
+                        best = g["seconds"] if best is None else min(best, g["seconds"])
+                    failed += mine["objective"] > g["objective"] * (1 + 1e-9)
+                    print(
+                        f"{name}: build {g['build']:.1f} s, {g['seconds']:.1f} s in {len(g['iterations'])} iterations "
+                        f"({', '.join(f'{t:.1f}' for t in g['iterations'])}), peak {g['peak']:.2f} GB, our objective "
+                        f"at its poses {g['objective']:.3f}, {g['rms']:.3f} m to the truth; "
+                        f"{g['seconds'] / mine['seconds']:.1f} × ours",
+                        flush=True,
+                    )
+        if best is not None:
+            print(f"  best of GTSAM from dead reckoning: {best:.1f} s, {best / mine['seconds']:.1f} × ours")
+    print("ok" if not failed else f"{failed} failed")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+    sys.exit(main())
