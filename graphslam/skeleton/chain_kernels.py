@@ -323,20 +323,22 @@ def multiply_blocks(blocks, v, begin, end, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def forward_pass(sightings, chain_poses, rules, start_seen, D, b, out):
+def forward_pass(sightings, chain_poses, span, rules, start_seen, D, b, out):
     """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
 
     Parameters
     ----------
     chain_poses : Poses
         Their increments are followed.
+    span : (begin, end)
+        Poses; those before are done.
     rules : (ago, turn, way, gate)
         A landmark is old when it was first seen more than ``ago`` poses earlier; prior information of a pose against
         its prediction [1/rad², 1/m²]; chi-square (3) up to which a sighting is believed.
     start_seen : (L,) int32
-        -1; the pose that saw each landmark first: out.
+        The pose that saw each landmark first, at the beginning -1; changed.
     D, b : (L, 6), (L, 3)
-        Zero; sums of weights and of weighted places: out.
+        Sums of weights and of weighted places, at the beginning zero; changed.
     out : Poses
         The first pose is that of the chain.
 
@@ -347,7 +349,6 @@ def forward_pass(sightings, chain_poses, rules, start_seen, D, b, out):
     """
     ago, turn, way, gate = rules
     rotation, position = chain_poses.rotation, chain_poses.position
-    N = len(position)
     A = np.empty((6, 6))
     x = np.empty(6)
     w = np.empty(3)
@@ -356,14 +357,14 @@ def forward_pass(sightings, chain_poses, rules, start_seen, D, b, out):
     Rp = np.empty((3, 3))
     pp = np.empty(3)
     most = 0
-    for i in range(N):
+    for i in range(span[0], span[1]):
         most = max(most, sightings.first[i + 1] - sightings.first[i])
     seen = np.empty((most, 8))
     misfit = np.empty(most)
     which = np.empty(most, np.int64)
     believed = np.ones(most, np.bool_)
     tied = refused = 0
-    for i in range(N):
+    for i in range(span[0], span[1]):
         R, p = out.rotation[i], out.position[i]
         if i == 0:
             R[:] = rotation[0]
@@ -379,7 +380,7 @@ def forward_pass(sightings, chain_poses, rules, start_seen, D, b, out):
                 for k in range(3):
                     R[r, k] = T[r, 0] * c[0, k] + T[r, 1] * c[1, k] + T[r, 2] * c[2, k]
                     p[r] += T[r, k] * (position[i, k] - position[i - 1, k])
-        lo, hi = sightings.first[i], sightings.first[i + 1]
+        lo, hi = sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base
         believed[: hi - lo] = True
         n = 0
         for m in range(lo, hi):

@@ -31,6 +31,38 @@ class Table(NamedTuple):
     """(1,): blocks so far."""
 
 
+class Waiting(NamedTuple):
+    """Landmarks that have not been seen for the last time; made by :func:`make_waiting`."""
+
+    slot: npt.NDArray[np.int32]
+    """(L,): zero between two intervals."""
+    head: npt.NDArray[np.int32]
+    """(L,): latest entry of each, -1."""
+    frame: npt.NDArray[np.int32]
+    """(room,): keyframe of each entry …"""
+    after: npt.NDArray[np.int32]
+    """(room,): … the one before it, or the next free one …"""
+    kept: Array
+    """(room, 6): … and its Σ h W."""
+    ends: npt.NDArray[np.int64]
+    """(2,): entries that were ever used; first free one, -1."""
+
+
+@nb.njit(cache=True, nogil=True)
+def make_waiting(landmarks):
+    """Nothing waits."""
+    ends = np.zeros(2, np.int64)
+    ends[1] = -1
+    return Waiting(
+        np.zeros(landmarks, np.int32),
+        np.full(landmarks, -1, np.int32),
+        np.empty(16, np.int32),
+        np.empty(16, np.int32),
+        np.empty((16, 6)),
+        ends,
+    )
+
+
 @nb.njit(cache=True, nogil=True)
 def make_table(capacity):
     """An empty table for ``capacity`` blocks."""
@@ -108,7 +140,7 @@ def _sum_interval(sightings, poses, interval, slot, ids, sums):
         h0 = 1.0 - h1
         h00, h01, h11 = h0 * h0, h0 * h1, h1 * h1
         R = _nine(poses.rotation, i)
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -279,8 +311,10 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def keyframe_network(sightings, poses, landmarks, k, count, table):
-    """Add all blocks of ``Pᵀ S P`` that come from measurements to ``table``; returns it, as it may have grown.
+def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table):
+    """Add the blocks of ``Pᵀ S P`` that come from measurements to ``table``, interval after interval.
+
+    Returns what waits and the table, as both may have grown.
 
     A landmark waits with its sums over each keyframe until it has been seen for the last time; then the pairs of its
     keyframes are made, and its room is free.
@@ -288,25 +322,24 @@ def keyframe_network(sightings, poses, landmarks, k, count, table):
     Parameters
     ----------
     landmarks : (l (L, 3), D⁻¹ (L, 6))
+    span : (begin, end)
+        Intervals between keyframes; all of them one after the other.
     count : (L,) int32
-        Sightings of each landmark; zero when done.
+        Sightings of each landmark that are still to come; changed.
     """
     l, Di = landmarks
     N = len(poses.position)
     K = (N - 2) // k + 2
-    most = _most(sightings.first, k, N, 0, K - 1)
-    slot = np.zeros(len(l), np.int32)
+    most = _most(sightings.first, k, N, span[0], span[1])
+    slot, head, frame, after, kept, ends = waiting
     ids, sums = np.empty(most, np.int32), np.empty((most, 31))
-    head = np.full(len(l), -1, np.int32)
-    room = 4 * most + 16
-    frame, after, kept = np.empty(room, np.int32), np.empty(room, np.int32), np.empty((room, 6))
-    used, free = 0, -1
+    room, used, free = len(frame), ends[0], ends[1]
     longest = 64
     X, Y, G = np.empty((longest, 3, 6)), np.empty((longest, 3, 6)), np.empty((longest, 3))
     chain = np.empty(longest, np.int32)
     B00, B01, B11 = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     T = np.empty((3, 6))
-    for c in range(K - 1):
+    for c in range(span[0], span[1]):
         n = _sum_interval(sightings, poses, _interval(c, k, N), slot, ids, sums)
         if used + 2 * n > room:  # everything may be new
             room = 2 * (used + 2 * n)
@@ -387,7 +420,8 @@ def keyframe_network(sightings, poses, landmarks, k, count, table):
         table.block[_find(table, np.int64(c) * K + c)] += B00
         table.block[_find(table, np.int64(c) * K + c + 1)] += B01
         table.block[_find(table, np.int64(c + 1) * K + c + 1)] += B11
-    return table
+    ends[0], ends[1] = used, free
+    return Waiting(slot, head, frame, after, kept, ends), table
 
 
 @nb.njit(cache=True, nogil=True)

@@ -34,6 +34,8 @@ class Sightings(NamedTuple):
     """1 / σ_range² [1/m²]."""
     across: float
     """1 / σ_bearing² [1/rad²]."""
+    base: int
+    """Measurements before the first row of ``points`` and ``landmark``: not zero where only a tile is in memory."""
 
 
 class Poses(NamedTuple):
@@ -78,7 +80,7 @@ def sum_landmarks(sightings, poses, begin, end, D, b):
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -120,7 +122,7 @@ def gradient(sightings, poses, l, begin, end, g, objective):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         J = wx = wy = wz = ux = uy = uz = 0.0
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -147,7 +149,7 @@ def landmark_chi2(sightings, poses, l, begin, end, out, count):
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -175,7 +177,7 @@ def diagonal(sightings, poses, landmarks, begin, end, blocks):
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -219,7 +221,7 @@ def gather(sightings, poses, l, v, begin, end, t):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
@@ -259,7 +261,7 @@ def scatter(sightings, poses, landmarks, v, begin, end, out):
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         yx = yy = yz = zx = zy = zz = 0.0
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
             x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
             sx, sy, sz, al, be = _seen(
                 R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across

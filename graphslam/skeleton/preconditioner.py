@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +83,10 @@ class KeyframeNetwork:
         self.k, self.frames, self.position = k, frames_of(problem.poses, k), poses.position
         count = network.layout.counts.copy()
         table = kernels.make_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
-        table = kernels.keyframe_network(
-            problem.sightings, poses, (network.landmarks, network.inverse), k, count, table
-        )
+        landmarks, waiting = (network.landmarks, network.inverse), kernels.make_waiting(problem.landmarks)
+        for a, b in _interval_chunks(network, k, 0, self.frames - 1):
+            sight = problem.sightings_of(*_poses_of(problem.poses, k, a, b))
+            waiting, table = kernels.keyframe_network(sight, poses, landmarks, k, (a, b), count, waiting, table)
         keys = kernels.keys_of(table)
         self.blocks = table.block[: len(keys)]
         diagonal, upper = chain_of(network, k)
@@ -123,6 +125,19 @@ def frames_of(poses: int, k: int) -> int:
     return (poses - 2) // k + 2
 
 
+def _poses_of(poses: int, k: int, begin: int, end: int) -> tuple[int, int]:
+    """Poses of the intervals ``begin … end - 1``."""
+    return begin * k, poses if end * k >= poses - 1 else end * k
+
+
+def _interval_chunks(network: Network, k: int, begin: int, end: int) -> Iterator[tuple[int, int]]:
+    """Ranges of intervals to take at a time: all at once in memory, about a tile from disk."""
+    problem = network.layout.problem
+    size = end - begin if problem.tiles is None else max(1, problem.tiles.size // k)
+    for a in range(begin, end, max(1, size)):
+        yield a, min(a + size, end)
+
+
 def chain_of(network: Network, k: int) -> tuple[Array, Array]:
     """Blocks of ``Pᵀ A P`` of what ties a pose alone or to the next: diagonal and upper."""
     K = frames_of(network.layout.problem.poses, k)
@@ -150,13 +165,17 @@ class Preconditioner:
         self.network: KeyframeNetwork | None = None
         if levels.jacobi:
             blocks = chain_of(network, levels.jacobi)[0]
-            half = len(blocks) // 2
+            half, k = len(blocks) // 2, levels.jacobi
             ranges = [(0, half), (half, len(blocks))]
-            landmarks, sight = (network.landmarks, network.inverse), self.layout.problem.sightings
-            workers.over(
-                lambda a, b: kernels.keyframe_diagonal(sight, network.poses, landmarks, levels.jacobi, a, b, blocks),
-                ranges,
-            )
+            landmarks = (network.landmarks, network.inverse)
+
+            def fill(first: int, last: int) -> None:
+                for a, b in _interval_chunks(network, k, first, last):
+                    # a keyframe is seen from the interval before it as well
+                    sight = network.layout.problem.sightings_of(*_poses_of(len(self.position), k, max(0, a - 1), b))
+                    kernels.keyframe_diagonal(sight, network.poses, landmarks, k, a, b, blocks)
+
+            workers.over(fill, ranges)
             self.keyframes = inverse_of(blocks, workers, ranges, "keyframe")
         if levels.factored:
             self.network = KeyframeNetwork(network, levels.factored, pattern)

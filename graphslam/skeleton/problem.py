@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -12,6 +13,7 @@ from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.skeleton.chain_kernels import Chain, reckon
 from graphslam.skeleton.landmark_kernels import Poses, Sightings
+from graphslam.skeleton.tile_store import Tiles
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,8 @@ class SkeletonProblem:
     gps_pose, gps_position : (G,), (G, 3)
         Which poses have a fix, and where [m]; of the body's origin.
     gps_covariance : (3, 3) or (G, 3, 3)
+    tiles : Tiles, optional
+        Measurements on disk; ``points`` and ``landmark`` are empty then (:func:`~graphslam.skeleton.tiles.to_disk`).
 
     Raises
     ------
@@ -69,6 +73,7 @@ class SkeletonProblem:
     gps_pose: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     gps_position: Array = field(default_factory=lambda: np.empty((0, 3)))
     gps_covariance: Array = field(default_factory=lambda: np.eye(3))
+    tiles: Tiles | None = None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -109,14 +114,17 @@ class SkeletonProblem:
         _ = self.odometry_information, self.gps_information, self.start_information
 
     def _check_numbers(self, N: int, gps: npt.NDArray[np.int64]) -> None:
-        if self.first[0] != 0 or self.first[-1] != len(self.points) or (np.diff(self.first) < 0).any():
-            raise DataError("first of a skeleton network", wanted=f"rising from 0 to {len(self.points)}")
+        if self.first[0] != 0 or self.first[-1] != self.measurements or (np.diff(self.first) < 0).any():
+            raise DataError("first of a skeleton network", wanted=f"rising from 0 to {self.measurements}")
         if not (self.range_sigma > 0 and self.bearing_sigma > 0 and (np.asarray(self.up_sigma) > 0).all()):
             raise DataError("noise of a skeleton network", wanted="positive")
         if np.ndim(self.up_sigma) and np.shape(self.up_sigma) != (N,):
             raise DataError("up_sigma", got=np.shape(self.up_sigma), wanted=(N,))
         if len(gps) and (gps.min() < 0 or gps.max() >= N):
             raise DataError("gps_pose of a pose that is not there", got=int(gps.max()), wanted=f"0 … {N - 1}")
+        if self.tiles is not None:
+            object.__setattr__(self, "_landmarks", self.tiles.landmarks)
+            return
         block = 1 << 22
         high = -1
         for k in range(0, len(self.points), block):
@@ -138,7 +146,7 @@ class SkeletonProblem:
     @property
     def measurements(self) -> int:
         """Number of measurements M."""
-        return len(self.points)
+        return len(self.points) if self.tiles is None else self.tiles.measurements
 
     @property
     def landmarks(self) -> int:
@@ -168,7 +176,22 @@ class SkeletonProblem:
     @property
     def sightings(self) -> Sightings:
         """The measurements, as the kernels take them."""
-        return Sightings(self.points, self.landmark, self.first, self.range_sigma**-2, self.bearing_sigma**-2)
+        return self.sightings_of(0, self.poses)
+
+    def sightings_of(self, begin: int, end: int) -> Sightings:
+        """The measurements of the poses ``begin … end - 1`` at least, as the kernels take them."""
+        along, across = self.range_sigma**-2, self.bearing_sigma**-2
+        if self.tiles is None:
+            return Sightings(self.points, self.landmark, self.first, along, across, 0)
+        points, landmark = self.tiles.read(begin, end)
+        return Sightings(points, landmark, self.first, along, across, int(self.first[begin]))
+
+    def chunks(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
+        """Ranges of poses to take at a time: all at once in memory, tile by tile from disk."""
+        if self.tiles is None:
+            yield begin, end
+        else:
+            yield from self.tiles.ranges(begin, end)
 
     @cached_property
     def chain(self) -> Chain:

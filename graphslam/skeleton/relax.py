@@ -227,6 +227,11 @@ def relax(
         The objective is not finite; or ``blocks`` would need more memory than ``config.limit``.
     """
     c = config or RelaxConfig()
+    if problem.tiles is not None and (c.split or c.method == "blocks"):
+        raise ConfigError(
+            "measurements are on disk; wanted split=False (wrong unions are found in memory) and another method than "
+            "'blocks'"
+        )
     stages = Stages()
     refused = 0
     if poses is None:

@@ -15,7 +15,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat, so3_left_jacobian_inverse, so3_log
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import landmark_kernels as kernels
-from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.landmark_kernels import Poses, Sightings
 from graphslam.skeleton.problem import SkeletonProblem
 
 Index = npt.NDArray[np.int64]
@@ -56,16 +56,27 @@ class Layout:
         cuts[0], cuts[-1] = 0, N
         self.ranges = [(int(a), int(b)) for a, b in pairwise(cuts)]
         self.reach: list[int] = []
-        for _, b in self.ranges:
-            at = problem.landmark[problem.first[self.ranges[len(self.reach)][0]] : problem.first[b]]
-            seen = int(at.max(initial=-1)) + 1
-            self.reach.append(max(seen, self.reach[-1] if self.reach else 0))
+        self.counts = np.zeros(problem.landmarks, dtype=np.int32)
+        for a, b in self.ranges:
+            high = self.reach[-1] if self.reach else 0
+            for c, e in problem.chunks(a, b):
+                sight = problem.sightings_of(c, e)
+                label = sight.landmark[problem.first[c] - sight.base : problem.first[e] - sight.base]
+                high = max(high, int(label.max(initial=-1)) + 1)
+                kernels.count_sightings(label, self.counts)
+            self.reach.append(high)
         L = problem.landmarks
         step = max(1, -(-L // 4))
         self.landmark_ranges = [(a, min(a + step, L)) for a in range(0, L, step)]
 
-        self.counts = np.zeros(L, dtype=np.int32)
-        kernels.count_sightings(problem.landmark, self.counts)
+    def over(self, work: Callable[..., None]) -> None:
+        """``work(k, sightings, begin, end)`` for the chunks of each range k of poses, in their order within a range."""
+
+        def walk(k: int) -> None:
+            for a, b in self.problem.chunks(*self.ranges[k]):
+                work(k, self.problem.sightings_of(a, b), a, b)
+
+        self.workers.over(walk, [(k,) for k in range(len(self.ranges))])
 
     def sums(self, width: int) -> list[Array]:
         """A zero array ``(landmarks in reach, width)`` for each range of poses; the last one has all landmarks."""
@@ -99,18 +110,15 @@ class Network:
     def __init__(self, layout: Layout, poses: Poses) -> None:
         self.layout, self.poses = layout, poses
         problem = layout.problem
-        sight = problem.sightings
         D, b = layout.sums(6), layout.sums(3)
-        layout.workers.over(
-            lambda k: kernels.sum_landmarks(sight, poses, *layout.ranges[k], D[k], b[k]), _each(layout.ranges)
-        )
+        layout.over(lambda k, sight, a, e: kernels.sum_landmarks(sight, poses, a, e, D[k], b[k]))
         self.inverse, self.landmarks = layout.total(D), layout.total(b)
         layout.workers.over(
             lambda a, e: kernels.solve_landmarks(self.inverse, self.landmarks, a, e), layout.landmark_ranges
         )
         N = problem.poses
         g, each = np.empty((N, 6)), np.empty(N)
-        layout.workers.over(lambda a, e: kernels.gradient(sight, poses, self.landmarks, a, e, g, each), layout.ranges)
+        layout.over(lambda k, sight, a, e: kernels.gradient(sight, poses, self.landmarks, a, e, g, each))
         self.objective = float(np.sum(each)) + self._add_chain(g, None, None)
         self.gradient = g
         self._blocks: tuple[Array, Array] | None = None
@@ -139,35 +147,25 @@ class Network:
         layout = self.layout
         blocks = self.chain_blocks()[0].copy()
         landmarks = (self.landmarks, self.inverse)
-        layout.workers.over(
-            lambda a, e: kernels.diagonal(layout.problem.sightings, self.poses, landmarks, a, e, blocks), layout.ranges
-        )
+        layout.over(lambda k, sight, a, e: kernels.diagonal(sight, self.poses, landmarks, a, e, blocks))
         return blocks
 
     def product(self, v: Array) -> Array:
         """Schur complement times ``v (N, 6)``."""
         layout = self.layout
-        sight, work = layout.problem.sightings, layout.workers
         parts = layout.sums(3)
-        work.over(
-            lambda k: kernels.gather(sight, self.poses, self.landmarks, v, *layout.ranges[k], parts[k]),
-            _each(layout.ranges),
-        )
+        layout.over(lambda k, sight, a, e: kernels.gather(sight, self.poses, self.landmarks, v, a, e, parts[k]))
         t = layout.total(parts)
-        work.over(lambda a, e: kernels.settle(self.inverse, t, a, e), layout.landmark_ranges)
+        layout.workers.over(lambda a, e: kernels.settle(self.inverse, t, a, e), layout.landmark_ranges)
         diagonal, upper = self.chain_blocks()
         out = np.empty_like(v)
 
-        def spread(a: int, e: int) -> None:
+        def spread(_: int, sight: Sightings, a: int, e: int) -> None:
             chains.product(diagonal, upper, v, a, e, out)
             kernels.scatter(sight, self.poses, (self.landmarks, t), v, a, e, out)
 
-        work.over(spread, layout.ranges)
+        layout.over(spread)
         return out
-
-
-def _each(ranges: list[tuple[int, int]]) -> list[tuple[int]]:
-    return [(k,) for k in range(len(ranges))]
 
 
 def add_fixes(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array | None) -> float:

@@ -98,5 +98,8 @@ def forward_pass(
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
     seen, D, b = np.full(L, -1, dtype=np.int32), np.zeros((L, 6)), np.zeros((L, 3))
     rules = (int(ago), float(turn_sigma) ** -2, float(way_sigma) ** -2, float(gate))
-    tied, refused = kernels.forward_pass(problem.sightings, chain, rules, seen, D, b, out)
-    return Walk(out, int(tied), int(refused))
+    tied = refused = 0
+    for span in problem.chunks(0, N):
+        t, r = kernels.forward_pass(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
+        tied, refused = tied + int(t), refused + int(r)
+    return Walk(out, tied, refused)

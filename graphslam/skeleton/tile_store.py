@@ -1,0 +1,154 @@
+"""Measurements of a skeleton network in tiles on disk: a tile is a range of poses, named by the digest of its bytes.
+
+A folder holds ``tiles.json`` and the tiles. A tile is, one after the other and little-endian: measurements of each pose
+(int32), points (float32, three each), landmarks (int32). A tile that is there already is not written again, so writing
+can be stopped at any moment and repeated, by one process or by many, and the folder is the same to the byte.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.atomic import atomic_open, read_json, sweep_parts, write_json
+from graphslam.core.errors import DataError, FormatError
+
+FORMAT = "graphslam.tiles/1"
+_INDEX = "tiles.json"
+_SHAPE = {
+    "format": str,
+    "landmarks": int,
+    "tiles": [{"file": str, "poses": int, "measurements": int}],
+}
+
+Points = npt.NDArray[np.float32]
+Labels = npt.NDArray[np.int32]
+
+
+class Tiles:
+    """Tiles of one network.
+
+    Parameters
+    ----------
+    folder : path
+    verify : bool
+        Read every tile once and compare its digest with its name.
+
+    Attributes
+    ----------
+    first : (N + 1,)
+        Where the measurements of each pose begin.
+    landmarks, measurements, size : int
+        How many landmarks and measurements there are, and poses of the largest tile.
+
+    Raises
+    ------
+    MissingDataError
+        There is no index.
+    FormatError
+        The folder is of another format, or a tile is missing, truncated or (``verify``) changed.
+    """
+
+    def __init__(self, folder: str | Path, verify: bool = False) -> None:
+        self.folder = Path(folder)
+        where = self.folder / _INDEX
+        index = read_json(where, fmt=FORMAT, shape=_SHAPE)
+        if not index["tiles"]:
+            raise FormatError("no tiles", where=str(where))
+        self.landmarks = int(index["landmarks"])
+        self._names = [str(t["file"]) for t in index["tiles"]]
+        counts = []
+        for tile in index["tiles"]:
+            path = self._path(str(tile["file"]))
+            n, m = int(tile["poses"]), int(tile["measurements"])
+            if not path.is_file() or path.stat().st_size != 4 * n + 16 * m:
+                got = f"{path.stat().st_size} bytes" if path.is_file() else "nothing"
+                raise FormatError("tile is missing or truncated", where=str(path), got=got, wanted=f"{4 * n + 16 * m}")
+            if verify and _digest(path.read_bytes()) != path.stem:
+                raise FormatError("tile was changed: its digest is not its name", where=str(path))
+            count = np.fromfile(path, dtype="<i4", count=n)
+            if count.min(initial=0) < 0 or int(count.sum()) != m:
+                raise FormatError(
+                    "measurements of the poses of a tile", where=str(path), got=int(count.sum()), wanted=m
+                )
+            counts.append(count)
+        self._begin = np.concatenate([[0], np.cumsum([len(c) for c in counts])])
+        self.first = np.concatenate([[0], np.cumsum(np.concatenate(counts), dtype=np.int64)]).astype(np.int64)
+        self.measurements = int(self.first[-1])
+        self.size = int(np.diff(self._begin).max())
+
+    def _path(self, name: str) -> Path:
+        if Path(name).name != name or not name.endswith(".tile"):
+            raise FormatError("name of a tile", where=str(self.folder / _INDEX), got=name, wanted="a file beside it")
+        return self.folder / name
+
+    def ranges(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
+        """The poses ``begin … end - 1``, cut where tiles meet."""
+        for a, b in zip(self._begin[:-1], self._begin[1:]):
+            if a < end and begin < b:
+                yield max(int(a), begin), min(int(b), end)
+
+    def read(self, begin: int, end: int) -> tuple[Points, Labels]:
+        """Points ``(m, 3)`` and landmarks ``(m,)`` of the poses ``begin … end - 1``."""
+        points, labels = [], []
+        for a, b in self.ranges(begin, end):
+            k = int(np.searchsorted(self._begin, a, side="right")) - 1
+            path = self._path(self._names[k])
+            head = 4 * int(self._begin[k + 1] - self._begin[k])
+            lo, hi = (int(self.first[i] - self.first[self._begin[k]]) for i in (a, b))
+            m = int(self.first[self._begin[k + 1]] - self.first[self._begin[k]])
+            points.append(np.fromfile(path, dtype="<f4", count=3 * (hi - lo), offset=head + 12 * lo).reshape(-1, 3))
+            labels.append(np.fromfile(path, dtype="<i4", count=hi - lo, offset=head + 12 * m + 4 * lo))
+        if len(points) == 1:
+            return points[0], labels[0]
+        return np.concatenate(points), np.concatenate(labels)
+
+
+def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points, Labels]]) -> Tiles:
+    """Write tiles, one for each block, and then the index that makes them a network.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it is not there. Tiles that it holds already are kept.
+    blocks : iterable of (counts (n,), points (m, 3), landmarks (m,))
+        Measurements of each pose, in pose order; landmarks numbered by first sighting over all blocks.
+
+    Raises
+    ------
+    DataError
+        A block contradicts itself, is not finite, or its landmarks are not numbered by first sighting.
+    """
+    out = Path(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    sweep_parts(out)
+    index, high = [], -1
+    for number, (counts, points, landmark) in enumerate(blocks):
+        n = np.ascontiguousarray(counts, dtype="<i4")
+        z, label = np.ascontiguousarray(points, dtype="<f4"), np.ascontiguousarray(landmark, dtype="<i4")
+        if z.shape != (len(label), 3) or int(n.sum()) != len(label):
+            got = (int(n.sum()), z.shape, label.shape)
+            raise DataError("a block of measurements contradicts itself", where=f"block {number}", got=got)
+        if not np.isfinite(z).all() or (np.abs(z).max(axis=1, initial=0.0) < 1e-6).any():
+            raise DataError("a measured point is not finite, or lies in the sensor", where=f"block {number}")
+        peak = np.maximum.accumulate(np.concatenate([[high], label]))
+        if label.min(initial=0) < 0 or (label > peak[:-1] + 1).any():
+            raise DataError("landmarks are not numbered by first sighting", where=f"block {number}")
+        high = int(peak[-1])
+        data = n.tobytes() + z.tobytes() + label.tobytes()
+        name = f"{_digest(data)}.tile"
+        path = out / name
+        if not path.is_file() or path.stat().st_size != len(data):
+            with atomic_open(path) as stream:
+                stream.write(data)
+        index.append({"file": name, "poses": len(n), "measurements": len(label)})
+    write_json(out / _INDEX, {"format": FORMAT, "landmarks": high + 1, "tiles": index})
+    return Tiles(out)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -1,0 +1,37 @@
+"""A skeleton network whose measurements stay on disk, one tile in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError
+from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.tile_store import Labels, Points, Tiles, write_tiles
+
+
+def to_disk(problem: SkeletonProblem, folder: str | Path, size: int = 20_000) -> SkeletonProblem:
+    """The same network with its measurements in tiles of ``size`` poses; every kernel gives the same bytes on both.
+
+    Odometry, tilt, GPS and poses stay in memory.
+    """
+    if size < 1:
+        raise ConfigError(f"tiles of {size} poses; wanted 1 or more")
+
+    def blocks() -> Iterator[tuple[npt.NDArray[np.int64], Points, Labels]]:
+        for a in range(0, problem.poses, size):
+            b = min(a + size, problem.poses)
+            lo, hi = problem.first[a], problem.first[b]
+            yield np.diff(problem.first[a : b + 1]), problem.points[lo:hi], problem.landmark[lo:hi]
+
+    return from_disk(problem, write_tiles(folder, blocks()))
+
+
+def from_disk(problem: SkeletonProblem, tiles: Tiles) -> SkeletonProblem:
+    """The network with the measurements of some tiles in place of its own."""
+    nothing = np.empty((0, 3), np.float32), np.empty(0, np.int32)
+    return replace(problem, points=nothing[0], landmark=nothing[1], first=tiles.first, tiles=tiles)
