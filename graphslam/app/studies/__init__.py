@@ -12,4 +12,5 @@ STUDIES: dict[str, str] = {
     "refinement": "graphslam.app.studies.refinement:STUDY",
     "scale": "graphslam.app.studies.scale:STUDY",
     "smartloc": "graphslam.app.studies.smartloc:STUDY",
+    "withheld-fixes": "graphslam.app.studies.withheld_fixes:STUDY",
 }
