@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+import numpy as np
+
 from graphslam.core.config import spelled
 from graphslam.core.errors import ConfigError
 from graphslam.graph.factors.imu.config import ImuConfig
@@ -19,9 +21,16 @@ class GpsOptions(GpsConfig):
 
     use: Literal["none", "all", "every-second", "even-segments", "odd-segments"] = "none"
     """Fixes that become factors; the rest is withheld and scored. Segments are runs of fixes without a gap."""
+    every: float = 0.0
+    """Of these at most one in so many seconds becomes a factor; the rest is withheld, too [s]."""
     robust: Robust = spelled(Robust("cauchy", 2.385), robust="kind", robust_width="k")
     """Robust kernel on every GPS factor, and its width in standard deviations; less costs accuracy where fixes are good
     (docs/segmap-graph.md)."""
+
+    def __post_init__(self) -> None:
+        GpsConfig.__post_init__(self)
+        if not (np.isfinite(self.every) and self.every >= 0):
+            raise ConfigError(f"gps.every must not be negative, got {self.every}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

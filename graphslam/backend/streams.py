@@ -37,7 +37,13 @@ def used_fixes(gps: Gps, config: GpsOptions) -> Mask:
         "even-segments": segment % 2 == 0,
         "odd-segments": segment % 2 == 1,
     }
-    return masks[config.use]
+    mask, last = masks[config.use], -np.inf
+    for k in np.flatnonzero(mask).tolist() if config.every > 0 else []:
+        if gps.times[k] - last < config.every * (1.0 - 1e-6):
+            mask[k] = False
+        else:
+            last = gps.times[k]
+    return mask
 
 
 def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:

@@ -45,10 +45,11 @@ def plot_innovations(ax: Axes | None, gps: GpsInnovations, *, title: str | None 
     each = gps.tests().iloc[0]
     t = gps.times - gps.times[0]
     band = f"{gps.confidence:.0%} bounds of the mean, worth {each['dof']:.0f} dof"
-    ax.axhspan(2 * each["low"], 2 * each["high"], color=style.BOUNDS, alpha=0.8, lw=0, label=band, zorder=0)
+    d = gps.dim
+    ax.axhspan(d * each["low"], d * each["high"], color=style.BOUNDS, alpha=0.8, lw=0, label=band, zorder=0)
     ax.plot(t, gps.nis, ".", color=style.GPS, ms=4, label="withheld fix", zorder=3)
-    ax.axhline(2 * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {2 * each['value']:.2f} (honest: 2)")
-    limit = float(stats.chi2.ppf(gps.confidence, 2))
+    ax.axhline(d * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {d * each['value']:.2f} (honest: {d})")
+    limit = float(stats.chi2.ppf(gps.confidence, d))
     ax.axhline(limit, color=style.BLACK, lw=0.8, ls="--", label=f"{gps.confidence:.0%} of honest fixes below")
     ax.set_yscale("log")
     ax.set_ylim(bottom=1e-2)

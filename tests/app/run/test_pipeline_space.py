@@ -12,6 +12,7 @@ import pytest
 
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import open_run
+from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import se2_between, se2_log
 from graphslam.core.log import SensorLog, Truth
@@ -114,12 +115,32 @@ def test_folder_is_complete_and_comes_back(dim, tmp_path, monkeypatch):
     assert back.dead_reckoning.dim == dim
 
 
+def test_fixes_that_come_too_often_are_withheld(monkeypatch):
+    """One in so many seconds is used; all others are withheld and counted."""
+    every_second, seldom = (
+        solved(2, monkeypatch, config={"gps": {"use": "all", "every": every}}) for every in (0.0, 1.0)
+    )
+    times = ring(2)[0]["gps"].times
+    wanted, last = 0, -np.inf
+    for t in times:
+        if t - last >= 1.0 - 1e-6:
+            wanted, last = wanted + 1, t
+    assert 0 < seldom.graph.objective()["gps"].factors <= wanted < len(times)
+    assert every_second.graph.objective()["gps"].factors > 1.9 * seldom.graph.objective()["gps"].factors
+    assert every_second.checks.gps is None
+    assert len(seldom.checks.gps.times) + wanted == len(times)
+    with pytest.raises(ConfigError, match=r"gps\.every"):
+        solved(2, monkeypatch, config={"gps": {"use": "all", "every": -1.0}})
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_map_is_near_the_truth_and_gps_is_scored(dim, monkeypatch):
     r = solved(dim, monkeypatch)
     assert r.metric("pose_rmse") < 0.35
     assert r.metric("path_rmse_aligned") < 0.25
     assert r.metric("gps_withheld_rmse") < 0.6
+    assert 0.5 < r.metric("gps_nis_each_value") < 1.6  # withheld fixes are foretold, and as well as is claimed
+    assert r.checks.gps.dim == dim
     assert r.metric("gps_chi2_per_dof") == pytest.approx(1.0, abs=0.5)
     assert r.map.T_gps_world.shape == (GROUP[dim].size,)
     open_ended = solved(dim, monkeypatch, config={"backend": {"match_support": 2.0}, "gps": {"use": "none"}})
