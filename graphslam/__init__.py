@@ -30,6 +30,7 @@ _VERBS = {
     "localise": "graphslam.app.sessions.localise",
     "export": "graphslam.app.export",
     "find_loops": "graphslam.loops.find_loops",
+    "relax_skeleton": "graphslam.skeleton.relax",
 }
 _LISTS = dict.fromkeys(("front_ends", "solvers", "joiners", "worlds"), "graphslam.app.verbs")
 _TYPES = {
@@ -43,6 +44,8 @@ _TYPES = {
     "Trajectory": "graphslam.core.trajectory",
     "PoseGraph": "graphslam.graph.pose_graph",
     "Run": "graphslam.app.run.run",
+    "Collapse": "graphslam.skeleton.collapse",
+    "SkeletonProblem": "graphslam.skeleton.problem",
 }
 _NAMES = {**_VERBS, **_LISTS, **_TYPES}
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from graphslam.sim import laps_kernels as kernels
 from graphslam.skeleton.collapse import Collapse
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.tile_store import Tiles, write_tiles
 
 _BLOCK = 20_000
 """Poses drawn at a time; part of what a seed means."""
@@ -114,19 +116,38 @@ class Laps:
 
     def points(self) -> npt.NDArray[np.float32]:
         """Measured points ``(M, 3)`` in the body frame [m]."""
-        c, tree = self.config, SeedTree(self.seed)
         out = np.empty((int(self.first[-1]), 3), dtype=np.float32)
-        for k in range(0, c.poses, _BLOCK):
-            e = min(k + _BLOCK, c.poses)
-            lo, hi = int(self.first[k]), int(self.first[e])
-            noise = tree.child("laps", "points", k).generator().standard_normal((hi - lo, 3), dtype=np.float32)
-            rules = (k, c.reach, c.range_sigma, c.bearing_sigma)
-            R, p = self.truth.rotation[k:e], self.truth.position[k:e]
-            kernels.see(R, p, self.places, rules, self.first[k : e + 1] - lo, noise, out[lo:hi])
+        for k in range(0, self.config.poses, _BLOCK):
+            self._see(k, out[self.first[k] : self.first[min(k + _BLOCK, self.config.poses)]])
         return out
 
+    def _see(self, k: int, out: npt.NDArray[np.float32]) -> None:
+        """Points of the block of poses that begins with ``k``."""
+        c = self.config
+        e = min(k + _BLOCK, c.poses)
+        noise = SeedTree(self.seed).child("laps", "points", k).generator().standard_normal(out.shape, dtype=np.float32)
+        rules = (k, c.reach, c.range_sigma, c.bearing_sigma)
+        R, p = self.truth.rotation[k:e], self.truth.position[k:e]
+        kernels.see(R, p, self.places, rules, self.first[k : e + 1] - self.first[k], noise, out)
+
+    def to_tiles(self, folder: str | Path) -> Tiles:
+        """Write the measurements to disk, a tile of 2·10⁴ poses at a time."""
+        landmark, _ = self.collapsed()
+
+        def blocks() -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float32], npt.NDArray[np.int32]]]:
+            for k in range(0, self.config.poses, _BLOCK):
+                at = self.first[k : k + _BLOCK + 1]
+                points = np.empty((int(at[-1] - at[0]), 3), dtype=np.float32)
+                self._see(k, points)
+                yield np.diff(at), points, landmark[at[0] : at[-1]]
+
+        return write_tiles(folder, blocks())
+
     def problem(
-        self, landmark: npt.NDArray[np.int32] | None = None, points: npt.NDArray[np.float32] | None = None
+        self,
+        landmark: npt.NDArray[np.int32] | None = None,
+        points: npt.NDArray[np.float32] | None = None,
+        tiles: Tiles | None = None,
     ) -> SkeletonProblem:
         """The skeleton network of this world.
 
@@ -136,7 +157,11 @@ class Laps:
             Default: those of :meth:`collapsed`.
         points : (M, 3), optional
             Default: :meth:`points`.
+        tiles : Tiles, optional
+            Of :meth:`to_tiles`, in place of both.
         """
+        if tiles is not None:
+            landmark, points = np.empty(0, np.int32), np.empty((0, 3), np.float32)
         c, R, p = self.config, self.truth.rotation, self.truth.position
         rng = SeedTree(self.seed).child("laps", "motion").generator()
         N = c.poses
@@ -167,6 +192,7 @@ class Laps:
             gps_pose=at,
             gps_position=p[at] + c.gps_sigma * rng.standard_normal((len(at), 3)),
             gps_covariance=c.gps_sigma**2 * np.eye(3),
+            tiles=tiles,
         )
 
 

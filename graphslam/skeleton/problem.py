@@ -55,6 +55,13 @@ class SkeletonProblem:
         sighting.
     CovarianceError
         A covariance is not positive definite.
+
+    Examples
+    --------
+    >>> from graphslam.sim.laps import LapsConfig, draw_laps
+    >>> problem = draw_laps(LapsConfig(poses=1200)).problem()
+    >>> problem.poses, problem.measurements
+    (1200, 119550)
     """
 
     points: npt.NDArray[np.float32]

@@ -44,9 +44,9 @@ class RelaxConfig:
     iterations : int
         Most Gauss-Newton steps; of ``cg`` most gradients.
     gain, move : float
-        It has converged when a step is predicted to gain less than ``gain`` (in units of χ²) and moves no pose by more
-        than ``move`` [m]. After two steps that gain less it ends in any case; if poses still moved, ``converged`` is
-        ``"objective"``: long modes are soft (``largest_move``, ``soft``).
+        When a step is predicted to gain less than ``gain`` (in units of χ²), one or two more follow, whose linear
+        systems are solved to 1 % however little that gains. It has converged (``"poses"``) if the last one moves no
+        pose by more than ``move`` [m]; if one does, ``converged`` is ``"objective"``: long modes are soft.
     enough : float
         It also ends when a step is predicted to gain less than this.
     levels : Levels, optional
@@ -202,7 +202,7 @@ class Stages:
         return time.process_time() - self._begin
 
 
-def relax(
+def relax_skeleton(
     problem: SkeletonProblem,
     config: RelaxConfig | None = None,
     poses: Poses | None = None,
@@ -225,6 +225,13 @@ def relax(
         Something does not constrain a pose.
     SolverError
         The objective is not finite; or ``blocks`` would need more memory than ``config.limit``.
+
+    Examples
+    --------
+    >>> from graphslam.sim.laps import LapsConfig, draw_laps
+    >>> found = gs.relax_skeleton(draw_laps(LapsConfig(poses=1200)).problem())
+    >>> found.converged, round(found.chi2, 2)
+    ('poses', 1.0)
     """
     c = config or RelaxConfig()
     if problem.tiles is not None and (c.split or c.method == "blocks"):
@@ -289,6 +296,7 @@ class _Descent:
         self.history: list[Iteration] = []
         self.converged = ""
         self.found = 0
+        self._finishing = self._before = 0
         self._progress = progress
         self._pattern: KeyframePattern | None = None
         self._begin(problem, poses)
@@ -327,6 +335,7 @@ class _Descent:
     def run(self) -> None:
         """Steps until nothing is gained."""
         self.converged = ""
+        self._finishing, self._before = 0, len(self.history)
         if not np.isfinite(self.network.objective):
             raise SolverError("objective of the skeleton network is not finite at its start")
         {"gn": self._gauss_newton, "blocks": self._gauss_newton, "levels": self._levels, "cg": self._gradients}[
@@ -340,18 +349,21 @@ class _Descent:
         M: Preconditioner | None = None
         rebuilt = 0
         for _ in range(c.iterations):
-            last = self.history[-1] if self.history else None
+            last = self.history[-1] if len(self.history) > self._before else None
             close = last is not None and last.predicted < 10.0
             if M is None or self.chi2 > 1.5 or (last is not None and last.scale < 1.0) or (close and not rebuilt):
                 M = self._preconditioner()
                 rebuilt = int(close)
-            tolerance = 0.01 if self.chi2 > 2.0 else 1e-3 if close else 0.03
+            # soft modes gain next to nothing: whether poses still move is seen only when the system is solved
+            self._finishing += last is not None and last.predicted < c.gain
+            tolerance = 0.01 if self.chi2 > 2.0 or self._finishing else 1e-3 if close else 0.03
+            gain = 0.0 if self._finishing else 1e-3 * c.gain
             product = self.network.product
             if c.method == "blocks":
                 product = ThinnedNetwork(self.network, c.limit).product
                 self.stages("thinning")
             step, predicted, products = conjugate_gradients(
-                product, M, -self.network.gradient, tolerance, c.inner, 1e-3 * c.gain
+                product, M, -self.network.gradient, tolerance, c.inner, gain
             )
             self.stages("products")
             if self._take(step, predicted, products):
@@ -391,9 +403,9 @@ class _Descent:
         self._note(there, products, predicted, gained, far, scale)
         if scale < 1.0 or predicted >= max(c.gain, c.enough):
             return False
-        last = self.history[-2].predicted if len(self.history) > 1 else np.inf
-        self.converged = "poses" if predicted < c.gain and far < c.move else "objective"
-        return self.converged == "poses" or predicted < c.enough or last < c.gain
+        solved = self._finishing > 0 or c.method == "levels"
+        self.converged = "poses" if predicted < c.gain and far < c.move and solved else "objective"
+        return self.converged == "poses" or predicted < c.enough or self._finishing > 1 or c.method == "cg"
 
     def _note(self, network: Network, products: int, predicted: float, gained: float, far: float, scale: float) -> None:
         chi2 = network.objective / max(1, self.problem.freedom)

@@ -15,13 +15,14 @@ from graphslam.solve.registry import make_solver
 VERBS = {
     *("compare", "export", "find_loops", "find_study", "first_particles", "join_submaps", "load", "local_maps"),
     *("localise", "merge", "open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "study"),
+    "relax_skeleton",
 }
 LISTS = {"front_ends", "joiners", "solvers", "worlds"}
 STREAMS = {
     *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "RangeScans", "SteeringControls"),
     "VelocityControls",
 }
-TYPES = {"PoseGraph", "Run", "SensorLog", "Submap", "Trajectory"}
+TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Submap", "Trajectory"}
 
 
 def test_tab_completion_offers_these_and_no_more() -> None:

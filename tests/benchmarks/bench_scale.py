@@ -14,6 +14,8 @@ from our forward pass. Each is a process with a limit on time and memory (``--se
 an iteration gains less than 10⁻⁵ of the objective. Its factors measure bearing and range instead of a point, so
 objectives are compared as ours, at its poses.
 
+``--tiles FOLDER`` writes each world to disk and relaxes it from there, one tile of 2·10⁴ poses in memory at a time.
+
 ``--quick``: 1,200 and 4,800 poses, GTSAM's Cholesky at 600 from dead reckoning. Exit code 1 if we end above the
 optimum: if χ²/dof is above that of the truth, or the objective above GTSAM's.
 """
@@ -51,12 +53,12 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
     from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.collapse import Collapse
     from graphslam.skeleton.preconditioner import Levels, Preconditioner
-    from graphslam.skeleton.relax import RelaxConfig, relax
+    from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
     from graphslam.skeleton.schur import Layout, Network, Workers
 
     config = RelaxConfig(threads=threads)
     for levels in (Levels(0, 20), Levels(10, 80)):
-        relax(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels, threads=threads))
+        relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels, threads=threads))
     world = draw_laps(LapsConfig(poses=poses))
     collapse = Collapse(int(world.first[-1]))
     seconds = 0.0
@@ -69,7 +71,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
     seconds += time.process_time() - begin
     problem = world.problem(landmark)
     wall = time.perf_counter()
-    found = relax(problem, config)
+    found = relax_skeleton(problem, config)
     wall = time.perf_counter() - wall
     total = sum(found.seconds.values())
     history = [(h.seconds, h.objective, h.chi2, h.products, h.predicted, h.largest_move) for h in found.history]
@@ -122,6 +124,42 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
         "peak": top,
         "peak_all": peak(),
         "products": found.products,
+    }
+
+
+def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
+    """Write a world to disk."""
+    from graphslam.sim.laps import LapsConfig, draw_laps
+
+    begin = time.process_time()
+    tiles = draw_laps(LapsConfig(poses=poses)).to_tiles(folder)
+    return {"seconds": time.process_time() - begin, "measurements": tiles.measurements, "peak": peak()}
+
+
+def from_tiles(poses: int, folder: str, iterations: int) -> dict[str, Any]:
+    """Relax a network whose measurements stay on disk."""
+    from graphslam.sim.laps import LapsConfig, draw_laps
+    from graphslam.skeleton.preconditioner import Levels
+    from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
+    from graphslam.skeleton.tile_store import Tiles
+
+    for levels in (Levels(0, 20), Levels(10, 80)):
+        relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels))
+    world = draw_laps(LapsConfig(poses=poses))
+    problem = world.problem(tiles=Tiles(folder))
+    truth = world.truth.position
+    del world
+    wall = time.perf_counter()
+    found = relax_skeleton(problem, RelaxConfig(split=False, soft=0, iterations=iterations))
+    wall = time.perf_counter() - wall
+    return {
+        "seconds": sum(found.seconds.values()),
+        "wall": wall,
+        "stages": found.seconds,
+        "history": [(h.seconds, h.objective, h.chi2, h.products, h.predicted, h.largest_move) for h in found.history],
+        "chi2": found.chi2,
+        "rms": rms(found.poses.position, truth),
+        "peak": peak(),
     }
 
 
@@ -254,6 +292,8 @@ def main() -> int:
     parser.add_argument("--starts", default="odometry,forward", help="from where GTSAM starts")
     parser.add_argument("--seconds", type=float, default=1800.0, help="wall time for one run of GTSAM")
     parser.add_argument("--gigabytes", type=float, default=10.0, help="address space for one run of GTSAM")
+    parser.add_argument("--tiles", default="", help="folder for tiles: also relax each size from disk")
+    parser.add_argument("--steps", type=int, default=30, help="most steps of a relaxation from disk")
     parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
@@ -316,6 +356,23 @@ def main() -> int:
                     )
         if best is not None:
             print(f"  best of GTSAM from dead reckoning: {best:.1f} s, {best / mine['seconds']:.1f} × ours")
+    if args.tiles:
+        for n in sizes:
+            folder = str(Path(args.tiles) / str(n))
+            drawn, why = child("draw", str(n), folder)
+            t, why = child("tiles", str(n), folder, str(args.steps)) if drawn else (None, why)
+            if drawn is None or t is None:
+                print(f"{n} poses from disk: failed: {why}")
+                failed += 1
+                continue
+            print(
+                f"\n{n:,} poses from disk: written in {drawn['seconds']:.1f} CPU s ({drawn['peak']:.2f} GB); "
+                f"relaxed in {t['seconds']:.1f} CPU s ({t['wall']:.1f} s wall), peak {t['peak']:.2f} GB, "
+                f"χ²/dof {t['chi2']:.6f}, {t['rms']:.3f} m rms to the truth"
+            )
+            print("  stages [s]: " + ", ".join(f"{k} {v:.2f}" for k, v in t["stages"].items()))
+            for k, (at, J, chi2, m, gain, far) in enumerate(t["history"], 1):
+                print(f"  {k:3d}: {at:8.2f}  {J:.6e}  {chi2:.6f}  {m:3d}  {gain:.2e}  {far:.2e} m")
     print("ok" if not failed else f"{failed} failed")
     return int(failed > 0)
 

@@ -12,7 +12,7 @@ from graphslam.sim.laps import Laps, LapsConfig, draw_laps
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import Levels
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.relax import RelaxConfig, relax
+from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.schur import Layout, Network, Workers
 from graphslam.skeleton.start import chain_start, forward_pass
 from graphslam.skeleton.thinning import ThinnedNetwork, blocks_per_pose
@@ -48,7 +48,7 @@ def test_the_optimum_is_that_of_poses_and_landmarks_together(
     problem: SkeletonProblem, optimum: tuple[Poses, np.ndarray, float], config: RelaxConfig
 ) -> None:
     poses, landmarks, objective = optimum
-    found = relax(problem, config)
+    found = relax_skeleton(problem, config)
     plain = config.method == "cg" and config.levels is not None
     assert found.objective == pytest.approx(objective, rel=1e-9 if not plain else 1e-5)
     assert farthest(found.poses, poses) < (0.01 if plain else 1e-5)
@@ -63,13 +63,13 @@ def test_the_optimum_is_that_of_poses_and_landmarks_together(
 def test_keyframes_alone_are_named_approximate_and_end_above_the_optimum(
     problem: SkeletonProblem, optimum: tuple[Poses, np.ndarray, float]
 ) -> None:
-    found = relax(problem, RelaxConfig(method="levels", levels=Levels(0, 16)))
+    found = relax_skeleton(problem, RelaxConfig(method="levels", levels=Levels(0, 16)))
     assert found.approximate
-    assert not relax(problem, RelaxConfig(iterations=1)).approximate
+    assert not relax_skeleton(problem, RelaxConfig(iterations=1)).approximate
     assert found.objective > 1.01 * optimum[2]
     assert farthest(found.poses, optimum[0]) < 0.5
     with pytest.raises(ConfigError, match="keyframes"):
-        relax(problem, RelaxConfig(method="levels", levels=Levels()))
+        relax_skeleton(problem, RelaxConfig(method="levels", levels=Levels()))
 
 
 def test_starts_come_nearer(laps: Laps, problem: SkeletonProblem) -> None:
@@ -88,11 +88,11 @@ def test_chain_start_is_the_optimum_of_all_but_the_landmarks(problem: SkeletonPr
     _, _, objective = dense.optimum(alone, problem.dead_reckoning())
     chain = chain_start(alone, iterations=30)
     assert Network(Layout(alone, Workers(1)), chain).objective == pytest.approx(objective, rel=1e-3)
-    assert relax(alone, RelaxConfig(gain=1e-9)).objective == pytest.approx(objective, rel=1e-9)
+    assert relax_skeleton(alone, RelaxConfig(gain=1e-9)).objective == pytest.approx(objective, rel=1e-9)
 
 
 def test_threads_change_no_byte_of_a_relaxation(problem: SkeletonProblem) -> None:
-    a, b = (relax(problem, RelaxConfig(threads=n, iterations=3, levels=Levels(4, 16))) for n in (1, 2))
+    a, b = (relax_skeleton(problem, RelaxConfig(threads=n, iterations=3, levels=Levels(4, 16))) for n in (1, 2))
     assert a.poses.position.tobytes() == b.poses.position.tobytes()
     assert a.poses.rotation.tobytes() == b.poses.rotation.tobytes()
     assert [h.objective for h in a.history] == [h.objective for h in b.history]
@@ -109,7 +109,7 @@ def test_written_out_network_is_the_schur_complement(network: Network, written_o
 
 def test_a_network_too_large_to_write_out_is_refused_with_its_size(problem: SkeletonProblem) -> None:
     with pytest.raises(SolverError, match=r"blocks a pose: about .* GB; wanted at most"):
-        relax(problem, RelaxConfig(method="blocks", limit=1e5))
+        relax_skeleton(problem, RelaxConfig(method="blocks", limit=1e5))
 
 
 # ---- wrong unions ----------------------------------------------------------------------------------------------
@@ -136,12 +136,12 @@ def merged(landmark: np.ndarray, share: float) -> tuple[np.ndarray, int]:
 
 def test_wrong_unions_are_found_split_and_counted(larger: Laps) -> None:
     landmark, _ = larger.collapsed()
-    clean = relax(larger.problem(landmark), RelaxConfig())
+    clean = relax_skeleton(larger.problem(landmark), RelaxConfig())
     assert clean.split == 0
     wrong, n = merged(landmark, 0.06)
     assert n >= 3
-    bent = relax(larger.problem(wrong), RelaxConfig(split=False))
-    found = relax(larger.problem(wrong), RelaxConfig())
+    bent = relax_skeleton(larger.problem(wrong), RelaxConfig(split=False))
+    found = relax_skeleton(larger.problem(wrong), RelaxConfig())
     assert bent.chi2 > 5.0
     assert n - 1 <= found.split <= n + 2, (n, found.split)
     assert found.chi2 == pytest.approx(1.0, abs=0.05)
@@ -191,4 +191,4 @@ def test_a_pose_that_nothing_holds_is_named(problem: SkeletonProblem) -> None:
         gps_position=np.empty((0, 3)),
     )
     with pytest.raises(IndeterminateError, match="pose 4"):
-        relax(alone, RelaxConfig(start="odometry", levels=Levels()))
+        relax_skeleton(alone, RelaxConfig(start="odometry", levels=Levels()))

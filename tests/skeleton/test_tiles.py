@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.sim.laps import Laps
 from graphslam.skeleton.preconditioner import Levels
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.relax import RelaxConfig, relax
+from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.tile_store import Tiles, write_tiles
 from graphslam.skeleton.tiles import from_disk, to_disk
 
@@ -34,7 +35,7 @@ def test_a_run_in_tiles_is_the_run_in_memory(problem: SkeletonProblem, tmp_path:
     )
     for levels in (Levels(4, 16), Levels(10, 12)):
         config = RelaxConfig(levels=levels, split=False, iterations=3)
-        a, b = relax(problem, config), relax(tiled, config)
+        a, b = relax_skeleton(problem, config), relax_skeleton(tiled, config)
         assert a.poses.position.tobytes() == b.poses.position.tobytes()
         assert a.poses.rotation.tobytes() == b.poses.rotation.tobytes()
         assert a.landmarks.tobytes() == b.landmarks.tobytes()
@@ -42,12 +43,22 @@ def test_a_run_in_tiles_is_the_run_in_memory(problem: SkeletonProblem, tmp_path:
         assert (a.refused, a.soft) == (b.refused, b.soft)
 
 
+def test_a_world_is_drawn_to_disk_as_in_memory(problem: SkeletonProblem, laps: Laps, tmp_path: Path) -> None:
+    tiles = laps.to_tiles(tmp_path)
+    points, landmark = tiles.read(0, problem.poses)
+    assert points.tobytes() == problem.points.tobytes()
+    assert landmark.tobytes() == problem.landmark.tobytes()
+    drawn = laps.problem(tiles=tiles)
+    assert drawn.odometry_translation.tobytes() == problem.odometry_translation.tobytes()
+    assert drawn.landmarks == problem.landmarks
+
+
 def test_what_needs_all_measurements_at_once_says_so(problem: SkeletonProblem, tmp_path: Path) -> None:
     tiled = to_disk(problem, tmp_path, 30)
     with pytest.raises(ConfigError, match="split"):
-        relax(tiled)
+        relax_skeleton(tiled)
     with pytest.raises(ConfigError, match="blocks"):
-        relax(tiled, RelaxConfig(method="blocks", split=False))
+        relax_skeleton(tiled, RelaxConfig(method="blocks", split=False))
 
 
 WRITE = """

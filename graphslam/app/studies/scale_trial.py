@@ -19,7 +19,7 @@ from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.links import relative_links
 from graphslam.skeleton.preconditioner import Levels
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.relax import RelaxConfig, Relaxed, relax
+from graphslam.skeleton.relax import RelaxConfig, Relaxed, relax_skeleton
 from graphslam.skeleton.schur import Layout, Network, Workers
 from graphslam.solve.network.solve import solve_network
 
@@ -97,9 +97,9 @@ def _methods(config: ScaleTrialConfig, seed: int) -> Rows:
     problem = world.problem()
     start = problem.dead_reckoning()
     first = float(np.linalg.norm(Network(Layout(problem, Workers(1)), start).gradient))
-    best = relax(problem, TIGHT)
+    best = relax_skeleton(problem, TIGHT)
     for name, how in METHODS.items():
-        yield from _said(name, relax(problem, how, start), best, world.truth, first)
+        yield from _said(name, relax_skeleton(problem, how, start), best, world.truth, first)
     yield from _said("gn, forward pass", best, best, world.truth, first)
 
 
@@ -108,16 +108,16 @@ def _approximations(config: ScaleTrialConfig, seed: int) -> Rows:
     world = draw_laps(config.world, seed)
     landmark, _ = world.collapsed()
     points = world.points()
-    exact = relax(world.problem(landmark, points), TIGHT)
+    exact = relax_skeleton(world.problem(landmark, points), TIGHT)
     rng = np.random.default_rng(seed)
     for name, labels, split in _labels(config, world, landmark, rng):
-        found = relax(world.problem(labels, points), replace(TIGHT, split=split))
+        found = relax_skeleton(world.problem(labels, points), replace(TIGHT, split=split))
         yield Measurement(name, "landmarks", int(found.landmark.max()) + 1)
         yield Measurement(name, "split", found.split)
         yield Measurement(name, "chi2", found.chi2)
         yield Measurement(name, "to_optimum", rms(found.poses, exact.poses))
         yield Measurement(name, "to_truth", rms(found.poses, world.truth))
-    averaged = relax(averaged_passes(world.problem(landmark, points)), TIGHT)
+    averaged = relax_skeleton(averaged_passes(world.problem(landmark, points)), TIGHT)
     yield Measurement("passes averaged", "chi2", averaged.chi2)
     yield Measurement("passes averaged", "to_optimum", rms(averaged.poses, exact.poses))
     yield Measurement("passes averaged", "to_truth", rms(averaged.poses, world.truth))
@@ -201,13 +201,13 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
         nothing: Array = np.empty((0, 3))
         problem = replace(world.problem(), up=None, gps_pose=np.empty(0, np.int64), gps_position=nothing)
         start = problem.dead_reckoning()
-        best = relax(problem, replace(TIGHT, split=False), world.truth)
+        best = relax_skeleton(problem, replace(TIGHT, split=False), world.truth)
         once = RelaxConfig(method="levels", levels=Levels(0, 1), iterations=1, soft=0, split=False, halve=False)
         ways: dict[str, Poses] = {
             "dead reckoning": start,
-            "relinearised": relax(problem, replace(TIGHT, split=False, start="odometry")).poses,
-            "relinearised, forward pass": relax(problem, replace(TIGHT, split=False)).poses,
-            "information form, linearised once": relax(problem, once, start).poses,
+            "relinearised": relax_skeleton(problem, replace(TIGHT, split=False, start="odometry")).poses,
+            "relinearised, forward pass": relax_skeleton(problem, replace(TIGHT, split=False)).poses,
+            "information form, linearised once": relax_skeleton(problem, once, start).poses,
             "links fixed once": linked(problem, start),
         }
         layout = Layout(problem, Workers(1))
