@@ -119,11 +119,12 @@ def pan_angle(config: CampusConfig, t: Array) -> Array:
 def empty_scans(config: CampusConfig, duration: float, sigma: float) -> dict[str, RangeScans]:
     """Stamps, directions and true angles of both lasers; ranges are 0."""
     c = config
-    elevation = np.linspace(-0.5 * c.fan, 0.5 * c.fan, c.beams)
+    kept = np.arange(0, c.beams, c.every_beam)
+    elevation = np.linspace(-0.5 * c.fan, 0.5 * c.fan, c.beams)[kept]
     step = c.every / c.line_rate
     count = int(np.floor((duration - c.line_time) / step + 1e-9)) + 1
     times = step * np.arange(count, dtype=np.float64)
-    zeros = np.zeros(c.beams)
+    zeros = np.zeros(len(kept))
     # mounts: x up for the panning head; the vertical laser is the base's own y-z plane
     ahead = np.column_stack([np.sin(elevation), np.cos(elevation), zeros])
     tilted = elevation + VERTICAL_MIDDLE
@@ -137,9 +138,9 @@ def empty_scans(config: CampusConfig, duration: float, sigma: float) -> dict[str
     ):
         out[name] = RangeScans(
             times=times,
-            ranges=np.zeros((len(times), c.beams), np.float32),
+            ranges=np.zeros((len(times), len(kept)), np.float32),
             directions=directions,
-            beam_times=np.linspace(0.0, c.line_time, c.beams),
+            beam_times=np.linspace(0.0, c.line_time, c.beams)[kept],
             max_range=c.max_range,
             sigma=sigma,
             T_base_mount=np.array(mount),

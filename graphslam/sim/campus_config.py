@@ -64,8 +64,10 @@ class CampusConfig:
     """Opening of the fan: 180 steps of half a degree [rad]."""
     line_rate: float = 75.0
     """Scan lines per second [Hz]."""
-    every: int = 5
-    """Only every so many lines are kept."""
+    every: int = 2
+    """Only every so many lines are kept …"""
+    every_beam: int = 2
+    """… and of a line only every so many beams: less to store, and planes can still be seen."""
     line_time: float = 1.0 / 300.0
     """From the first beam of a line to its last: a quarter of a turn of the mirror [s]."""
     sweep: float = 2.0
@@ -202,7 +204,7 @@ PRESETS: dict[str, Mapping[str, Any]] = {
     "block": {"size": (110.0, 110.0), "block": 90.0, "visits": 1, "open_share": 1.0, "movers": 8},
     "quick": {
         **{"size": (72.0, 72.0), "block": 60.0, "visits": 1, "open_share": 1.0, "movers": 4, "round": False},
-        **{"every": 15, "beams": 61},
+        **{"every": 3, "every_beam": 3},
     },
 }
 """Sizes by name: ``full`` is the default; ``three-blocks`` has room for a far session, ``quick`` is for tests."""
