@@ -237,8 +237,9 @@ def simulate_campus(
     streams["gps"] = Gps(
         times=fixes.times,
         positions=fixes.positions,
-        sigma=np.sqrt(np.mean(fixes.sigmas**2, axis=1)),
+        sigma=np.sqrt(0.5 * (fixes.covariances[:, 0, 0] + fixes.covariances[:, 1, 1])),
         lever=np.array(c.lever),
+        covariances=fixes.covariances,
     )
 
     frame = start_frame(motion)

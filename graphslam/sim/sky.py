@@ -35,8 +35,8 @@ class Fixes:
     times : (n,)
     positions : (n, 3)
         East, north, up [m].
-    sigmas : (n, 3)
-        What the receiver takes their σ to be, from the satellites' directions: it does not know of walls [m].
+    covariances : (n, 3, 3)
+        What the receiver takes their covariance to be, from the satellites' directions: it knows of no walls [m²].
     truth : (n, 3)
     hidden : (n,)
         How many of the satellites used are behind a wall.
@@ -46,7 +46,7 @@ class Fixes:
 
     times: Array
     positions: Array
-    sigmas: Array
+    covariances: Array
     truth: Array
     hidden: npt.NDArray[np.int64]
     seen: tuple[Array, npt.NDArray[np.int64]]
@@ -127,12 +127,12 @@ def measure_gps(
             continue
         rows.append(k)
         found.append((C @ H.T @ (scale * error[k, used[k]]))[:3])
-        stated.append(sigma * np.sqrt(np.diag(C)[:3]))
+        stated.append(sigma**2 * C[:3, :3])
     index = np.array(rows, dtype=np.int64)
     return Fixes(
         times=times[index],
         positions=antennas[index] + np.array(found).reshape(-1, 3),
-        sigmas=np.array(stated).reshape(-1, 3),
+        covariances=np.array(stated).reshape(-1, 3, 3),
         truth=antennas[index],
         hidden=(used & ~seen)[index].sum(axis=1),
         seen=(times, seen.sum(axis=1)),

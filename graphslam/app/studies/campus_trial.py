@@ -194,8 +194,4 @@ def angle_errors(legs: list[list[list[float]]], path: Trajectory, true: Array) -
                 turn = np.arctan2(np.sum(q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0]), np.sum(p * q))
                 turned[-1].append((0.5 * (a + b), float(turn)))
     # the two legs of one drive are those nearest in time
-    return [
-        float(wrap_angle(min(turned[1], key=lambda y: abs(y[0] - x[0]))[1] - x[1]))
-        for x in turned[0]
-        if turned[1]
-    ]
+    return [float(wrap_angle(min(turned[1], key=lambda y: abs(y[0] - x[0]))[1] - x[1])) for x in turned[0] if turned[1]]
