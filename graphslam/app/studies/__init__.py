@@ -9,6 +9,7 @@ STUDIES: dict[str, str] = {
     "segslam-mine": "graphslam.app.studies.segslam_mine:STUDY",
     "segslam-building": "graphslam.app.studies.segslam_building:STUDY",
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
+    "campus": "graphslam.app.studies.campus:STUDY",
     "refinement": "graphslam.app.studies.refinement:STUDY",
     "scale": "graphslam.app.studies.scale:STUDY",
     "smartloc": "graphslam.app.studies.smartloc:STUDY",

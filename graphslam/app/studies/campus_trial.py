@@ -153,6 +153,7 @@ class Judge:
             yield Measurement(kind, "angle_error", float(np.rad2deg(np.mean(np.abs(angles)))))
             yield Measurement(kind, "angle_error_max", float(np.rad2deg(np.max(np.abs(angles)))))
         yield from self.honesty(kind, path, true, inside)
+        yield Measurement(kind, "failed", 0.0)
 
     def honesty(self, kind: str, path: Trajectory, true: Array, inside: np.ndarray) -> Iterator[Measurement]:
         """NEES a degree of freedom, first base held: in the middle of the way, inside, at the end, and on the mean."""

@@ -1,0 +1,92 @@
+"""The study of the campus: pairs that differ in the fixes alone, the corridor's angle, and tables that can say no."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from graphslam.app.studies.campus import QUICK_WORLDS, STUDY, nees_table, pair_table
+from graphslam.app.studies.campus_trial import BLOCKS, KINDS, angle_errors, campus_figures
+from graphslam.app.studies.definition import find_study
+from graphslam.core.poses import SE3
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.montecarlo import Measurement
+
+
+@pytest.fixture(scope="module")
+def run() -> dict[tuple[str, str], float]:
+    """One run with fixes that are nearly exact: what they bring cannot be missed."""
+    config = QUICK_WORLDS["quick"]
+    sharp = {"code_sigma": (0.02, 0.02), "orbit_sigma": (0.01, 0.01), "reflect_sigma": (1e-3, 1e-3)}
+    rows = list(campus_figures(replace(config, campus=replace(config.campus, **sharp, hidden_share=(1e-6, 1e-6))), 3))
+    return {(m.algorithm, m.quantity): m.value for m in rows}
+
+
+def test_sharp_fixes_outside_straighten_the_inside(run: dict[tuple[str, str], float]) -> None:
+    assert run["joint", "fixes"] > 40
+    for quantity in ("ate", "ate_outdoor", "ate_indoor", "ate_indoor_anchored", "end_error"):
+        assert run["joint", quantity] < 0.7 * run["alone", quantity]
+    assert run["joint", "ate"] < run["joint-sparse", "ate"] < run["alone", "ate"]
+    assert 0 < run["joint", "ate"] < 0.2
+    for kind in KINDS:
+        assert run[kind, "angle_error"] < 1.0
+        assert run[kind, "failed"] == 0.0
+        assert {f"nees_{b}_indoor" for b in BLOCKS} <= {q for k, q in run if k == kind}
+    assert run["odometry", "scans_lost"] < 0.4
+
+
+def test_the_angle_between_two_legs() -> None:
+    """A corridor whose second leg is bent by 2°, driven there and back."""
+    out = np.linspace(0.0, 20.0, 41)
+    first, second = np.column_stack([out, 0 * out]), np.column_stack([np.full(41, 20.0), out])
+    plan = np.concatenate([first, second, second[::-1], first[::-1]])
+    times = np.arange(len(plan)) * 0.5
+    legs = [[[0.0, 20.0], [61.5, 82.0]], [[20.5, 40.5], [41.0, 61.0]]]
+    true = np.tile(SE3.identity, (len(plan), 1))
+    true[:, :2] = plan
+    turn = np.deg2rad(2.0)
+    bent = true.copy()
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    on_second = (times > 20.2) & (times < 61.2)
+    bent[on_second, :2] = (plan[on_second] - [20.0, 0.0]) @ R.T + [20.0, 0.0]
+    np.testing.assert_allclose(np.rad2deg(angle_errors(legs, Trajectory(times, bent), true)), [2.0, 2.0], atol=1e-9)
+    bent[:, :2] = bent[:, :2] @ R.T + [5.0, 7.0]  # where the building lies is no matter of its angle
+    np.testing.assert_allclose(np.rad2deg(angle_errors(legs, Trajectory(times, bent), true)), [2.0, 2.0], atol=1e-9)
+    assert angle_errors(legs, Trajectory(times, true), true) == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert angle_errors([[], [[0.0, 20.0]]], Trajectory(times, true), true) == []
+
+
+def rows_of(pairs: list[tuple[float, float]], quantity: str = "ate_indoor") -> pd.DataFrame:
+    out = []
+    for run, (alone, joint) in enumerate(pairs):
+        for kind, value in (("alone", alone), ("joint", joint)):
+            m = Measurement(kind, quantity, value)
+            out.append(("w", run, m.algorithm, m.submap, m.quantity, m.value))
+    return pd.DataFrame(out, columns=["world", "run", "algorithm", "submap", "quantity", "value"])
+
+
+def test_pairs_are_told_with_a_sign_test() -> None:
+    row = pair_table(rows_of([(1.0, 0.4)] * 9 + [(1.0, 1.2)])).iloc[0]
+    assert (row["runs"], row["better"], row["half"]) == (10, 9, 0.9)
+    assert row["p"] == pytest.approx(2 * 11 / 2**10)
+    assert row["ratio"] == pytest.approx(0.48)
+    worse = pair_table(rows_of([(1.0, 2.0)] * 8)).iloc[0]
+    assert (worse["better"], worse["median_ratio"]) == (0, 2.0)
+    assert worse["p"] < 0.01  # as sure, the other way
+
+
+def test_nees_has_bounds_on_both_sides() -> None:
+    t = pd.concat([rows_of([(1.0, 1.0)] * 20, f"nees_plan_{p}") for p in ("middle", "indoor", "end")])
+    t = nees_table(t)
+    row = t[(t["graph"] == "joint") & (t["block"] == "plan")].iloc[0]
+    assert 0.5 < row["low"] < 1.0 < row["high"] < 1.6
+    assert row["indoor"] == 1.0
+
+
+def test_it_is_found_by_its_name() -> None:
+    assert find_study("campus") is STUDY
+    assert STUDY.worlds(quick=True) == ("quick",)
+    assert STUDY.default_trials(quick=False) == 20
