@@ -20,6 +20,7 @@ PAGES = [
     "concepts.md",
     "evidence-grids.md",
     "faults.md",
+    "gnss.md",
     "how-to.md",
     "imu.md",
     "limits.md",

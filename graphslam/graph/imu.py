@@ -70,9 +70,10 @@ class ImuUnits:
             raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
         bias_sigma(imu.noise)
         places = places_of(self.graph.submaps, cfg.window)
-        if more and self.graph.submaps:
-            places.pop(self.graph.submaps[-1].exit_node, None)
-        plan = plan_of(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places)
+        waiting = self.graph.submaps[-1].exit_node if more and self.graph.submaps else None
+        if waiting is not None:
+            places.pop(waiting, None)
+        plan = plan_of(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places, waiting)
         for a, b in plan.pairs:
             self.graph.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
         for n in plan.gravity:

@@ -11,10 +11,6 @@ what it shows is that ways and path are consistent, not that anything is gained.
 from __future__ import annotations
 
 import argparse
-import gzip
-import io
-import lzma
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +28,10 @@ from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.io.euroc import read_euroc
 from graphslam.solve.batch import BatchSolver
 from tests.conftest import data_root
 
-SHEET = ImuNoise(
-    gyro=1.6968e-4, gyro_bias=0.1, gyro_walk=1.9393e-5,
-    accelerometer=2e-3, accelerometer_bias=0.3, accelerometer_walk=3e-3,
-)  # fmt: skip
-"""Densities and walks as the set's own file states them; σ of the biases at the start are ours."""
 PRISM = np.array([7.48903e-02, -1.84772e-02, -1.20209e-01])
 CONSUMER = ImuNoise(
     gyro=1e-3, gyro_bias=0.02, gyro_walk=1e-4, accelerometer=1e-2, accelerometer_bias=0.1, accelerometer_walk=1e-3
@@ -122,21 +114,14 @@ def euroc(
     late : float
         Taken off the stamps of the positions [s].
     """
-    folder = root / "euroc_mh01_imu_leica"
-    readings = lzma.decompress((folder / "imu0_data.csv.xz").read_bytes())
-    positions = gzip.decompress((folder / "leica0_data.csv.gz").read_bytes())
-    a, z = (np.loadtxt(io.BytesIO(raw), delimiter=",", comments="#") for raw in (readings, positions))
-    t0 = a[0, 0]
-    t, tz = 1e-9 * (a[:, 0] - t0), 1e-9 * (z[:, 0] - t0) - late
-    good = np.concatenate([[True], np.diff(t) > 0])
-    noise = replace(SHEET, gyro=scale * SHEET.gyro, accelerometer=scale * SHEET.accelerometer)
-    imu = Imu(times=t[good], angular_rate=a[good, 1:4], specific_force=a[good, 4:7], noise=noise)
+    log = read_euroc(root / "euroc_mh01_imu_leica", sigma=sigma, late=late, noise_scale=scale)
+    imu, tz, z = log["imu"], log["leica"].times, log["leica"].positions
     keep = [k for k in range(len(tz)) if 1.0 < tz[k] < length]
     nodes = [keep[0]]
     for k in keep:
         if tz[k] - tz[nodes[-1]] >= every - 0.01:
             nodes.append(k)
-    at, points = tz[nodes], z[nodes, 1:4]
+    at, points = tz[nodes], z[nodes]
     # a start: attitudes by the gyro alone from the force of the first second, as if it stood still then
     first = imu.times < 1.0
     bias = np.concatenate([imu.angular_rate[first].mean(axis=0), np.zeros(3)])
@@ -171,9 +156,9 @@ def euroc(
     p = X[:, :3] + v * T - 0.5 * GRAVITY * T**2 * up + se3.quat_rotate(X[:, 3:], pim.p)
     turned = se3.quat_multiply(X[:, 3:], se3.matrix_to_quat(pim.R))
     seen = SE3.transform(T_gps, p + se3.quat_rotate(turned, np.tile(PRISM, (len(p), 1)))) + g.gps_origin
-    wrong = np.linalg.norm(seen - z[withheld, 1:4], axis=1)
+    wrong = np.linalg.norm(seen - z[withheld], axis=1)
     line = np.array([np.interp(tz[withheld], at, c) for c in points.T]).T
-    straight = np.linalg.norm(line - z[withheld, 1:4], axis=1)
+    straight = np.linalg.norm(line - z[withheld], axis=1)
     last = states.bias[states.order[-1]]
     s = np.sqrt(np.diag(g.covariance().marginal(f"imubias{last}")))
     chi2 = ", ".join(

@@ -72,6 +72,45 @@ def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
     assert "imu" not in set(bare.ledger["stream"])
 
 
+FAULTS = {
+    "gyro in degrees": (lambda i: replace(i, angular_rate=np.rad2deg(i.angular_rate)), {"imu-contradicted"}),
+    "gyro saturated": (
+        lambda i: replace(i, angular_rate=np.clip(i.angular_rate, *np.quantile(i.angular_rate, [0.1, 0.9]))),
+        {"imu-contradicted", "imu-saturated"},
+    ),
+    "accelerometer in g": (
+        lambda i: replace(i, specific_force=i.specific_force / 9.80665), {"imu-contradicted", "imu-gravity"}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_imu_of_the_graph_that_is_wrong_is_told_of(fault, monkeypatch):
+    """The front end did not use it, so that nothing but the graph can see that it is wrong."""
+    log, submaps = made()
+    change, codes = FAULTS[fault]
+    r = solved(replace(log, streams={"imu": change(log["imu"])}), submaps, monkeypatch, config={"imu": {"use": "auto"}})
+    assert codes <= {f.code for f in r.verdict if f.level == "bad"}
+    right = solved(log, submaps, monkeypatch, config={"imu": {"use": "auto"}})
+    assert not [f for f in right.verdict if f.level == "bad"]
+
+
+@pytest.mark.parametrize("every", [0, 5])
+def test_a_gap_in_the_readings_is_counted_and_bridged_by_the_submaps(every, monkeypatch):
+    """Whenever the factors come in: a node behind the gap waits for its way before it sees gravity."""
+    log, submaps = made()
+    imu = log["imu"]
+    hole = imu.take((imu.times < 20.0) | (imu.times > 26.0))
+    config = {"imu": {"use": "auto"}, "backend": {"look_every": every}}
+    r = solved(replace(log, streams={"imu": hole}), submaps, monkeypatch, config=config)
+    bare = solved(log, submaps, monkeypatch)
+    assert not [f for f in r.verdict if f.level == "bad"]
+    assert r.metric("path_rmse_aligned") < bare.metric("path_rmse_aligned")
+    (said,) = [e for e in r.events if e["event"] == "imu"]
+    assert 0 < sum(said["dropped"].values()) < 10
+    assert 15 < said["ways"] < 24
+
+
 def test_what_the_front_end_used_is_not_used_again(monkeypatch):
     log, submaps = made(frozenset({"laser", "imu"}))
     r = solved(log, submaps, monkeypatch, config={"imu": {"use": "auto"}})

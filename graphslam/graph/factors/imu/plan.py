@@ -47,13 +47,18 @@ def plan_of(
     stream: str,
     cfg: ImuConfig,
     places: dict[int, Place],
+    waiting: int | None = None,
 ) -> Plan:
-    """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason."""
+    """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason.
+
+    A node whose next one is still ``waiting`` for its submap may get a way to it: it does not see gravity yet.
+    """
     t, pause = imu.times, cfg.pause_of(imu.times)
     had = {(r.i, r.j) for r in records if isinstance(r, ImuRecord) and r.stream == stream}
     heard = {r.node for r in records if isinstance(r, ForceRecord) and r.stream == stream}
     pairs: list[tuple[int, int]] = []
     near, dropped = {n for pair in had for n in pair}, Counter[str]()
+    near |= {a for s in submaps for a, b in zip(s.nodes, s.nodes[1:]) if b == waiting}
     for s in submaps:
         for a, b in zip(s.nodes, s.nodes[1:]):
             if (a, b) in had:
