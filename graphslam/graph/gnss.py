@@ -118,15 +118,15 @@ def add_odometer(
         raise DataError("an odometer needs two records", where=stream, got=n)
     P = cfg.covariance_scale * odometry.covariances[1:]
     W = covariance_whiteners(P, n - 1, 6, what=f"increment of {stream}")
-    first = graph.next_factor()
-    graph.ledger.spend(first, f"{n - 1} × odometer", [stream], (float(odometry.times[0]), float(odometry.times[-1])))
+    entry = graph.next_factor()  # of the ledger alone: the stream stays spent, whichever factor is taken out
+    graph.ledger.spend(entry, f"{n - 1} × odometer", [stream], (float(odometry.times[0]), float(odometry.times[-1])))
     poses = [SE3.identity]
     for T in odometry.increments[1:]:
         poses.append(SE3.compose(poses[-1], T))
     graph.structure.append("x", np.array(poses[1:]))
     row = graph.structure.append("odometer", np.zeros(2))
     seconds, twists = np.diff(odometry.times), SE3.log(odometry.increments[1:])
-    graph.insert(OdometerPriorRecord(first, row, (cfg.rate_sigma, cfg.scale_sigma)))
+    graph.insert(OdometerPriorRecord(graph.next_factor(), row, (cfg.rate_sigma, cfg.scale_sigma)))
     for k in range(n - 1):
         graph.insert(OdometerRecord(graph.next_factor(), k, k + 1, row, twists[k], float(seconds[k]), W[k]))
     graph.note("odometer", stream=stream, nodes=n)
@@ -177,6 +177,8 @@ def add_pseudoranges(
             "nodes do not fit the epochs", got=at.shape, wanted=f"({len(ranges.times)},) nodes that are there"
         )
     satellites = plane.satellites(ranges.satellites) if len(ranges.ranges) else np.zeros((0, 3))
+    if graph.structure.count("datum") and graph.gps_origin is not None:
+        satellites = satellites - graph.gps_origin  # fixes that are there already count from the first of them
     used = np.flatnonzero(at[ranges.epochs] >= 0)
     epochs = np.unique(ranges.epochs[used])
     enough = epochs[np.bincount(ranges.epochs[used], minlength=len(at))[epochs] >= UNKNOWNS]
@@ -185,9 +187,9 @@ def add_pseudoranges(
     growth = cfg.growth(ranges.density)
     sigma = cfg.sigma_scale * ranges.sigmas * growth
     fixes = np.array([_fix(satellites[k], ranges.ranges[k], sigma[k]) for k in _rows_of(ranges, enough)])
-    first = graph.next_factor()
+    entry = graph.next_factor()  # of the ledger alone, as that of the odometer
     span = float(ranges.times[epochs[0]]), float(ranges.times[epochs[-1]])
-    graph.ledger.spend(first, f"{len(used)} × pseudorange", [stream], span)
+    graph.ledger.spend(entry, f"{len(used)} × pseudorange", [stream], span)
     # from here on nothing fails
     arms = np.broadcast_to(ranges.lever, (len(ranges.times), 3))
     if not graph.structure.count("datum"):
@@ -205,7 +207,7 @@ def add_pseudoranges(
     ids: list[int] = []
     for m, q in enumerate(used.tolist()):
         k = int(ranges.epochs[q])
-        fid = first if not ids else graph.next_factor()
+        fid = graph.next_factor()
         graph.insert(
             PseudorangeRecord(
                 fid, int(at[k]), float(ranges.times[k]), arms[k], satellites[q], float(ranges.ranges[q]),

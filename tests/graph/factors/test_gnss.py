@@ -11,10 +11,11 @@ from scipy.stats import chi2
 
 from graphslam.app.studies.smartloc import errors, score_of, solve_street
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
-from graphslam.core.gnss import SPEED_OF_LIGHT, TangentPlane
+from graphslam.core.gnss import SPEED_OF_LIGHT, Pseudoranges, TangentPlane
 from graphslam.core.poses import SE3
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
+from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.odometer import OdometerPriorRecord, OdometerRecord
 from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 from graphslam.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
@@ -23,6 +24,8 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.graph.factors.test_gps_space import LEVER, built, fixes_along
+from tests.reference.space_chain import dense_chain
 
 SHORT = SatelliteConfig(seconds=12.0, satellites=7)
 TRUE = PseudorangeConfig(density_scale=10.0, bias_sigma=5.0)
@@ -176,6 +179,48 @@ def test_what_cannot_be_used_is_refused_and_changes_nothing():
     for bad in ({"bias_sigma": -1.0}, {"density_scale": 0.0}, {"bias_every": np.nan}):
         with pytest.raises(ConfigError, match="pseudoranges"):
             PseudorangeConfig(**bad)
+
+
+def test_the_stream_stays_spent_whichever_factor_goes():
+    log = simulate_satellites(1, SHORT)
+    graph = PoseGraph(3)
+    nodes = add_odometer(graph, log["odometry"])
+    ids = add_pseudoranges(graph, log["pseudoranges"], PLANE, nodes)
+    for fid in (0, 1, ids[0], ids[-1]):
+        if fid in graph.records:
+            graph.remove(fid)
+    with pytest.raises(EvidenceReusedError):
+        add_pseudoranges(graph, log["pseudoranges"], PLANE, nodes)
+
+
+def test_fixes_and_pseudoranges_share_their_frame(rng):
+    """Fixes a kilometre from the plane's origin, and exact distances to satellites: one datum holds both."""
+
+    class Flat(TangentPlane):
+        def satellites(self, sent):
+            return sent
+
+    chain = dense_chain(rng, 3, m=8)
+    away = np.array([800.0, -600.0, 50.0, 0.7])
+    gps = fixes_along(chain, rng, level_datum_pose(away), sigma=0.01)
+    graph = built(chain, gps)
+    BatchSolver(graph).solve_to_optimum()
+    nodes = np.array([s.node for s in graph.submaps])
+    there = antenna_positions(graph, nodes, LEVER)[0] + graph.gps_origin
+    up = np.array([[1, 0, 1], [-1, 0.3, 1], [0, 1, 1], [0.2, -1, 1], [0, 0, 1.0], [1, 1, 0.5]])
+    sky = 2e7 * up / np.linalg.norm(up, axis=1)[:, None]
+    n, m = len(nodes), len(sky)
+    times = np.array([s.interval[0] for s in graph.submaps])
+    way = np.linalg.norm(there[:, None] - sky, axis=2) - 300.0
+    ranges = Pseudoranges(
+        times=times, offsets=m * np.arange(n + 1), ranges=way.ravel(), sigmas=np.full(n * m, 0.1),
+        satellites=np.tile(sky, (n, 1)), ids=np.tile(np.arange(m), n), systems=np.ones(n * m, np.int64),
+        elevation=np.full(n * m, 0.7), density=np.full(n * m, 50.0), lever=LEVER,
+    )  # fmt: skip
+    add_pseudoranges(graph, ranges, Flat(52.5, 13.4), nodes)
+    BatchSolver(graph).solve_to_optimum()
+    assert graph.objective()["pseudorange"].chi2 < 1.0
+    np.testing.assert_allclose(antenna_positions(graph, nodes, LEVER)[0] + graph.gps_origin, there, atol=0.02)
 
 
 def test_epochs_without_a_node_are_counted():
