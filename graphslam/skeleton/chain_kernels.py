@@ -131,62 +131,69 @@ def odometry_residual(chain, poses, k, r, J):
 
 
 @nb.njit(cache=True, nogil=True)
+def _sandwich(X, P, Y, M, row, column):
+    """Write ``Xᵀ P Y`` of three (3, 3) to a corner of ``M``."""
+    for i in range(3):
+        a = X[0, i] * P[0, 0] + X[1, i] * P[1, 0] + X[2, i] * P[2, 0]
+        b = X[0, i] * P[0, 1] + X[1, i] * P[1, 1] + X[2, i] * P[2, 1]
+        c = X[0, i] * P[0, 2] + X[1, i] * P[1, 2] + X[2, i] * P[2, 2]
+        for j in range(3):
+            M[row + i, column + j] = a * Y[0, j] + b * Y[1, j] + c * Y[2, j]
+
+
+@nb.njit(cache=True, nogil=True)
 def linearise(chain, poses, blocks, diagonal, upper, g):
     """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
 
+    Odometry: with J the derivative by the later pose, that by the earlier one is ``-J T``, T = [[I, 0], [-[d]×, I]], d
+    the way from one to the other. So with ``M = Jᵀ Ω J`` the blocks are ``Tᵀ M T``, ``-Tᵀ M`` and ``M``.
     Tilt: ``Rᵀ e_z - m`` of two unit vectors, isotropic; in the world its derivative by w is ``e_z × w``.
     """
     N = len(poses.position)
-    Jb = np.empty((6, 6))
-    Ja = np.empty((6, 6))
-    OJa = np.empty((6, 6))
-    OJb = np.empty((6, 6))
-    r = np.empty(6)
-    Or = np.empty(6)
+    J, M, A = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    r, f, h = np.empty(6), np.empty(6), np.empty(6)
     total = 0.0
     for k in range(N - 1):
-        dx, dy, dz = odometry_residual(chain, poses, k, r, Jb)
+        x, y, z = odometry_residual(chain, poses, k, r, J)
         O = chain.information[k if len(chain.information) > 1 else 0]
+        for i in range(6):
+            f[i] = O[i, 0] * r[0] + O[i, 1] * r[1] + O[i, 2] * r[2] + O[i, 3] * r[3] + O[i, 4] * r[4] + O[i, 5] * r[5]
+            total += r[i] * f[i]
         for i in range(3):
-            for j in range(3):
-                Ja[i, j] = -Jb[i, j]
-                Ja[i, 3 + j] = 0.0
-                Ja[3 + i, 3 + j] = -Jb[3 + i, 3 + j]
-            # Rᵀ (d × w)
-            a, b, c = Jb[3 + i, 3], Jb[3 + i, 4], Jb[3 + i, 5]
-            Ja[3 + i, 0] = b * dz - c * dy
-            Ja[3 + i, 1] = c * dx - a * dz
-            Ja[3 + i, 2] = a * dy - b * dx
+            h[i] = J[0, i] * f[0] + J[1, i] * f[1] + J[2, i] * f[2]
+            h[3 + i] = J[3, 3 + i] * f[3] + J[4, 3 + i] * f[4] + J[5, 3 + i] * f[5]
         for i in range(6):
-            s = 0.0
-            for j in range(6):
-                s += O[i, j] * r[j]
-            Or[i] = s
-            total += r[i] * s
-        for i in range(6):
-            for j in range(6):
-                g[k, i] += Ja[j, i] * Or[j]
-                g[k + 1, i] += Jb[j, i] * Or[j]
+            g[k + 1, i] += h[i]
+        g[k, 0] -= h[0] + y * h[5] - z * h[4]
+        g[k, 1] -= h[1] + z * h[3] - x * h[5]
+        g[k, 2] -= h[2] + x * h[4] - y * h[3]
+        g[k, 3] -= h[3]
+        g[k, 4] -= h[4]
+        g[k, 5] -= h[5]
         if not blocks:
             continue
+        turn, way = J[:3, :3], J[3:, 3:]
+        _sandwich(turn, O[:3, :3], turn, M, 0, 0)
+        _sandwich(turn, O[:3, 3:], way, M, 0, 3)
+        _sandwich(way, O[3:, 3:], way, M, 3, 3)
+        for i in range(3):
+            for j in range(3):
+                M[3 + i, j] = M[j, 3 + i]
+        for j in range(6):  # A = Tᵀ M
+            A[0, j] = M[0, j] - z * M[4, j] + y * M[5, j]
+            A[1, j] = M[1, j] + z * M[3, j] - x * M[5, j]
+            A[2, j] = M[2, j] - y * M[3, j] + x * M[4, j]
+            A[3, j], A[4, j], A[5, j] = M[3, j], M[4, j], M[5, j]
+        D, E, U = diagonal[k], diagonal[k + 1], upper[k]
         for i in range(6):
+            D[i, 0] += A[i, 0] - z * A[i, 4] + y * A[i, 5]
+            D[i, 1] += A[i, 1] + z * A[i, 3] - x * A[i, 5]
+            D[i, 2] += A[i, 2] - y * A[i, 3] + x * A[i, 4]
+            for j in range(3):
+                D[i, 3 + j] += A[i, 3 + j]
             for j in range(6):
-                s = t = 0.0
-                for m in range(6):
-                    s += O[i, m] * Ja[m, j]
-                    t += O[i, m] * Jb[m, j]
-                OJa[i, j] = s
-                OJb[i, j] = t
-        for i in range(6):
-            for j in range(6):
-                s = t = c = 0.0
-                for m in range(6):
-                    s += Ja[m, i] * OJa[m, j]
-                    t += Jb[m, i] * OJb[m, j]
-                    c += Ja[m, i] * OJb[m, j]
-                diagonal[k, i, j] += s
-                diagonal[k + 1, i, j] += t
-                upper[k, i, j] += c
+                E[i, j] += M[i, j]
+                U[i, j] -= A[i, j]
     for i in range(N):
         a = chain.up_information[i if len(chain.up_information) > 1 else 0]
         R, m3 = poses.rotation[i], chain.up[i]

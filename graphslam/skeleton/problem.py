@@ -168,17 +168,17 @@ class SkeletonProblem:
     @cached_property
     def odometry_information(self) -> Array:
         """(1 or N - 1, 6, 6)"""
-        return _inverse(self.odometry_covariance, "odometry_covariance")
+        return inverse_covariance(self.odometry_covariance, "odometry_covariance")
 
     @cached_property
     def gps_information(self) -> Array:
         """(1 or G, 3, 3)"""
-        return _inverse(self.gps_covariance, "gps_covariance")
+        return inverse_covariance(self.gps_covariance, "gps_covariance")
 
     @cached_property
     def start_information(self) -> Array:
         """(6, 6)"""
-        return _inverse(self.start_covariance, "start_covariance")
+        return inverse_covariance(self.start_covariance, "start_covariance")
 
     @property
     def sightings(self) -> Sightings:
@@ -229,7 +229,8 @@ class SkeletonProblem:
         return replace(self, landmark=landmark)
 
 
-def _inverse(covariance: Array, name: str) -> Array:
+def inverse_covariance(covariance: Array, name: str) -> Array:
+    """Information matrices of covariances ``(n, d, d)``, or a CovarianceError that says ``name``."""
     try:
         np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(covariance)

@@ -14,6 +14,10 @@ from our forward pass. Each is a process with a limit on time and memory (``--se
 an iteration gains less than 10⁻⁵ of the objective. Its factors measure bearing and range instead of a point, so
 objectives are compared as ours, at its poses.
 
+``--chain 100000,1000000`` relaxes plain pose graphs: odometry, and loops at one pose in a hundred, by elimination along
+the chain, beside GTSAM in the same four ways from the same start. GTSAM's residual of a link differs from ours in how
+it turns the way; its objective is therefore also computed at our poses.
+
 ``--tiles FOLDER`` writes each world to disk and relaxes it from there, one tile of 2·10⁴ poses in memory at a time.
 
 ``--quick``: 1,200 and 4,800 poses, GTSAM's Cholesky at 600 from dead reckoning. Exit code 1 if we end above the
@@ -27,6 +31,7 @@ import json
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -248,6 +253,136 @@ def theirs(poses: int, solver: str, ordering: str, start: str, gigabytes: float)
     }
 
 
+def chain_graph(poses: int, share: float) -> Any:
+    """The laps' odometry, and a loop to the lap before at a share of the poses."""
+    from graphslam.core.se3 import quat_to_matrix, so3_exp
+    from graphslam.sim.laps import LapsConfig, draw_laps
+    from graphslam.skeleton.chain_graph import ChainGraph
+
+    world = draw_laps(LapsConfig(poses=poses))
+    per, rng = world.shared.shape[0], np.random.default_rng(0)
+    j = np.sort(rng.choice(np.arange(per, poses), int(share * poses), replace=False))
+    R, p = world.truth
+    R, p = R[0].T @ R, (p - p[0]) @ R[0]
+
+    def measured(i: Any, j: Any, turn: float, way: float) -> Any:
+        Q = quat_to_matrix(so3_exp(turn * rng.standard_normal((len(i), 3))))
+        d = np.einsum("nji,nj->ni", R[i], p[j] - p[i]) + way * rng.standard_normal((len(i), 3))
+        return R[i].swapaxes(1, 2) @ R[j] @ Q, d
+
+    k, ends = np.arange(poses - 1), np.column_stack([j - per, j])
+    step, loop = np.diag([5e-4**2] * 3 + [0.01**2] * 3), np.diag([2e-3**2] * 3 + [0.02**2] * 3)
+    return ChainGraph(*measured(k, k + 1, 5e-4, 0.01), step, ends, *measured(j - per, j, 2e-3, 0.02), loop)
+
+
+def our_chain(poses: int, share: float, file: str) -> dict[str, Any]:
+    """A chain with loops, by elimination along the chain."""
+    from graphslam.skeleton.chain_graph import relax_chain
+
+    relax_chain(chain_graph(2000, share))
+    graph = chain_graph(poses, share)
+    begin = time.process_time()
+    found = relax_chain(graph)
+    seconds = time.process_time() - begin
+    np.savez(file, R=found.poses.rotation, p=found.poses.position)
+    return {
+        "seconds": seconds,
+        "history": found.history,
+        "move": found.largest_move,
+        "predicted": found.predicted,
+        "peak": peak(),
+    }
+
+
+def their_chain(poses: int, share: float, file: str, solver: str, ordering: str, gigabytes: float) -> dict[str, Any]:
+    """The same with GTSAM's Gauss-Newton; and GTSAM's objective at our poses."""
+    import gtsam
+
+    from graphslam.core.se3 import matrix_to_quat
+
+    graph = chain_graph(poses, share)
+    start = graph.dead_reckoning()
+    resource.setrlimit(resource.RLIMIT_AS, (int(gigabytes * 1e9),) * 2)
+    begin = time.process_time()
+    factors, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
+    k = np.arange(poses - 1)
+    for ends, Z, d, cov in (
+        (np.column_stack([k, k + 1]), graph.rotation, graph.translation, graph.covariance[0]),
+        (graph.ends, graph.loop_rotation, graph.loop_translation, graph.loop_covariance[0]),
+    ):
+        model, turns = noise(cov), matrix_to_quat(Z)
+        for n, (i, j) in enumerate(ends.tolist()):
+            x, y, z, w = turns[n]
+            factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), d[n]), model))
+    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+
+    def values(R: np.ndarray, p: np.ndarray) -> Any:
+        out = gtsam.Values()
+        for i in range(poses):
+            out.insert(i, gtsam.Pose3(gtsam.Rot3(R[i]), p[i]))
+        return out
+
+    initial = values(start.rotation, start.position)
+    built = time.process_time() - begin
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setLinearSolverType(solver)
+    parameters.setOrderingType(ordering)
+    parameters.setRelativeErrorTol(1e-6)
+    begin = time.process_time()
+    optimizer = gtsam.GaussNewtonOptimizer(factors, initial, parameters)
+    result = optimizer.optimize()
+    seconds = time.process_time() - begin
+    top = peak()
+    with np.load(file) as ours:
+        mine = 2.0 * factors.error(values(ours["R"], ours["p"]))
+    return {
+        "build": built,
+        "seconds": seconds,
+        "iterations": optimizer.iterations(),
+        "objective": 2.0 * factors.error(result),
+        "ours": mine,
+        "peak": top,
+    }
+
+
+def show_chain(poses: int, share: float, seconds: float, gigabytes: float) -> int:
+    """A chain with loops, ours beside GTSAM; how many of ours end above GTSAM's objective by 1e-6 of it."""
+    failed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder) / "ours.npz")
+        mine, why = child("chain", str(poses), str(share), file)
+        if mine is None:
+            print(f"chain of {poses}: failed: {why}")
+            return 1
+        print(
+            f"\nchain of {poses:,} poses with {int(share * poses):,} loops, from dead reckoning: {mine['seconds']:.2f} "
+            f"CPU s, {len(mine['history']) - 1} steps, {mine['peak']:.2f} GB, last step moved {mine['move']:.1e} m, "
+            f"predicted {mine['predicted']:.1e}; objective " + " → ".join(f"{J:.7g}" for J in mine["history"]),
+            flush=True,
+        )
+        best: float | None = None
+        for solver in SOLVERS:
+            for ordering in ORDERINGS:
+                g, why = child(
+                    "their_chain", str(poses), str(share), file, solver, ordering, str(gigabytes), timeout=seconds
+                )
+                if g is None:
+                    print(f"  GTSAM {solver} {ordering}: {why}", flush=True)
+                    continue
+                above = g["ours"] / g["objective"] - 1.0
+                failed += above > 1e-6
+                best = g["seconds"] if best is None else min(best, g["seconds"])
+                print(
+                    f"  GTSAM {solver} {ordering}: build {g['build']:.1f} s, {g['seconds']:.1f} s in {g['iterations']} "
+                    f"iterations, {g['peak']:.2f} GB, {g['seconds'] / mine['seconds']:.1f} × ours; its objective "
+                    f"{g['objective']:.7g}, ours by its residuals {above:+.1e}",
+                    flush=True,
+                )
+        if best is not None:
+            print(f"  best of GTSAM: {best:.1f} s, {best / mine['seconds']:.1f} × ours")
+    return failed
+
+
 def child(kind: str, *arguments: str, timeout: float | None = None) -> tuple[dict[str, Any] | None, str]:
     """One run in a fresh process; None and the reason where it does not end."""
     command = [sys.executable, "-m", "tests.benchmarks.bench_scale", "--child", kind, *arguments]
@@ -292,16 +427,23 @@ def main() -> int:
     parser.add_argument("--starts", default="odometry,forward", help="from where GTSAM starts")
     parser.add_argument("--seconds", type=float, default=1800.0, help="wall time for one run of GTSAM")
     parser.add_argument("--gigabytes", type=float, default=10.0, help="address space for one run of GTSAM")
+    parser.add_argument("--chain", default="", help="sizes of plain pose graphs: a chain with loops")
+    parser.add_argument("--loops", type=float, default=0.01, help="loops of a chain, for each pose")
     parser.add_argument("--tiles", default="", help="folder for tiles: also relax each size from disk")
     parser.add_argument("--steps", type=int, default=30, help="most steps of a relaxation from disk")
     parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
         kind, n, *rest = args.child
-        made = (
-            ours(int(n), int(rest[0])) if kind == "ours" else theirs(int(n), rest[0], rest[1], rest[2], float(rest[3]))
-        )
-        print(json.dumps(made))
+        runs_of: dict[str, Any] = {
+            "ours": lambda: ours(int(n), int(rest[0])),
+            "theirs": lambda: theirs(int(n), rest[0], rest[1], rest[2], float(rest[3])),
+            "draw": lambda: draw_tiles(int(n), rest[0]),
+            "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1])),
+            "chain": lambda: our_chain(int(n), float(rest[0]), rest[1]),
+            "their_chain": lambda: their_chain(int(n), float(rest[0]), rest[1], rest[2], rest[3], float(rest[4])),
+        }
+        print(json.dumps(runs_of[kind]()))
         return 0
     sizes = [1200, 4800] if args.quick else [int(n) for n in args.poses.split(",") if n]
     beside = 600 if args.quick else args.gtsam
@@ -356,6 +498,8 @@ def main() -> int:
                     )
         if best is not None:
             print(f"  best of GTSAM from dead reckoning: {best:.1f} s, {best / mine['seconds']:.1f} × ours")
+    for n in [int(k) for k in ("2000" if args.quick else args.chain).split(",") if k]:
+        failed += show_chain(n, args.loops, args.seconds, args.gigabytes)
     if args.tiles:
         for n in sizes:
             folder = str(Path(args.tiles) / str(n))

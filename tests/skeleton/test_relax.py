@@ -112,6 +112,20 @@ def test_a_network_too_large_to_write_out_is_refused_with_its_size(problem: Skel
         relax_skeleton(problem, RelaxConfig(method="blocks", limit=1e5))
 
 
+@pytest.mark.parametrize("start", ["odometry", "chain", "forward"])
+def test_a_long_drift_is_undone_from_every_start(start: str) -> None:
+    """GPS on the first lap only and turns ten times as noisy: the chain is metres off, landmarks pull laps together."""
+    world = draw_laps(LapsConfig(poses=1200, laps=6, begin=4, reach=6, odometry=(5e-3, 0.01), gps_laps=1), seed=6)
+    problem = world.problem()
+    config = RelaxConfig(start=start, split=False, levels=Levels(10, 40))  # type: ignore[arg-type]
+    best = relax_skeleton(problem, config, world.truth)
+    assert rms(chain_start(problem), world.truth) > 1.0
+    found = relax_skeleton(problem, config)
+    assert found.converged == "poses"
+    assert found.objective == pytest.approx(best.objective, abs=1e-3)
+    assert farthest(found.poses, best.poses) < 1e-3
+
+
 # ---- wrong unions ----------------------------------------------------------------------------------------------
 
 
