@@ -70,7 +70,7 @@ def campus(config: CampusConfig, *, seed: int = 0) -> World:
     route = plan_route(waypoints, CORNER_RADIUS, where="campus")
     vertices, triangles = mesh.build()
     return World(
-        name="campus" + (f"-far-{config.session}" if config.far else f"-{config.session}" if config.session else ""),
+        name="campus" + (f"-far{config.session}" if config.far else f"-{config.session}" if config.session else ""),
         vertices=vertices,
         triangles=triangles,
         waypoints=waypoints,

@@ -13,7 +13,9 @@ the way; without ``<where>``: mean over the way.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +23,11 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.app.studies import segslam_report as tables
+from graphslam.app.studies.campus_sessions import run_sessions_trial
 from graphslam.app.studies.campus_trial import BLOCKS, KINDS, CampusTrialConfig, run_campus_trial
 from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam.core.gaussian import chi2_mean_bounds
+from graphslam.evaluate.montecarlo import Measurement
 from graphslam.sim.campus_config import campus_preset
 
 _THIN = {"every": 3, "every_beam": 3}
@@ -37,6 +41,12 @@ round and through."""
 QUICK_WORLDS = {
     "quick": replace(WORLDS["block"], campus=campus_preset("quick", size=(66.0, 66.0), block=55.0, every=3, speed=1.5))
 }
+SESSIONS = {
+    "sessions": CampusTrialConfig(
+        campus=campus_preset("full", size=(70.0, 215.0), block=59.0, visits=1, open_share=1.0, movers=4, **_THIN)
+    )
+}
+"""Three blocks one behind the other: two sessions round the first, one round the last."""
 PAIRED = ("ate_indoor", "ate_indoor_own", "ate_indoor_anchored", "ate_outdoor", "ate", "end_error", "angle_error")
 DRAWN = {"ate_indoor": "ATE inside, path aligned as a whole [m]", "angle_error": "corridor's angle off [°]"}
 PLACES = ("middle", "indoor", "end")
@@ -47,9 +57,20 @@ class CampusStudy(WorldsStudy[CampusTrialConfig]):
 
     run_one = staticmethod(run_campus_trial)
 
+    def worlds(self, quick: bool) -> tuple[str, ...]:
+        """The paired runs, and the sessions."""
+        return super().worlds(quick) + (() if quick else tuple(SESSIONS))
+
+    def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
+        """See the base."""
+        return partial(run_sessions_trial, SESSIONS[world]) if world in SESSIONS else super().trial(world, quick)
+
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
         """``errors`` of every kind, ``pairs`` of each against ``alone`` with a sign test, ``nees``, ``cpu``."""
-        out = {"errors": error_table(table), "pairs": pair_table(table), "nees": nees_table(table)}
+        pairs = table[~table["world"].isin(SESSIONS)]
+        out = {"errors": error_table(pairs), "pairs": pair_table(pairs), "nees": nees_table(pairs)}
+        if len(pairs) < len(table):
+            out["sessions"] = session_table(table)
         if not timings.empty:
             out["cpu"] = tables.seconds_table(timings)
         return out
@@ -119,6 +140,14 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
                     row |= {"low": low / dof, "high": high / dof, "runs": runs}
                 out.append(row)
     return pd.DataFrame(out)
+
+
+def session_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean over the runs of everything said of sessions that were merged; of those refused, the share."""
+    rows = table[table["world"].isin(SESSIONS) & (table["quantity"] != "failed")]
+    wide = rows.pivot_table(index="algorithm", columns="quantity", values="value", aggfunc="mean", sort=False)
+    wide.insert(0, "runs", rows.groupby("algorithm")["run"].nunique())
+    return wide.reset_index()
 
 
 STUDY = CampusStudy(

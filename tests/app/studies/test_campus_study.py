@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.campus import QUICK_WORLDS, STUDY, nees_table, pair_table
-from graphslam.app.studies.campus_trial import BLOCKS, KINDS, angle_errors, campus_figures
+from graphslam.app.studies.campus import QUICK_WORLDS, SESSIONS, STUDY, nees_table, pair_table, session_table
+from graphslam.app.studies.campus_sessions import seam, start_of
+from graphslam.app.studies.campus_trial import BLOCKS, KINDS, angle_errors, campus_figures, submap_lift
 from graphslam.app.studies.definition import find_study
+from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
+from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
+from graphslam.frontends.scan_window.front_end import ScanWindow
+from graphslam.sim.campus import simulate_campus
 
 
 @pytest.fixture(scope="module")
@@ -89,4 +95,49 @@ def test_nees_has_bounds_on_both_sides() -> None:
 def test_it_is_found_by_its_name() -> None:
     assert find_study("campus") is STUDY
     assert STUDY.worlds(quick=True) == ("quick",)
+    assert STUDY.worlds(quick=False) == ("blocks", "block", "sessions")
+    assert STUDY.trial("sessions", False).args == (SESSIONS["sessions"],)
     assert STUDY.default_trials(quick=False) == 20
+
+
+def test_a_seam_is_held_against_the_covariance_that_is_stated() -> None:
+    """0.3 m off along x, stated with σ of 0.1 m there: 9 of χ² over six numbers; four times that is beyond 3 σ."""
+    covariance = np.diag([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.04])
+    true = SE3.exp(np.array([0.0, 0.0, 0.5, 10.0, 4.0, 0.1]))
+
+    def told(off: float) -> dict[str, float]:
+        base = SE3.compose(true, SE3.exp(np.array([0.0, 0, 0, -off, 0, 0])))
+        placed = SimpleNamespace(T_world_base=base, covariance=covariance)
+        placed.attached = SimpleNamespace(used=[1, 2], dropped=1)
+        return {m.quantity: m.value for m in seam(SimpleNamespace(sessions=[None, placed]), 1, "overlap", true)}
+
+    near, far = told(0.3), told(0.6)
+    assert near["seam_error"] == pytest.approx(0.3)
+    assert near["seam_nees"] == pytest.approx(9.0 / 6.0)
+    assert near["seam_sigma"] == pytest.approx(np.sqrt(0.06))
+    assert (near["seam_within_3_sigma"], far["seam_within_3_sigma"]) == (1.0, 0.0)
+    assert (near["ties"], near["ties_dropped"]) == (2.0, 1.0)
+    rows = [("sessions", run, "overlap", -1, q, v) for run, d in enumerate((near, far)) for q, v in d.items()]
+    table = session_table(pd.DataFrame(rows, columns=["world", "run", "algorithm", "submap", "quantity", "value"]))
+    assert table["runs"].tolist() == [2]
+    assert table["seam_within_3_sigma"].tolist() == [0.5]
+
+
+def test_the_true_start_of_a_session_is_where_its_first_submap_begins(sessions: list[SensorLog]) -> None:
+    """Level, at the first step's stamp, and the sessions in one world."""
+    config = SESSIONS["sessions"]
+    for log in sessions:
+        start = start_of(log, config)
+        submap = next(ScanWindow(config.front_end).submaps(log, seed=SeedTree(0)))
+        at = log.truth.trajectory.interpolate(np.array([submap.interval[0]]))
+        world = SE3.compose(np.asarray(log.meta["T_world_frame"]), at[0])
+        np.testing.assert_allclose(start[:2], world[:2], atol=1e-9)
+        assert start[2] == pytest.approx(world[2] - submap_lift(config.front_end.submap))
+        np.testing.assert_allclose(start[3:5], 0.0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def sessions() -> list[SensorLog]:
+    small = replace(SESSIONS["sessions"].campus, every=15, every_beam=30)
+    logs = [simulate_campus(replace(small, session=k, far=k == 2), 1) for k in (0, 2)]
+    return [log.slice(0.0, 15.0) for log in logs]
