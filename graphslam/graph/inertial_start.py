@@ -13,13 +13,15 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix, so3_exp
-from graphslam.graph.factors.imu.preintegration import Preintegrated, preintegrate
+from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma, preintegrate
 
 FIRST = 8
 """Positions of the first stretch that is solved; each next one is twice as long."""
 ROUNDS = 4
 """Gauss–Newton steps on the bias in each stretch."""
 PLACE, SPEED = slice(3, 6), slice(6, 9)
+SPEED_SIGMA = 0.2
+"""Of a change of velocity by positions and readings, where the two are compared [m/s]."""
 STEP = 1e-4
 """Of the numerical derivative by the bias [rad/s]."""
 
@@ -51,19 +53,28 @@ def inertial_start(imu: Imu, times: Array, positions: Array) -> tuple[Array, Arr
     n = len(times)
     if n < 4:
         raise DataError("a start by positions needs four of them", got=n)
-    bias, stretch = np.zeros(3), FIRST
+    sigma, stretch = bias_sigma(imu.noise)[:3], min(FIRST, n)
+    # over a long first stretch an unknown bias turns by radians, so that several are tried
+    starts = np.concatenate([np.zeros((1, 3)), np.diag(sigma), -np.diag(sigma)])
+    tried = [_settled(imu, times[:stretch], positions[:stretch], start) for start in starts]
     while True:
-        stretch = min(stretch, n)
-        at, points = times[:stretch], positions[:stretch]
-        for _ in range(ROUNDS):
-            pim = preintegrate(imu, at[:-1], at[1:], np.append(bias, np.zeros(3)))
-            r, R = _contradiction(pim, points, np.zeros(3))
-            J = np.stack([(_contradiction(pim, points, d)[0] - r) / STEP for d in STEP * np.eye(3)], axis=1)
-            scale = 1e-6 * np.trace(J.T @ J) / 3.0  # an axis about which nothing turned stays as it is
-            bias = bias - np.linalg.solve(J.T @ J + scale * np.eye(3), J.T @ r)
+        _, bias, R = min(tried, key=lambda found: found[0])
         if stretch == n:
             return matrix_to_quat(R), bias
-        stretch *= 2
+        stretch = min(2 * stretch, n)
+        tried = [_settled(imu, times[:stretch], positions[:stretch], bias)]
+
+
+def _settled(imu: Imu, times: Array, positions: Array, bias: Array) -> tuple[float, Array, Array]:
+    """Cost, bias and first attitude after some Gauss–Newton steps from a bias; a large one is dear, as its σ says."""
+    weight = (SPEED_SIGMA / bias_sigma(imu.noise)[:3]) ** 2
+    for _ in range(ROUNDS):
+        pim = preintegrate(imu, times[:-1], times[1:], np.append(bias, np.zeros(3)))
+        r, R = _contradiction(pim, positions, np.zeros(3))
+        J = np.stack([(_contradiction(pim, positions, d)[0] - r) / STEP for d in STEP * np.eye(3)], axis=1)
+        here = float(r @ r + weight @ bias**2), bias, R
+        bias = bias - np.linalg.solve(J.T @ J + np.diag(weight), J.T @ r + weight * bias)
+    return here
 
 
 def turned_on(attitude: Array, imu: Imu, times: Array, bias: Array) -> Array:

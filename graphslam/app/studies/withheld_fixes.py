@@ -253,6 +253,7 @@ STUDY = WithheldStudy(
     {
         "euroc-1s": _FLIGHT,
         "euroc-2s": replace(_FLIGHT, every=2.0),
+        "euroc-5s": replace(_FLIGHT, every=5.0),
         "kitti-2s": _DRIVE,
         "kitti-4s": replace(_DRIVE, every=4.0),
     },
