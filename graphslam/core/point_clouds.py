@@ -32,6 +32,13 @@ class CloudSource(Protocol):
         """Points ``(m, 3)`` of scan ``k`` [m], sensor frame, all finite; m may be less than ``counts[k]``."""
         ...
 
+    def ages(self, k: int) -> Array | None:
+        """Time from each point of ``cloud(k)`` to the stamp of its scan ``(m,)`` [s]; negative: measured later.
+
+        None where points have no stamps of their own: all are taken to be of the scan's.
+        """
+        ...
+
     def packed(self) -> bytes:
         """Bytes that tell these points from others, without decoding them."""
         ...
@@ -47,15 +54,18 @@ class ArrayClouds:
         Metres, sensor frame, all finite.
     offsets : (n + 1,) int64
         Points of scan k are rows ``offsets[k]:offsets[k + 1]``.
+    before : (q,), optional
+        Time from each point to the stamp of its scan [s]; negative: measured later.
 
     Raises
     ------
     DataError
-        Offsets that do not partition the points; a point that is not finite.
+        Offsets that do not partition the points; a point or a time that is not finite.
     """
 
     points: Array
     offsets: npt.NDArray[np.int64]
+    before: Array | None = None
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points, dtype=np.float64)
@@ -66,6 +76,11 @@ class ArrayClouds:
             raise DataError(f"point {k} is not finite", got=points[k], wanted="finite numbers")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "offsets", check_offsets(self.offsets, len(points)))
+        if self.before is not None:
+            before = np.ascontiguousarray(self.before, dtype=np.float64)
+            if before.shape != (len(points),) or not np.all(usable(before)):
+                raise DataError("times of points are impossible", got=before.shape, wanted=f"({len(points)},), finite")
+            object.__setattr__(self, "before", before)
 
     @property
     def counts(self) -> npt.NDArray[np.int64]:
@@ -76,9 +91,13 @@ class ArrayClouds:
         """See :class:`CloudSource`."""
         return self.points[self.offsets[k] : self.offsets[k + 1]]
 
+    def ages(self, k: int) -> Array | None:
+        """See :class:`CloudSource`."""
+        return None if self.before is None else self.before[self.offsets[k] : self.offsets[k + 1]]
+
     def packed(self) -> bytes:
         """See :class:`CloudSource`."""
-        return self.points.tobytes()
+        return self.points.tobytes() + (b"" if self.before is None else self.before.tobytes())
 
 
 def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:
@@ -140,9 +159,9 @@ class PointClouds:
             object.__setattr__(self, name, a)
 
     @classmethod
-    def from_arrays(cls, times: Any, points: Any, offsets: Any, **rest: Any) -> PointClouds:
+    def from_arrays(cls, times: Any, points: Any, offsets: Any, before: Any = None, **rest: Any) -> PointClouds:
         """Scans held in memory; see :class:`ArrayClouds` for the arguments."""
-        return cls(times=times, source=ArrayClouds(points, offsets), **rest)
+        return cls(times=times, source=ArrayClouds(points, offsets, before), **rest)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -156,6 +175,11 @@ class PointClouds:
         """Points ``(m, 3)`` of record ``k`` [m], sensor frame; decodes what is needed."""
         assert self.index is not None
         return self.source.cloud(int(self.index[k]))
+
+    def ages(self, k: int) -> Array | None:
+        """Time from each point of record ``k`` to its stamp ``(m,)`` [s]; None: points have no stamps of their own."""
+        assert self.index is not None
+        return self.source.ages(int(self.index[k]))
 
     def __iter__(self) -> Iterator[Array]:
         return (self.cloud(k) for k in range(len(self)))

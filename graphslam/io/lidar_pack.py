@@ -100,6 +100,10 @@ class PackedClouds:
         units = self._points[self._offsets[k] : self._offsets[k + 1]]
         return np.multiply(units[np.all(units != MISSING, axis=1)], self._step, dtype=np.float64)
 
+    def ages(self, k: int) -> Array | None:
+        """See :class:`~graphslam.core.point_clouds.CloudSource`: packs have none."""
+        return None
+
     def packed(self) -> bytes:
         """See :class:`~graphslam.core.point_clouds.CloudSource`: the file as it is, and the metres of one unit."""
         return np.float64(self._step).tobytes() + self._path.read_bytes()

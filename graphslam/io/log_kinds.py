@@ -113,11 +113,15 @@ def _pack_clouds(s: PointClouds) -> dict[str, Any]:
     """Decodes every scan of the stream, and no other of its source."""
     clouds = [np.asarray(c, dtype=np.float64).reshape(-1, 3) for c in s]
     offsets = np.concatenate([[0], np.cumsum([len(c) for c in clouds])]).astype(np.int64)
-    return {"points": np.concatenate(clouds) if clouds else np.zeros((0, 3)), "offsets": offsets}
+    ages = [s.ages(k) for k in range(len(s))]
+    packed = {"points": np.concatenate(clouds) if clouds else np.zeros((0, 3)), "offsets": offsets}
+    if clouds and all(a is not None for a in ages):
+        packed["before"] = np.concatenate([a for a in ages if a is not None])
+    return packed
 
 
 def _unpack_clouds(a: Arrays) -> dict[str, Any]:
-    return {"source": ArrayClouds(a["points"], a["offsets"])}
+    return {"source": ArrayClouds(a["points"], a["offsets"], a.get("before"))}
 
 
 def _floats(*names: str) -> dict[str, Any]:
@@ -154,7 +158,7 @@ KINDS: dict[str, Kind] = {
         {**_TIMES, "origin": floats(3), "T_base_sensor": floats(7)},
         _pack_clouds,
         _unpack_clouds,
-        {"points": floats("q", 3), "offsets": ints("n+1")},
+        {"points": floats("q", 3), "offsets": ints("n+1"), "before": floats("q", optional=True)},
     ),
     "imu": Kind(
         Imu,

@@ -22,8 +22,9 @@ class RefineConfig:
     """Longest time of such a chunk, for robots that stand still [s]."""
     chunk_turn: float = 0.5
     """In the plane: greatest turn within such a chunk [rad]; a scanner that looks one way soon sees other walls."""
-    reach: float = 10.0
-    """Chunks whose centres are nearer than this may see the same surfaces [m]."""
+    reach: float | None = None
+    """Chunks whose centres are nearer than this may see the same surfaces [m]; None: the range that three quarters of
+    the returns of the log stay below, 10 m at least and 30 m at most."""
     distances: tuple[float, ...] = (1.0, 0.6, 0.4, 0.3)
     """Greatest distance of a pair in each round over all passes [m]."""
     spacing: float = 0.2
@@ -42,7 +43,7 @@ class RefineConfig:
     def __post_init__(self) -> None:
         for name in ("chunk_length", "chunk_time", "chunk_turn", "reach", "spacing", "turn", "knot"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
+            if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")
         if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
             raise ConfigError(f"refine: distances = {self.distances}; wanted at least one, all > 0 m")

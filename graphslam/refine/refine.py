@@ -40,6 +40,10 @@ WIDE = 3.0, 2.0
 """Greatest distances of pairs before those of the configuration, where no guide brought passes together [m]."""
 DOUBTED = 0.2
 """Residuals below this share of the greatest distance of a pair are not doubted."""
+REACH = 10.0, 30.0
+"""Least and greatest distance of chunks that may see the same surfaces, where the log says which [m]."""
+FEWEST = 3
+"""Chunks of one pass that a chunk is paired with at least; over a reach there lie so many as fit."""
 KEPT = 2
 """Surfaces are found anew in so many rounds over all passes; then the steps about a point move no more."""
 
@@ -238,6 +242,14 @@ class _Attempt:
     walk: float
 
 
+def _reach(steps: Scans) -> float:
+    """The range that three quarters of the returns stay below: two places that far apart see the same things [m]."""
+    points = (steps.points - steps.origins)[steps.returns]
+    if not len(points):
+        return REACH[0]
+    return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
+
+
 class _Work:
     """A refinement while it goes on."""
 
@@ -257,6 +269,8 @@ class _Work:
         self.surfaces: Surfaces | None = None
         self.first: Surfaces | None = None
         self.length = float(steps.path_length[-1])
+        self.reach = config.reach if config.reach is not None else _reach(steps)
+        self.most = max(FEWEST, round(self.reach / config.chunk_length))
 
     def run(self) -> Refinement:
         """All rounds; from the odometry's path once more where the start turns out to be wrong."""
@@ -337,7 +351,7 @@ class _Work:
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
             if self.first is None:
                 self.first = self.surfaces
-        self.chunks = chunk_pairs(self.cloud, self.poses, self.config.reach, passes=passes)
+        self.chunks = chunk_pairs(self.cloud, self.poses, self.reach, self.most, passes=passes)
         self.found = associate(
             self.cloud,
             self.surfaces,
@@ -375,7 +389,7 @@ class _Work:
 
     def follow_guides(self) -> tuple[Guides, npt.NDArray[np.bool_]]:
         """Bring passes together as the start has them where the scans between allow it; which of the guides they do."""
-        guides = find_guides(self.cloud, self.start, 0.5 * self.config.reach)
+        guides = find_guides(self.cloud, self.start, 0.5 * self.reach)
         if not len(guides):
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
@@ -404,7 +418,7 @@ class _Work:
             cloud,
             surfaces,
             poses,
-            chunk_pairs(cloud, poses, self.config.reach, passes=True),
+            chunk_pairs(cloud, poses, self.reach, self.most, passes=True),
             distance=self.config.distances[0],
             every=4 * self.every,
             within=self.motion.within,

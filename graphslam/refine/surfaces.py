@@ -170,8 +170,11 @@ NEIGHBOURS = 5
 """Chunks that follow each other so closely are neighbours on the way; others are passes of the same place."""
 
 
-def chunk_pairs(cloud: Cloud, poses: Array, reach: float, *, passes: bool) -> ChunkPairs:
-    """Chunks next to each other on the way; with ``passes`` also those whose centres are within ``reach`` [m]."""
+def chunk_pairs(cloud: Cloud, poses: Array, reach: float, most: int, *, passes: bool) -> ChunkPairs:
+    """Chunks next to each other on the way; with ``passes`` also those whose centres are within ``reach`` [m].
+
+    Of one pass, no more than ``most`` chunks are paired with a chunk: the nearest.
+    """
     C, d = cloud.chunks, cloud.points.shape[1]
     first = np.searchsorted(cloud.chunk, np.arange(C))
     centres = np.add.reduceat(poses[:, :d], first) / np.diff(np.append(first, len(cloud.chunk)))[:, None]
@@ -180,24 +183,20 @@ def chunk_pairs(cloud: Cloud, poses: Array, reach: float, *, passes: bool) -> Ch
     if passes and C > 2:
         near = cKDTree(centres).query_pairs(reach, output_type="ndarray").astype(np.int64)
         near = np.sort(near, axis=1)[:, ::-1]
-        pairs.append(_nearest(near[near[:, 0] - near[:, 1] > NEXT], centres))
+        pairs.append(_nearest(near[near[:, 0] - near[:, 1] > NEXT], centres, most))
     every = np.concatenate(pairs)
     every = every[np.lexsort((every[:, 1], every[:, 0]))]
     return ChunkPairs(np.ascontiguousarray(every[:, 0]), np.ascontiguousarray(every[:, 1]))
 
 
-def _nearest(pairs: Index, centres: Array) -> Index:
-    """Of the partners of a chunk that follow each other, and so are one pass, the :data:`MOST` nearest."""
+def _nearest(pairs: Index, centres: Array, most: int) -> Index:
+    """Of the partners of a chunk that follow each other, and so are one pass, so many of the nearest."""
     a, b = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
     group = np.cumsum((np.diff(a, prepend=-1) != 0) | (np.diff(b, prepend=-9) > 1))
     order = np.lexsort((np.linalg.norm(centres[a] - centres[b], axis=1), group))
     first = np.searchsorted(group[order], group[order])
-    chosen = order[np.arange(len(order)) - first < MOST]
+    chosen = order[np.arange(len(order)) - first < most]
     return np.column_stack([a, b])[chosen]
-
-
-MOST = 3
-"""Chunks of one other pass that a chunk is compared with."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,186 @@
+"""A point map in levels of Gaussian cells, coarse to fine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.frontends.lidar_odometry import cell_kernels as kernels
+
+PARTS = 512
+"""Parts of space whose gradients are told apart."""
+_FIRST_ROOM = 1 << 12
+
+
+@dataclass(frozen=True, slots=True)
+class LevelConfig:
+    """One level.
+
+    Parameters
+    ----------
+    size : float
+        Edge of a cell [m].
+    least : float
+        σ that is added to a cell's own [m]: on coarse levels a quarter of the cell, or the weights are 0 before the
+        match begins.
+    planes : bool
+        Only across surfaces do cells hold a point: along them a cell's centre is where scans happened to fall.
+    """
+
+    size: float
+    least: float
+    planes: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Normal equations at a pose.
+
+    Parameters
+    ----------
+    H, g : (6, 6), (6,)
+        Right tangent, rotation first.
+    every : (6, 6)
+        What the same points would say with surfaces turned anyhow.
+    overlap : float
+        Sum of the weights over the number of points.
+    known : float
+        Share of the points with a cell near them that says something.
+    quality : float
+        Mean weight of these: whether the scan fits where there is something to fit to.
+    misfit : float
+        Weighted mean of the squared Mahalanobis distance.
+    """
+
+    H: Array
+    g: Array
+    every: Array
+    overlap: float
+    known: float
+    quality: float
+    misfit: float
+
+
+class CellMap:
+    """One level of Gaussian cells (see `cell_kernels`)."""
+
+    def __init__(self, config: LevelConfig) -> None:
+        self.config = config
+        self.cells = _empty(_FIRST_ROOM)
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self.cells.told[: self.cells.used[0]]))
+
+    @property
+    def centres(self) -> Array:
+        """Of the cells that count ``(n, 3)``, world [m]."""
+        used = int(self.cells.used[0])
+        return np.asarray(self.cells.centre[:used][self.cells.told[:used] > 0])
+
+    def add(self, points: Array, scan: int) -> None:
+        """Put points ``(n, 3)`` of the world into the cells they fall into; ``scan`` is a number that rises."""
+        # every point may make a block, and a match asks for as many again
+        self.room(2 * len(points))
+        c = self.config
+        kernels.add_points(self.cells, points, scan, c.size, c.least, c.planes)
+
+    def room(self, more: int) -> None:
+        """Make room for blocks."""
+        c = self.cells
+        if int(c.used[0]) + more > len(c.cube):
+            self._copy(-1, more)
+
+    def keep_since(self, scan: int) -> None:
+        """Forget the cells that no scan saw since."""
+        self._copy(scan, 0)
+
+    def _copy(self, scan: int, more: int) -> None:
+        c = self.cells
+        kept = int(np.count_nonzero((c.seen[: c.used[0]] >= scan) & (c.number[: c.used[0]] > 0)))
+        out = _empty(2 * (kept + more))
+        kernels.keep_since(c, out, scan)
+        self.cells = out
+
+    def nearest(self, points: Array) -> npt.NDArray[np.int64]:
+        """The cell of each point ``(n, 3)``, as an index; negative: none."""
+        self.room(len(points))
+        out = np.empty(len(points), np.int64)
+        kernels.nearest_cells(self.cells, points, self.config.size, out)
+        return out
+
+    def scores(self, points: Array, R: Array, t: Array) -> Array:
+        """How well points ``(n, 3)`` lie on cells at rotations ``(m, 3, 3)`` about ``t``: 0 to 1."""
+        self.room(len(points) * 8)
+        out, step = np.empty(len(R)), max(1, 8)
+        sigma = 0.4 * self.config.size
+        for k in range(0, len(R), step):
+            self.room(len(points) * step)
+            kernels.score_rotations(self.cells, points, R[k : k + step], t, self.config.size, sigma, out[k : k + step])
+        return out
+
+    def fit(self, points: Array, R: Array, t: Array, scale: float) -> Fit:
+        """Normal equations of points ``(n, 3)`` in the body, at a pose."""
+        self.room(len(points))
+        H, g, told = np.empty((6, 6)), np.empty(6), np.empty(13)
+        kernels.normal_equations(self.cells, points, (R, t), self.config.size, scale, H, g, told)
+        n = max(len(points), 1)
+        return Fit(
+            H, g, _every(told[3:]), told[0] / n, told[1] / n, told[0] / max(told[1], 1.0), told[2] / max(told[0], 1e-12)
+        )
+
+    def by_slot(self, points: Array, R: Array, t: Array, scale: float, ends: Array) -> tuple[Array, Array, Array]:
+        """See `cell_kernels.information_by_slot`: ``(s, 6, 6)``, ``(6, 6)`` and ``(c, 6)``."""
+        self.room(len(points))
+        H, M, G = np.empty((len(ends), 6, 6)), np.empty((6, 6)), np.empty((PARTS, 6))
+        kernels.information_by_slot(self.cells, points, (R, t), self.config.size, scale, ends, (H, M, G))
+        return H, M, G
+
+
+def _every(m: Array) -> Array:
+    second = np.array([[m[4], m[5], m[6]], [m[5], m[7], m[8]], [m[6], m[8], m[9]]])
+    out = np.zeros((6, 6))
+    out[:3, :3] = np.trace(second) * np.eye(3) - second
+    a, b, c = m[1:4]
+    out[:3, 3:] = [[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]
+    out[3:, :3] = out[:3, 3:].T
+    out[3:, 3:] = m[0] * np.eye(3)
+    return out
+
+
+def _empty(blocks: int) -> kernels.Cells:
+    blocks = max(blocks, _FIRST_ROOM)
+    if blocks > 1 << 26:
+        raise DataError("the map of a lidar is too large", got=f"{blocks} cells", wanted=f"at most {1 << 26}")
+    table = 1 << int(np.ceil(np.log2(2 * blocks)))
+    return kernels.Cells(
+        keys=np.full(table, -1, np.int64),
+        slots=np.zeros(table, np.int32),
+        cube=np.zeros(blocks, np.int64),
+        number=np.zeros(blocks, np.int32),
+        mean=np.zeros((blocks, 3)),
+        scatter=np.zeros((blocks, 6)),
+        told=np.zeros(blocks, np.int32),
+        centre=np.zeros((blocks, 3)),
+        information=np.zeros((blocks, 6)),
+        seen=np.full(blocks, -1, np.int64),
+        made=np.zeros(blocks),
+        around=np.zeros((blocks, 27), np.int32),
+        n_around=np.full(blocks, -1, np.int32),
+        near=np.full((blocks, 64), kernels.UNKNOWN, np.int32),
+        used=np.zeros(1, np.int64),
+    )
+
+
+def thin(points: Array, size: float, ranges: tuple[float, float] = (0.0, np.inf)) -> npt.NDArray[np.int64]:
+    """Rows of the first point of each cube of edge ``size``, of the points within ranges."""
+    rows = np.empty(len(points), np.int64)
+    return rows[: kernels.thin(points, size, ranges[0] ** 2, ranges[1] ** 2, rows)]
+
+
+def evenly(n: int, most: int) -> npt.NDArray[np.int64]:
+    """At most so many of n rows, spread over all."""
+    return np.arange(n, dtype=np.int64) if n <= most else np.arange(most, dtype=np.int64) * n // most

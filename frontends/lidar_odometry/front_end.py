@@ -1,0 +1,283 @@
+"""The front end ``kiss-icp``: LiDAR odometry, cut into short submaps that carry a cloud and an evidence grid."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graphslam.core import se3
+from graphslam.core.dense import CloudMap
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.random import SeedTree
+from graphslam.core.records import Odometry
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.base import FrontEnd, Watch
+from graphslam.frontends.lidar_odometry.cells import evenly
+from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.odometry import MAPPED, LidarOdometry, Seen
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.frontends.scan_window.exits import relative_covariance
+
+MANY = 0.05
+"""Share of lost scans of a submap from which a line of the verdict says so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LidarSubmapConfig:
+    """How the path is cut into submaps, and what they carry."""
+
+    length: float = 3.0
+    """Way of a submap [m] …"""
+    scans: int = 5
+    """… which holds no fewer scans …"""
+    most_scans: int = 100
+    """… and no more."""
+    voxel_size: float = 0.2
+    """Edge of a voxel of the grid [m]."""
+    cloud_cell: float = 0.1
+    """Edge of the cubes of which the cloud keeps one point each [m]."""
+    reach: float = 40.0
+    """Beams are followed so far through the grid [m]."""
+    points: int = 2000
+    """Points of a scan in grid and cloud at most."""
+    hit: float = 0.7
+    """Probability that a voxel is occupied, given that a beam ended in it."""
+    miss: float = 0.4
+    """The same, given that a beam passed through it."""
+    clamp: tuple[float, float] = (0.1192, 0.971)
+    """Bounds of a voxel's probability."""
+
+    def __post_init__(self) -> None:
+        for name in ("length", "voxel_size", "cloud_cell", "reach"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"submap: {name} = {value}; wanted > 0")
+        if not 1 <= self.scans <= self.most_scans or self.points < 1:
+            raise ConfigError("submap: wanted 1 ≤ scans ≤ most_scans and points ≥ 1")
+        self.beam_model()
+
+    def beam_model(self) -> BeamModel:
+        """What a beam says of a voxel."""
+        return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LidarFrontEndConfig:
+    """The front end ``kiss-icp``."""
+
+    stream: str | None = None
+    """Stream of point clouds; None: the first of the log."""
+    odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
+    """How scans are matched."""
+    submap: LidarSubmapConfig = field(default_factory=LidarSubmapConfig)
+    """How the path is cut, and what submaps carry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Follow:
+    """A scan that was followed.
+
+    Parameters
+    ----------
+    time : float
+    pose : (7,)
+        ``T_first_base``.
+    joint : (12, 12)
+        Joint covariance of the pose where the submap began and of this one.
+    spread : (6, 6)
+        Covariance of what the motion from the last scan was expected to be, right tangent.
+    points : (m, 3)
+        In the base at ``time``.
+    seen : Seen
+    """
+
+    time: float
+    pose: Array
+    joint: Array
+    spread: Array
+    points: Array
+    seen: Seen
+
+
+@dataclass(frozen=True, slots=True)
+class LidarFrontEnd(FrontEnd):
+    """The front end ``kiss-icp``.
+
+    Needs a stream of point clouds and nothing else. It draws nothing, and says of every scan what the scans up to it
+    let it say. A run that is resumed follows the scans again from the start, since window and running medians go on
+    from submap to submap, and makes the maps that are missing.
+    """
+
+    config: LidarFrontEndConfig = field(default_factory=LidarFrontEndConfig)
+    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
+    name: ClassVar[str] = "kiss-icp"
+
+    def submaps(
+        self,
+        log: SensorLog,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
+    ) -> Iterator[Submap]:
+        """See :class:`~graphslam.frontends.base.FrontEnd`."""
+        first = 0 if after is None else after.key + 1
+        name, clouds = self._clouds(log)
+        self._made[:] = [log, []]
+        config, origin = self.config.submap, se3.se3_transform(clouds.T_base_sensor, clouds.origin)
+        odometry, kept, key, way = LidarOdometry(self.config.odometry), [], 0, 0.0
+        for k in range(len(clouds)):
+            seen = self._follow(odometry, clouds, k)
+            if k == 0:
+                odometry.errors.begin()
+            self._made[1].append(seen)
+            kept.append(seen)
+            n = len(kept) - 1
+            full = odometry.way - way >= config.length and n >= config.scans
+            if k == len(clouds) - 1 or full or n >= config.most_scans:
+                if n and key >= first:
+                    yield _submap(name, kept, origin, config, key, "end-of-log" if k == len(clouds) - 1 else "length")
+                odometry.errors.begin()
+                kept, key, way = [replace(seen, joint=odometry.errors.joint)], key + 1, odometry.way
+        if key == 0:
+            raise DataError(
+                "too few scans for a submap", where=f"{log.name}/{name}", got=len(clouds), wanted="at least 2"
+            )
+
+    def steps(self, log: SensorLog) -> Steps:
+        """Scans and motion, for a refinement; the motion is only as sure as an even motion would be.
+
+        The path of the odometry is made of the same scans. It is the start of a refinement and must not weigh in it.
+        """
+        if not (self._made and self._made[0] is log and len(self._made[1]) == len(self._clouds(log)[1])):
+            name, clouds = self._clouds(log)
+            odometry = LidarOdometry(self.config.odometry)
+            self._made[:] = [log, [self._follow(odometry, clouds, k) for k in range(len(clouds))]]
+        name, clouds = self._clouds(log)
+        return _steps(log, name, clouds, self._made[1], self.config)
+
+    def _clouds(self, log: SensorLog) -> tuple[str, PointClouds]:
+        name = self.config.stream or log.of_type(PointClouds)
+        if name is None:
+            raise MissingDataError("no stream of point clouds", where=log.name, wanted="PointClouds")
+        stream = log[name]
+        if not isinstance(stream, PointClouds):
+            raise ConfigError(f"frontend.stream = {name!r} holds no point clouds; got {type(stream).__name__}")
+        return name, stream
+
+    def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> Follow:
+        cloud, ages = clouds.cloud(k), clouds.ages(k)
+        seen = odometry.step(se3.se3_transform(clouds.T_base_sensor, cloud), float(clouds.times[k]), ages)
+        return Follow(
+            float(clouds.times[k]),
+            odometry.pose,
+            odometry.errors.joint,
+            odometry.spread,
+            odometry.points[evenly(len(odometry.points), self.config.submap.points)],
+            seen,
+        )
+
+
+def _submap(name: str, kept: list[Follow], origin: Array, config: LidarSubmapConfig, key: int, ended: str) -> Submap:
+    poses = np.array([f.pose for f in kept])
+    path = se3.se3_between(np.broadcast_to(poses[0], poses.shape), poses)
+    C = np.array([relative_covariance((poses[0], f.pose), (poses[0], f.pose), f.joint) for f in kept])
+    grid = EvidenceGrid(config.voxel_size, model=config.beam_model(), dim=3)
+    dropped, points, scan = 0, [], []
+    origins: list[Array] = []
+    for k, (f, T) in enumerate(zip(kept, path)):
+        # the scan between two submaps is in the map of the one that ends there
+        if (k == 0 and key > 0) or f.seen.state not in MAPPED:
+            continue
+        at = np.broadcast_to(origin, f.points.shape)
+        dropped += grid.insert_scan(f.points, at, pose=T, max_range=config.reach).dropped
+        points.append(se3.se3_transform(T, f.points))
+        scan.append(np.full(len(f.points), len(origins)))
+        origins.append(se3.se3_transform(T, origin))
+    states = Counter(f.seen.state for f in kept[int(key > 0) :])
+    overlaps = [f.seen.overlap for f in kept if np.isfinite(f.seen.overlap)]
+    lost = states["lost"] + states["empty"]
+    report: dict[str, Any] = {
+        "ended": ended,
+        "scans": len(kept) - 1,
+        "length": round(float(np.sum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1))), 3),
+        "scan_states": dict(sorted(states.items())),
+        "scans_searched": sum(f.seen.searched for f in kept[int(key > 0) :]),
+        "scans_lost": lost,
+        "scans_unheld": sum(f.seen.unheld > 0 for f in kept[int(key > 0) :] if f.seen.state in MAPPED),
+        "overlap_median": float(np.median(overlaps)) if overlaps else None,
+        "beams_dropped": int(dropped),
+        "exit_covariance": "window",
+    }
+    findings = _findings(key, kept, report)
+    if findings:
+        report["findings"] = [f.as_row() for f in findings]
+    cloud = None
+    if points:
+        cloud = CloudMap(
+            points=np.concatenate(points), origins=np.array(origins), scan=np.concatenate(scan), cell=config.cloud_cell
+        )
+    return Submap(
+        key=key,
+        interval=(kept[0].time, kept[-1].time),
+        exit_pose=path[-1],
+        exit_covariance=C[-1],
+        trajectory=Trajectory(np.array([f.time for f in kept]), path, C),
+        grid=grid,
+        cloud=cloud,
+        uses=frozenset({name}),
+        report=report,
+    )
+
+
+def _findings(key: int, kept: list[Follow], report: dict[str, Any]) -> list[Finding]:
+    out, n = [], report["scans"]
+    if report["scans_lost"] > MANY * n:
+        text = (
+            f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
+            "are not in it. The path there is that of an even motion, and the covariance as wide as that may be off."
+        )
+        out.append(Finding("bad" if report["scans_lost"] > 0.5 * n else "look", "scans-lost", text))
+    if report["scans_unheld"] > 0.5 * n:
+        text = (
+            f"Submap {key}: nothing holds {report['scans_unheld']} of {n} scans along some direction, as in a corridor "
+            "or on a plain. The path along it is that of an even motion."
+        )
+        out.append(Finding("look", "scans-unheld", text))
+    return out
+
+
+def _steps(log: SensorLog, name: str, clouds: PointClouds, made: list[Follow], config: LidarFrontEndConfig) -> Steps:
+    times = np.array([f.time for f in made])
+    poses = np.array([f.pose for f in made])
+    increments = np.concatenate([np.array([[0.0, 0, 0, 0, 0, 0, 1]]), se3.se3_between(poses[:-1], poses[1:])])
+    covariances = np.array([np.zeros((6, 6)), *[f.spread for f in made[1:]]])
+    points = [f.points if f.seen.state in MAPPED else f.points[:0] for f in made]
+    offsets = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
+    ends = np.concatenate(points)
+    origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)
+    return Steps(
+        times=times,
+        odometry=Odometry(times=times, increments=increments, covariances=covariances),
+        offsets=offsets,
+        points=ends,
+        origins=np.tile(origin, (len(ends), 1)),
+        returns=np.ones(len(ends), np.bool_),
+        max_range=config.odometry.max_range,
+        range_sigma=0.03,
+        uses=frozenset({name}),
+        name=log.name,
+        truth=log.truth.trajectory if log.truth is not None else None,
+    )

@@ -1,0 +1,486 @@
+"""Scan after scan against the map of those before it: start by search, coarse to fine, and a check before it is kept.
+
+What decides is the start of each match. A hand-held lidar turns by ten degrees between scans, which moves things at
+20 m by metres, while a match sees no farther than a cell. So rotations about the prediction and about the last pose are
+tried on the coarsest cells, wherever the prediction's own match is not as good as the scans before it. A scan that
+finds less of itself in the map than usual is looked for far and wide before it enters the map: a lost scan in the map
+spoils all that come after.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.geometry import Array
+from graphslam.frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, evenly, thin
+from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.joint import JointErrors
+from graphslam.frontends.scan_window.tracker import directions
+
+Index = npt.NDArray[np.int64]
+
+MOST_STEPS = 12
+"""Gauss–Newton steps on a level."""
+SCALE = 2.0
+"""Mahalanobis distance of Geman and McClure's kernel."""
+STILL = (1e-4, 5e-4)
+"""A match stands still below this [rad], [m]."""
+MOST_DESKEWED = 6
+"""Times that a scan is unbent by the motion found."""
+COARSE_POINTS = 1000
+"""Points matched on all but the finest level."""
+COARSE = np.diag([1.0 / 0.05**2] * 3 + [1.0 / 0.2**2] * 3)
+"""Information of what a coarse match says [rad], [m]."""
+SEARCHED = 300
+"""Points of a search over rotations."""
+SEARCH_STEP, SEARCH_SIDE = np.deg2rad(4.0), 3
+"""Rotations are tried ±3 steps of 4° about every axis …"""
+WIDE_STEP, WIDE_SIDE = np.deg2rad(8.0), 8
+"""… and, where a scan is looked for far and wide, ±8 steps of 8° about one with ±1 about the others."""
+LIKELY = 0.85
+"""Overlap of the prediction's match beside the running median above which rotations are not searched …"""
+NEAR = (np.deg2rad(4.0), 0.6)
+"""… if it corrects the prediction by less than this [rad], [m]."""
+LATE = 2.5
+"""Time since the last scan, in usual ones, from which a scan is looked for far and wide anyhow."""
+BETTER = 1.2
+"""A place found far and wide must overlap so many times as much."""
+FEW = 100
+"""Points below which a scan is not matched."""
+FITS = 0.75
+"""Quality of the fit beside the running median from which on a scan with little overlap is one of new space: where
+there is something to fit to, it fits."""
+REMEMBERED = 10
+"""Scans of the running medians."""
+NORMAL_SIGMA = 0.05
+"""σ of the normals of cells [rad]."""
+PRETENDED = 1.5
+"""What surfaces hold a body by, in multiples of what such noise of their normals would pretend to, up to which nothing
+is known."""
+MAPPED = ("first", "matched", "found again", "new space")
+"""States of scans that enter the map."""
+LASTING = 4.0
+"""Variance of what surfaces do to the poses of a window, which see them again and again, beside that of one scan's
+residuals. Found on simulated lidars (`tests/frontends/lidar_odometry`)."""
+ACCELERATION = (3.0, 2.0)
+"""What speeds may change by, beside what was seen lately [rad/s²], [m/s²]: a hand-held lidar, a car that brakes."""
+GIVEN_UP = 10
+"""Scans lost in a row after which a new map begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What came of a scan.
+
+    Parameters
+    ----------
+    points : int
+        Matched.
+    overlap : float
+        Share of them on the finest cells; nan for the first scan of a map.
+    unheld : int
+        Number of directions, of six, that no surface holds: the prediction stands there.
+    state : str
+        "first", "matched", "new space", "found again" (far and wide), "lost" (predicted, not in the map), "empty".
+    searched : bool
+    """
+
+    points: int
+    overlap: float
+    unheld: int
+    state: str
+    searched: bool
+
+
+def _spreads() -> tuple[Array, Array]:
+    """Weighted mean of squares under Geman and McClure's weights, of Gaussians of so much variance."""
+    variances = np.geomspace(1e-3, 30.0, 40)
+    x = np.linspace(-6.0, 6.0, 2001)
+    out = []
+    for v in variances:
+        m = v * x**2
+        w = np.exp(-0.5 * x**2) / (1.0 + m / SCALE**2) ** 2
+        out.append(float(np.sum(w * m) / np.sum(w)))
+    return np.array(out), variances
+
+
+SPREADS = _spreads()
+"""Misfit, and the variance of residuals beside what the cells say that it tells of."""
+
+
+@dataclass(frozen=True, slots=True)
+class Raw:
+    """Points as they were measured while the body moved.
+
+    Parameters
+    ----------
+    points : (n, 3)
+        In the body at its time of each.
+    ages : (n,) or None
+        Time from each to the stamp of the scan [s].
+    """
+
+    points: Array
+    ages: Array | None
+
+    def at(self, motion: Array, dt: float) -> Array:
+        """In the body at the stamp ``(n, 3)``, where it moved by ``motion`` (7,) evenly in the ``dt`` [s] before."""
+        if self.ages is None or dt <= 0:
+            return self.points
+        twist = np.asarray(se3.se3_log(motion)) / dt
+        return np.asarray(se3.se3_transform(se3.se3_exp(-self.ages[:, None] * twist), self.points))
+
+
+class LidarOdometry:
+    """Follows the scans of a lidar one by one.
+
+    Parameters
+    ----------
+    config : LidarOdometryConfig
+
+    Attributes
+    ----------
+    pose : (7,)
+        ``T_first_now``.
+    points : (n, 3)
+        Of the last scan, thinned, in the body at its stamp.
+    spread : (6, 6)
+        Covariance of the error of the last prediction, right tangent.
+    errors : JointErrors
+    """
+
+    def __init__(self, config: LidarOdometryConfig) -> None:
+        self.config = config
+        last = len(config.levels) - 1
+        self.levels = [
+            CellMap(LevelConfig(size, config.finest_sigma if k == last else 0.25 * size, k == last))
+            for k, size in enumerate(config.levels)
+        ]
+        self.pose = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        self.anchor = self.pose
+        self.twist, self.dt = np.zeros(6), 0.0
+        self.time = -np.inf
+        self.recent: deque[tuple[float, Array]] = deque(maxlen=50)
+        self.scan = -1
+        self.way, self.ways = 0.0, [0.0]
+        self.overlaps: deque[float] = deque(maxlen=REMEMBERED)
+        self.coarse: deque[float] = deque(maxlen=REMEMBERED)
+        self.qualities: deque[float] = deque(maxlen=REMEMBERED)
+        self.agreeing: deque[float] = deque(maxlen=5 * REMEMBERED)
+        self.points, self.spread = np.zeros((0, 3)), np.zeros((6, 6))
+        self.changes: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
+        self.missed: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
+        self.errors = JointErrors()
+        self.lost, self.loose = 0, 1
+        self.first = 0
+        side = range(-SEARCH_SIDE, SEARCH_SIDE + 1)
+        self.near_rotations = _rotations(SEARCH_STEP * np.array(list(product(side, side, side)), dtype=np.float64))
+        wide = {
+            tuple(np.roll([far, a, b], axis))
+            for axis in range(3)
+            for far in range(-WIDE_SIDE, WIDE_SIDE + 1)
+            for a in (-1, 0, 1)
+            for b in (-1, 0, 1)
+        }
+        self.wide_rotations = _rotations(WIDE_STEP * np.array(sorted(wide), dtype=np.float64))
+
+    # --- one scan ----------------------------------------------------------------------------------------------------
+
+    def predict(self, time: float, turn: Array | None = None) -> Array:
+        """Motion ``(7,)`` from the last scan to ``time``, at constant velocity, or with the turn ``(4,)`` of a gyro."""
+        dt = time - self.time
+        ratio = min(dt / self.dt, 2.0) if self.dt > 0 and np.isfinite(dt) else 0.0
+        step = np.asarray(se3.se3_exp(self.twist * ratio))
+        if turn is not None:
+            step[3:] = turn
+        return step
+
+    def step(self, cloud: Array, time: float, ages: Array | None = None, turn: Array | None = None) -> Seen:
+        """Match the next scan, and put it into the map.
+
+        Parameters
+        ----------
+        cloud : (m, 3)
+            In the body at ``time``, all finite.
+        time : float
+            [s]; not before the scan before.
+        ages : (m,), optional
+            Time from each point to ``time`` [s].
+        turn : (4,), optional
+            Rotation from the last scan to this one, as a gyro tells it.
+        """
+        self.scan += 1
+        c = self.config
+        motion = self.predict(time, turn)
+        before = self.pose
+        rows = thin(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
+        kept = rows[evenly(len(rows), c.most_kept)]
+        raw = Raw(cloud[kept], None if ages is None or not c.deskew else ages[kept])
+        dt = time - self.time if np.isfinite(self.time) else 0.0
+        self._since(raw, time)
+        chosen = evenly(len(kept), c.most_points)
+        points = self._unbent(raw, se3.se3_compose(before, motion), time)[chosen]
+        if self.scan == self.first:
+            seen = Seen(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
+            self.first += len(points) < FEW
+            fit = None
+        else:
+            self.pose, fit, seen = self._match(raw, chosen, se3.se3_compose(before, motion), time)
+        self.points = self._unbent(raw, self.pose, time)
+        points = self.points[chosen]
+        self._doubt(raw, points, before, motion, dt, fit, seen)
+        if seen.state in MAPPED:
+            self._add(self.points)
+            self.lost, self.anchor = 0, self.pose
+        else:
+            self.lost += 1
+            if self.lost >= GIVEN_UP and len(points) >= FEW:
+                # nothing of the map is here any more: what comes is matched to what comes
+                self.first = self.scan + 1
+                self._begin()
+        made = se3.se3_between(before, self.pose)
+        if np.isfinite(dt) and dt > 0:
+            if self.dt > 0 and not self.lost:
+                change = np.asarray(se3.se3_log(made)) / dt - self.twist / self.dt
+                self.changes.append((float(np.mean(change[:3] ** 2)), float(np.mean(change[3:] ** 2))))
+            # nobody knows how a body moves that is not seen: the guess is that it comes to rest
+            self.twist, self.dt = (0.5 if self.lost else 1.0) * np.asarray(se3.se3_log(made)), dt
+        self.time = time
+        self.recent.append((time, self.pose))
+        self.way += float(np.linalg.norm(made[:3]))
+        self.ways.append(self.way)
+        if self.scan % 20 == 19:
+            old = int(np.searchsorted(self.ways, self.way - c.window)) - 1
+            since = min(old, self.scan - c.window_scans)
+            if since > 0:
+                for level in self.levels:
+                    level.keep_since(since)
+        return seen
+
+    def _bent(self, raw: Raw) -> Array:
+        """Covariance of what an uneven motion within a scan does to its pose.
+
+        The motion within a scan is off the mean one by half of what it changes by from one interval to the next.
+        """
+        if raw.ages is None or not len(raw.ages) or not self.changes:
+            return np.zeros((6, 6))
+        turn2, shift2 = 0.25 * np.mean(self.changes, axis=0) * float(np.mean(raw.ages)) ** 2
+        return np.diag([turn2] * 3 + [shift2] * 3)
+
+    def _since(self, raw: Raw, time: float) -> None:
+        """Since when the motion is taken to be even: over two sweeps or more.
+
+        If a scan lasts until the next, an even motion from the last pose alone would answer an error of that pose by
+        one of the other sign, as large, in this one, and so on for ever.
+        """
+        if raw.ages is None or not len(raw.ages):
+            return
+        span = 2.0 * float(raw.ages.max()) - 1e-6
+        while len(self.recent) > 1 and time - self.recent[1][0] >= span:
+            self.recent.popleft()
+
+    def _unbent(self, raw: Raw, pose: Array, time: float) -> Array:
+        """Points of a scan where the body stands at ``pose`` (7,), at its stamp."""
+        if raw.ages is None or not self.recent or time <= self.recent[0][0]:
+            return raw.points
+        then, before = self.recent[0]
+        return raw.at(se3.se3_between(before, pose), time - then)
+
+    def _begin(self) -> None:
+        self.levels = [CellMap(level.config) for level in self.levels]
+        for memory in (self.overlaps, self.coarse, self.qualities):
+            memory.clear()
+        self.errors.forget()
+
+    def _doubt(
+        self, raw: Raw, points: Array, before: Array, motion: Array, dt: float, fit: Fit | None, seen: Seen
+    ) -> None:
+        """How far the pose of now is off, jointly with those of the window."""
+        predicted = se3.se3_compose(before, motion)
+        if seen.state in MAPPED and seen.state != "first":
+            off = np.asarray(se3.se3_log(se3.se3_between(predicted, self.pose)))
+            self.missed.append((float(np.mean(off[:3] ** 2)), float(np.mean(off[3:] ** 2))))
+        if self.scan == 0:
+            return
+        self.loose = self.loose + 1 if fit is None or seen.unheld else 1
+        turn2, shift2 = np.mean(self.missed, axis=0) if self.missed else (0.0, 0.0)
+        turn2 = max(turn2, (0.5 * ACCELERATION[0] * dt**2) ** 2, 1e-6)
+        shift2 = max(shift2, (0.5 * ACCELERATION[1] * dt**2) ** 2, 1e-6)
+        self.spread = np.diag([turn2] * 3 + [shift2] * 3)
+        # a speed that nothing holds is off for as long as nothing holds it
+        Q = self.loose**2 * self.spread
+        if fit is None or not self.errors.ends:
+            H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
+        else:
+            H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
+            M *= np.interp(fit.misfit, *SPREADS)
+            # how far residuals of a whole part of the scan agree, beside what those of one cell would
+            E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
+            self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
+            M *= LASTING * float(np.mean(self.agreeing))
+            F = trusted(fit.H, fit.every)
+            H, M = F @ H, F @ M @ F.T
+        self.errors.step(self.pose, motion, Q, H, M, self._bent(raw))
+
+    def _add(self, points: Array) -> None:
+        R, t = _split(self.pose)
+        world = points @ R.T + t
+        for level in self.levels:
+            level.add(world, self.scan)
+        self.errors.lay(self.scan)
+
+    # --- matching ----------------------------------------------------------------------------------------------------
+
+    def _match(self, raw: Raw, chosen: Index, predicted: Array, time: float) -> tuple[Array, Fit | None, Seen]:
+        points = self._unbent(raw, predicted, time)[chosen]
+        if len(points) < FEW:
+            return predicted, None, Seen(len(points), 0.0, 6, "empty", False)
+        few = points[evenly(len(points), SEARCHED)]
+        top = self.levels[:-1] or self.levels
+        start, coarse = self._descend(points, predicted, top)
+        searched = False
+        if not self._likely(coarse.overlap, predicted, start):
+            searched = True
+            tried = [(coarse.overlap, start)]
+            tried += self._search(points, few, (predicted, self.anchor), self.near_rotations, 2, top)
+            _, start = max(tried, key=lambda x: x[0])
+        pose, points, fit = self._finish(raw, chosen, start, time)
+        state = "matched"
+        few_of_it = len(self.overlaps) >= 3 and fit.overlap < self.config.suspicious * np.median(self.overlaps)
+        if few_of_it or self._late(time):
+            searched = True
+            found = self._search(points, few, (predicted, self.anchor), self.wide_rotations, 6, self.levels)
+            overlap, best = max(found, key=lambda x: x[0])
+            if overlap > BETTER * fit.overlap:
+                pose, points, fit = self._finish(raw, chosen, best, time)
+                state = "found again"
+            if few_of_it and fit.overlap < self.config.suspicious * np.median(self.overlaps):
+                # after scans that were lost, what overlaps little is not new but elsewhere
+                fits = (
+                    not self.lost and fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
+                )
+                state = "new space" if fits else "lost"
+        if state == "lost":
+            return predicted, None, Seen(len(points), fit.overlap, 6, state, searched)
+        pose, unheld = self._hold(points, pose, predicted, fit)
+        if state != "new space":
+            self.overlaps.append(fit.overlap)
+            self.qualities.append(fit.quality)
+            self.coarse.append(top[-1].fit(points[evenly(len(points), COARSE_POINTS)], *_split(pose), SCALE).overlap)
+        return pose, fit, Seen(len(points), fit.overlap, unheld, state, searched)
+
+    def _finish(self, raw: Raw, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, Fit]:
+        """Match on the finest level: pose, points of the scan where that pose says they were measured, fit."""
+        for _ in range(MOST_DESKEWED):
+            points = self._unbent(raw, pose, time)[chosen]
+            before = pose
+            pose, fit = self._descend(points, pose, self.levels[-1:])
+            moved = se3.se3_log(se3.se3_between(before, pose))
+            # a scan that is bent by a motion that is off pulls each pose a little, and always to the same side
+            if raw.ages is None or (np.linalg.norm(moved[:3]) < STILL[0] and np.linalg.norm(moved[3:]) < STILL[1]):
+                break
+        return pose, points, fit
+
+    def _late(self, time: float) -> bool:
+        """Is this scan later than scans use to be, so that nothing is known of the motion before it?"""
+        usual = [b[0] - a[0] for a, b in zip(self.recent, list(self.recent)[1:])]
+        return bool(usual) and time - self.time > LATE * float(np.median(usual))
+
+    def _likely(self, overlap: float, predicted: Array, start: Array) -> bool:
+        if len(self.coarse) < 3 or overlap < LIKELY * np.median(self.coarse):
+            return False
+        off = se3.se3_log(se3.se3_between(predicted, start))
+        return bool(np.linalg.norm(off[:3]) < NEAR[0] and np.linalg.norm(off[3:]) < NEAR[1])
+
+    def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, Fit]:
+        """Gauss–Newton on one level after the other."""
+        R, t = _split(pose)
+        fit = None
+        last = self.levels[-1]
+        for level in levels:
+            some = points if level is last else points[evenly(len(points), COARSE_POINTS)]
+            # a coarse match is the start of a finer one
+            still = STILL if level is last else (0.01 * level.config.size / 5.0, 0.01 * level.config.size)
+            for _ in range(MOST_STEPS):
+                fit = level.fit(some, R, t, SCALE)
+                if level is last:
+                    # where the finest cells tell little yet, the coarser ones' word stands
+                    off = np.asarray(se3.se3_log(se3.se3_between(pose, np.concatenate([t, se3.matrix_to_quat(R)]))))
+                    d = -np.linalg.solve(fit.H + COARSE, fit.g + COARSE @ off)
+                else:
+                    d = -np.linalg.solve(fit.H + 1e-3 * np.eye(6), fit.g)
+                # a step as long as a cell is a guess
+                d *= min(1.0, 0.5 * level.config.size / max(float(np.linalg.norm(d[3:])), 1e-12))
+                d *= min(1.0, 0.2 / max(float(np.linalg.norm(d[:3])), 1e-12))
+                t = t + R @ (np.asarray(se3.so3_left_jacobian(d[:3])) @ d[3:])
+                R = R @ np.asarray(se3.quat_to_matrix(se3.so3_exp(d[:3])))
+                if np.linalg.norm(d[:3]) < still[0] and np.linalg.norm(d[3:]) < still[1]:
+                    break
+        assert fit is not None
+        return np.concatenate([t, se3.matrix_to_quat(R)]), fit
+
+    def _search(
+        self, points: Array, few: Array, centres: tuple[Array, ...], rotations: Array, best: int, levels: list[CellMap]
+    ) -> list[tuple[float, Array]]:
+        """The best rotations about each centre on the coarsest level, matched on ``levels``: (overlap, pose)."""
+        out = []
+        for centre in centres:
+            R, t = _split(centre)
+            tries = R @ rotations
+            scores = self.levels[0].scores(few, tries, t)
+            for k in np.argsort(-scores, kind="stable")[:best]:
+                start = np.concatenate([t, se3.matrix_to_quat(tries[k])])
+                pose, fit = self._descend(points, start, levels)
+                out.append((fit.overlap, pose))
+        return out
+
+    def _hold(self, points: Array, pose: Array, predicted: Array, fit: Fit) -> tuple[Array, int]:
+        """Take the prediction along directions that no surface holds, and tell how many these are."""
+        P = held(fit.H, fit.every)
+        unheld = 6 - round(float(np.trace(P)))
+        if unheld and len(self.missed) >= 3:
+            xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
+            pose = np.asarray(se3.se3_compose(predicted, se3.se3_exp(xi)))
+        return pose, unheld
+
+
+def held(H: Array, every: Array) -> Array:
+    """Projection ``(6, 6)`` of motions onto the directions that surfaces hold.
+
+    Parameters
+    ----------
+    H : (6, 6)
+        Information of a scan.
+    every : (6, 6)
+        What the same points would say with surfaces turned anyhow.
+    """
+    values, V, B = _directions(H, every)
+    U = V[:, values > PRETENDED]
+    return np.asarray(U @ U.T @ B)
+
+
+def trusted(H: Array, every: Array) -> Array:
+    """What ``(6, 6)`` takes a gradient to that part of it that is not pretended by noise of the normals."""
+    values, V, B = _directions(H, every)
+    share = np.maximum(1.0 - PRETENDED / np.maximum(values, 1e-9), 0.0)
+    return np.asarray(B @ (V * share) @ V.T)
+
+
+def _directions(H: Array, every: Array) -> tuple[Array, Array, Array]:
+    every = 1.01 * every + np.eye(6)
+    B = NORMAL_SIGMA**2 * (every - H) + 1e-9 * every
+    return *directions(H, every, NORMAL_SIGMA), B
+
+
+def _split(pose: Array) -> tuple[Array, Array]:
+    return np.ascontiguousarray(se3.quat_to_matrix(pose[3:])), np.ascontiguousarray(pose[:3])
+
+
+def _rotations(vectors: Array) -> npt.NDArray[np.float64]:
+    return np.ascontiguousarray(se3.quat_to_matrix(se3.so3_exp(vectors)))

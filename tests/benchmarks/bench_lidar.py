@@ -1,0 +1,186 @@
+"""LiDAR odometry: recorded packs against their poses, drawn simulated lidars against truth, and the cached neighbour.
+
+``python -m tests.benchmarks.bench_lidar [--scans N] [--draws 12] [--first 101] [--quick]``
+
+CPU time on one thread, without compilation. Recorded: ATE after rigid alignment to the poses that come with the packs,
+which are results of other programs; KITTI 0005 to the path of KISS-ICP, where that is installed. NEES of pieces of 3 m.
+Neighbours: nanoseconds a point for one scan against the map, asked for the first time (cold), again (warm), and of k-d
+trees of scipy and small_gicp over the same cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+
+import numpy as np
+import small_gicp
+from scipy.spatial import cKDTree
+
+import graphslam as gs
+from graphslam.app.worlds import mesh_world
+from graphslam.core import se3
+from graphslam.core.errors import GraphSlamError
+from graphslam.core.geometry import Array
+from graphslam.core.point_clouds import PointClouds
+from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.odometry import LidarOdometry
+from graphslam.frontends.odometry.recorded import chain
+from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam.sim.lidar import drawn_lidar, simulate_lidar
+
+PACKS = ("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall", "lidar3d-kitti-0005")
+PIECE = 3.0
+"""Way of the pieces whose covariances are judged [m]."""
+
+
+def followed(clouds: PointClouds, truth: Array | None, scans: int) -> tuple[Array, list[float], str]:
+    """Path ``(n, 7)``, NEES/6 of its pieces, and a line of figures."""
+    clouds.cloud(0)  # decoded
+    odometry = LidarOdometry(LidarOdometryConfig())
+    poses, states, nees, begin, way, spent = [], Counter[str](), [], 0, 0.0, 0.0
+    for k in range(min(len(clouds), scans)):
+        cloud, ages = clouds.cloud(k), clouds.ages(k)
+        if k == 5:
+            spent = -time.process_time()
+        states[odometry.step(cloud, float(clouds.times[k]), ages).state] += 1
+        poses.append(odometry.pose)
+        if k == 0:
+            odometry.errors.begin()
+        if truth is not None and odometry.way - way >= PIECE:
+            a, b = poses[begin], poses[k]
+            C = relative_covariance((a, b), (a, b), odometry.errors.joint)
+            e = se3.se3_log(se3.se3_between(se3.se3_between(a, b), se3.se3_between(truth[begin], truth[k])))
+            nees.append(float(e @ np.linalg.solve(C, e)) / 6.0)
+            odometry.errors.begin()
+            begin, way = k, odometry.way
+    spent += time.process_time()
+    path = np.array(poses)
+    rate = float(np.median(np.diff(clouds.times)))
+    cpu = spent / max(len(path) - 5, 1)
+    bad = {s: n for s, n in states.items() if s not in ("first", "matched")}
+    said = f"{len(path):5d} scans {odometry.way:6.1f} m  {1e3 * cpu:6.1f} ms a scan ({rate / cpu:4.1f} × real time)"
+    if nees:
+        inside = np.mean(np.array(nees) < 12.6 / 6.0)
+        said += f"  NEES/6 {np.mean(nees):5.2f} (median {np.median(nees):4.2f}, {inside:.0%} inside 95 %)"
+    return path, nees, said + (f"  {bad}" if bad else "")
+
+
+def ate(path: Array, truth: Array) -> float:
+    """RMS of position after rigid alignment [m]."""
+    T, _ = se3.align_se3(path[:, :3], truth[:, :3])
+    return float(np.sqrt(np.mean(np.sum((se3.se3_transform(T, path[:, :3]) - truth[:, :3]) ** 2, axis=1))))
+
+
+def kiss_icp(clouds: PointClouds, scans: int) -> Array | None:
+    """Path of KISS-ICP with its default figures; None where it is not installed."""
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return None
+    config = KISSConfig()
+    config.mapping.voxel_size, config.data.max_range = 1.0, 100.0
+    config.data.deskew = False
+    odometry, out = KissICP(config), []
+    for k in range(min(len(clouds), scans)):
+        odometry.register_frame(clouds.cloud(k), np.zeros(0))
+        out.append(odometry.last_pose.copy())
+    M = np.array(out)
+    return np.column_stack([M[:, :3, 3], se3.matrix_to_quat(M[:, :3, :3])])
+
+
+def recorded(scans: int) -> None:
+    """The packs."""
+    for name in PACKS:
+        try:
+            log = gs.load(name)
+        except GraphSlamError as error:
+            print(f"{name}: not here ({error})")
+            continue
+        clouds = log["clouds"]
+        truth = chain(log["odometry"]).poses if "odometry" in log.streams else None
+        path, _, said = followed(clouds, truth, scans)
+        errors = []
+        if truth is not None:
+            errors.append(f"odometry's {ate(path, truth[: len(path)]):.3f}")
+        if "reference" in log.streams:
+            errors.append(f"reference {ate(path, log['reference'].poses[: len(path)]):.3f}")
+        if truth is None:
+            other = kiss_icp(clouds, scans)
+            errors.append("KISS-ICP not installed" if other is None else f"KISS-ICP {ate(path, other):.3f}")
+        print(f"{name:20s} ATE [m] {', '.join(errors)}  end to start {np.linalg.norm(path[-1, :3]):.3f} m\n   {said}")
+
+
+def simulated(draws: int, first: int, seconds: float) -> None:
+    """Lidars and carriers that are drawn."""
+    every: list[float] = []
+    for k in range(draws):
+        seed, world = first + k, ("garage", "building", "mine")[k % 3]
+        config = drawn_lidar(seed)
+        layout = {"layout": "B"} if world == "garage" else {}
+        log = simulate_lidar(mesh_world(world, seed=seed, **layout), seed, config, most=seconds)
+        truth = log.truth.trajectory.interpolate(log["clouds"].times)
+        path, nees, said = followed(log["clouds"], truth, 10**9)
+        every += nees
+        carried = "hand" if config.sway else "wheels"
+        print(f"{world:9s}{seed:5d} {config.pattern:9s}{carried:7s} ATE {ate(path, truth):.4f} m {said}")
+    if every:
+        inside = np.mean(np.array(every) < 12.6 / 6.0)
+        print(
+            f"all {len(every)} pieces: NEES/6 {np.mean(every):.2f}, median {np.median(every):.2f}, {inside:.0%} inside 95 %"
+        )
+
+
+def neighbours(scans: int) -> None:
+    """Time of one scan's neighbours in the map of the scans before it."""
+    for name in ("lidar3d-hku1", "lidar3d-kitti-0005"):
+        try:
+            clouds = gs.load(name)["clouds"]
+        except GraphSlamError:
+            continue
+        odometry = LidarOdometry(LidarOdometryConfig())
+        n = min(scans, len(clouds) - 1)
+        for k in range(n):
+            odometry.step(clouds.cloud(k), float(clouds.times[k]))
+        level = odometry.levels[-1]
+        centres = level.centres
+        clouds_points = se3.se3_transform(odometry.pose, clouds.cloud(n))
+        query = np.ascontiguousarray(clouds_points[np.linalg.norm(clouds.cloud(n), axis=1) < 80.0])
+        tree, other = cKDTree(centres), small_gicp.KdTree(small_gicp.PointCloud(centres))
+        figures = {}
+        for what, ask in (
+            ("cold", level.nearest),
+            ("warm", level.nearest),
+            ("after 3 cm", level.nearest),
+            ("cKDTree", tree.query),
+            ("small_gicp", other.batch_nearest_neighbor_search),
+        ):
+            asked = query + 0.03 if what == "after 3 cm" else query
+            begin = time.perf_counter()
+            ask(asked)
+            figures[what] = 1e9 * (time.perf_counter() - begin) / len(query)
+        told = ", ".join(f"{what} {value:.0f}" for what, value in figures.items())
+        print(f"{name}: {len(centres)} cells, {len(query)} points, ns a point: {told}")
+        print(f"   warm against cKDTree {figures['cKDTree'] / figures['warm']:.1f} ×")
+
+
+def main() -> None:
+    """See the module's docstring."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--scans", type=int, default=10**6)
+    p.add_argument("--draws", type=int, default=12)
+    p.add_argument("--first", type=int, default=101)
+    p.add_argument("--seconds", type=float, default=25.0)
+    p.add_argument("--quick", action="store_true")
+    a = p.parse_args()
+    if a.quick:
+        a.scans, a.draws, a.seconds = 30, 2, 8.0
+    recorded(a.scans)
+    simulated(a.draws, a.first, a.seconds)
+    neighbours(min(a.scans, 60))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The front end ``kiss-icp``: submaps of a log, the same when resumed; a whole run by the public verbs."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import graphslam as gs
+from graphslam.app.worlds import mesh_world
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.log import SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, LidarSubmapConfig
+from graphslam.io.log_store import load_log, save_log
+from graphslam.sim.lidar import LidarConfig, simulate_lidar
+
+FRONT = LidarFrontEnd(LidarFrontEndConfig(submap=LidarSubmapConfig(length=2.0, points=500)))
+
+
+@pytest.fixture(scope="module")
+def log():
+    config = LidarConfig(rate=4.0, points=3000, lines=32)
+    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=14.0)
+
+
+@pytest.fixture(scope="module")
+def submaps(log):
+    return list(FRONT.submaps(log, seed=SeedTree(0)))
+
+
+def test_submaps_follow_each_other_and_the_truth(log, submaps):
+    assert len(submaps) > 2
+    truth, nees = log.truth.trajectory, []
+    for a in submaps:
+        begin, end = truth.interpolate(np.array(a.interval))
+        off = se3.se3_log(se3.se3_between(a.exit_pose, se3.se3_between(begin, end)))
+        nees.append(off @ np.linalg.solve(a.exit_covariance, off) / 6)
+        assert np.linalg.norm(off[3:]) < 0.05
+        assert a.uses == {"clouds"}
+        assert a.grid is not None
+        assert a.cloud is not None
+        assert len(a.cloud) <= 500 * a.report["scans"] + 500
+        assert a.report["scans_lost"] == 0
+    for a, b in pairwise(submaps):
+        assert a.interval[1] == b.interval[0]
+    assert np.mean(nees) < 3.0
+    # every scan is in one map
+    assert sum(len(a.cloud.origins) for a in submaps) == len(log["clouds"])
+
+
+def test_resumed_submaps_are_the_same(log, submaps):
+    rest = list(FRONT.submaps(log, seed=SeedTree(0), after=submaps[1]))
+    assert [a.key for a in rest] == [a.key for a in submaps[2:]]
+    for a, b in zip(rest, submaps[2:]):
+        assert a.exit_pose.tobytes() == b.exit_pose.tobytes()
+        assert a.exit_covariance.tobytes() == b.exit_covariance.tobytes()
+        assert a.cloud.points.tobytes() == b.cloud.points.tobytes()
+        assert a.report == b.report
+
+
+def test_steps_of_the_path_weigh_no_more_than_an_even_motion(log, submaps):
+    steps = FRONT.steps(log)
+    assert len(steps) == len(log["clouds"])
+    fresh = LidarFrontEnd(FRONT.config).steps(log)
+    assert fresh.odometry.increments.tobytes() == steps.odometry.increments.tobytes()
+    sigma = np.sqrt(np.diagonal(steps.odometry.covariances[1:], axis1=1, axis2=2))
+    # the path's own are a hundred times smaller
+    assert sigma.min() > 10.0 * np.sqrt(np.diag(submaps[0].exit_covariance)).max()
+
+
+def test_a_log_without_clouds_is_refused():
+    with pytest.raises(MissingDataError, match="no stream of point clouds"):
+        list(FRONT.submaps(SensorLog(name="bare", streams={}), seed=SeedTree(0)))
+    for wrong in ({"length": 0.0}, {"scans": 0}, {"voxel_size": -1.0}):
+        with pytest.raises(ConfigError):
+            LidarSubmapConfig(**wrong)
+
+
+def test_times_of_points_are_stored_with_a_log(log, tmp_path):
+    save_log(log, tmp_path / "log")
+    back = load_log(tmp_path / "log")["clouds"]
+    np.testing.assert_array_equal(back.ages(5), log["clouds"].ages(5))
+    assert log["clouds"].ages(5).max() > 0.09
+
+
+def test_a_run_ends_with_a_refined_path_and_a_map(log, tmp_path):
+    options = {"submap": {"length": 2.0, "points": 500}}
+    run = gs.run(log, frontend="kiss-icp", out=tmp_path / "run", config={"frontend": options}, progress=False)
+    assert run.metrics.set_index("key")["value"]["path_rmse_aligned"] < 0.03
+    assert (tmp_path / "run" / "trajectory_graph.tum").exists()
+    assert (tmp_path / "run" / "map.ply").exists()
+
+
+def test_lost_scans_are_a_line_of_the_verdict(log):
+    clouds = log["clouds"]
+    rows = [clouds.cloud(k)[: 0 if 20 <= k < 26 else None] for k in range(len(clouds))]
+    offsets = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
+    spoilt = type(clouds).from_arrays(clouds.times, np.concatenate(rows), offsets)
+    submaps = list(FRONT.submaps(replace(log, streams={"clouds": spoilt}), seed=SeedTree(0)))
+    said = [f["code"] for a in submaps for f in a.report.get("findings", [])]
+    assert "scans-lost" in said
+    assert sum(a.report["scan_states"].get("empty", 0) for a in submaps) == 6
+    wide = max(np.sqrt(a.trajectory.covariances[:, 3, 3].max()) for a in submaps)
+    assert wide > 10.0 * min(np.sqrt(a.exit_covariance[3, 3]) for a in submaps)

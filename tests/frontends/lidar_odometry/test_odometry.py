@@ -1,0 +1,181 @@
+"""LiDAR odometry on simulated lidars: errors and their covariance, corridors, lost scans, bent scans."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.app.worlds import mesh_world
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError
+from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.odometry import LidarOdometry
+from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam.sim.lidar import LidarConfig, drawn_lidar, simulate_lidar
+from graphslam.sim.raycast import RayCaster
+
+
+def _lidar(seed):
+    """A drawn lidar with fewer points."""
+    return replace(drawn_lidar(seed), points=4000)
+
+
+def follow(clouds, *, ages=True, spoil=lambda k, cloud: cloud):
+    odometry = LidarOdometry(LidarOdometryConfig())
+    seen, poses, joints = [], [], []
+    for k in range(len(clouds)):
+        cloud = spoil(k, clouds.cloud(k))
+        before = clouds.ages(k) if ages and len(cloud) == len(clouds.cloud(k)) else None
+        seen.append(odometry.step(cloud, float(clouds.times[k]), before))
+        if k % 10 == 0:
+            odometry.errors.begin()
+        poses.append(odometry.pose)
+        joints.append(odometry.errors.joint)
+    return np.array(poses), seen, np.array(joints)
+
+
+def errors(poses, truth):
+    return np.asarray(
+        se3.se3_log(se3.se3_between(se3.se3_between(truth[:1], truth), se3.se3_between(poses[:1], poses)))
+    )
+
+
+@pytest.fixture(scope="module")
+def drives():
+    out = []
+    for seed, world in ((1, "garage"), (2, "building"), (3, "mine"), (5, "building"), (8, "garage"), (9, "building")):
+        log = simulate_lidar(mesh_world(world, seed=seed), seed, _lidar(seed), most=14.0)
+        clouds = log["clouds"]
+        out.append((clouds, log.truth.trajectory.interpolate(clouds.times), *follow(clouds)))
+    return out
+
+
+def test_paths_are_centimetres_off_and_their_covariances_say_so(drives):
+    nees, ends = [], []
+    for _, truth, poses, seen, joints in drives:
+        ends.append(np.linalg.norm(errors(poses, truth)[-1, 3:]))
+        assert all(s.state in ("first", "matched") for s in seen)
+        for a in range(0, len(poses) - 10, 10):
+            b = a + 9
+            C = relative_covariance((poses[a], poses[b]), (poses[a], poses[b]), joints[b])
+            e = se3.se3_log(se3.se3_between(se3.se3_between(poses[a], poses[b]), se3.se3_between(truth[a], truth[b])))
+            nees.append(e @ np.linalg.solve(C, e) / 6)
+    assert np.median(ends) < 0.05
+    assert max(ends) < 0.2  # in a hand that shakes
+    # a few, correlated and from different lidars: bounds that a covariance of half or a fourth of the size misses
+    assert len(nees) > 20
+    assert 0.15 < np.median(nees) < 1.2
+    assert 0.3 < np.mean(nees) < 2.0
+
+
+def test_the_same_scans_give_the_same_bytes(drives):
+    clouds, _, poses, _, joints = drives[0]
+    again, _, joints_again = follow(clouds)
+    assert again.tobytes() == poses.tobytes()
+    assert joints_again.tobytes() == joints.tobytes()
+
+
+def test_scans_are_bent_by_motion_and_unbent_by_their_stamps():
+    log = simulate_lidar(mesh_world("building", seed=2), 2, LidarConfig(rate=10.0, sweep=0.1, points=4000), most=12.0)
+    clouds = log["clouds"]
+    truth = log.truth.trajectory.interpolate(clouds.times)
+    unbent, bent = follow(clouds)[0], follow(clouds, ages=False)[0]
+    off = [np.abs(errors(p, truth)[40:, 3:]).max() for p in (unbent, bent)]
+    assert off[0] < 0.03
+    assert off[1] > 2.0 * off[0]
+
+
+def test_nothing_holds_a_scan_along_an_endless_corridor():
+    for ends in (False, True):
+        poses, seen, joints = follow(_corridor(ends), ages=False)
+        late = joints[-1][6:, 6:] if len(poses) % 10 != 1 else joints[-2][6:, 6:]
+        along = np.sqrt(late[3, 3])
+        if ends:
+            assert all(s.unheld == 0 for s in seen[3:])
+            assert along < 0.02
+            assert poses[-1, 0] == pytest.approx(0.1 * (len(poses) - 1), abs=0.1)
+        else:
+            assert all(s.unheld == 1 for s in seen[5:])
+            assert along > 0.3
+            assert np.sqrt(late[4, 4]) < 0.02  # but across it
+            assert np.abs(poses[:, 1]).max() < 0.05
+
+
+class _Clouds:
+    def __init__(self, scans):
+        self.scans, self.times = scans, 0.1 * np.arange(len(scans))
+
+    def __len__(self):
+        return len(self.scans)
+
+    def cloud(self, k):
+        return self.scans[k]
+
+    def ages(self, k):
+        return None
+
+
+def _corridor(ends):
+    """Scans every 0.1 m in a corridor of 2.4 m × 2.6 m, whose ends are out of sight or at -5 and 12 m."""
+    x0, x1 = (-5.0, 12.0) if ends else (-500.0, 500.0)
+    y0, y1, z0, z1 = -1.2, 1.2, -1.2, 1.4
+    v = np.array([[x, y, z] for x in (x0, x1) for y in (y0, y1) for z in (z0, z1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    caster = RayCaster(v, np.array([[q[i] for i in t] for q in quads for t in ((0, 1, 2), (0, 2, 3))]))
+    rng = np.random.default_rng(7)
+    scans = []
+    for k in range(26):
+        d = rng.normal(size=(3000, 3))
+        d /= np.linalg.norm(d, axis=1)[:, None]
+        r = caster.ranges(np.hstack([np.broadcast_to([0.1 * k, 0.0, 0.0], d.shape), d]))
+        met = r < 25.0
+        scans.append(d[met] * (r[met] + rng.normal(0, 0.02, met.sum()))[:, None])
+    return _Clouds(scans)
+
+
+def test_lost_scans_are_found_and_stay_out_of_the_map(drives):
+    clouds, truth, clean, _, _ = drives[1]
+    other = drives[2][0]
+    n = len(clouds)
+
+    def foreign(k, cloud):
+        return other.cloud(k) if k in (30, 31) else cloud
+
+    def empty(k, cloud):
+        return cloud[:0] if 30 <= k < 34 else cloud
+
+    good = errors(clean, truth)
+    for spoil, bad in ((foreign, (30, 31)), (empty, range(30, 34))):
+        poses, seen, joints = follow(clouds, spoil=spoil)
+        assert all(seen[k].state in ("lost", "empty") for k in bad)
+        later = errors(poses[40:], truth[40:])
+        assert np.abs(later[:, 3:]).max() < 2.0 * np.abs(errors(clean[40:], truth[40:])[:, 3:]).max() + 0.02
+        assert n > 60
+        assert np.all(np.isfinite(joints))
+    assert np.abs(good[:, 3:]).max() < 0.05
+
+
+def test_scans_of_one_instant_and_a_gap(drives):
+    clouds, truth, _, _, _ = drives[1]
+    odometry = LidarOdometry(LidarOdometryConfig())
+    poses, at = [], []
+    for k in range(len(clouds)):
+        if 20 <= k < 24:
+            continue
+        time = float(clouds.times[30] if 30 <= k < 33 else clouds.times[k])
+        odometry.step(clouds.cloud(k), time, clouds.ages(k))
+        poses.append(odometry.pose)
+        at.append(k)
+    assert np.abs(errors(np.array(poses), truth[at])[:, 3:]).max() < 0.1
+
+
+def test_impossible_figures_are_refused():
+    for wrong in (
+        {"max_range": -1.0},
+        {"levels": (0.5, 1.0)},
+        {"suspicious": 1.5},
+        {"most_points": 3},
+        {"min_range": 90.0},
+    ):
+        with pytest.raises(ConfigError):
+            LidarOdometryConfig(**wrong)
