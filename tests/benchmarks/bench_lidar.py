@@ -128,9 +128,8 @@ def simulated(draws: int, first: int, seconds: float) -> None:
         print(f"{world:9s}{seed:5d} {config.pattern:9s}{carried:7s} ATE {ate(path, truth):.4f} m {said}")
     if every:
         inside = np.mean(np.array(every) < 12.6 / 6.0)
-        print(
-            f"all {len(every)} pieces: NEES/6 {np.mean(every):.2f}, median {np.median(every):.2f}, {inside:.0%} inside 95 %"
-        )
+        said = f"NEES/6 {np.mean(every):.2f}, median {np.median(every):.2f}, {inside:.0%} inside 95 %"
+        print(f"all {len(every)} pieces: {said}")
 
 
 def neighbours(scans: int) -> None:
