@@ -39,6 +39,7 @@ PAGES = [
     "segslam-recorded.md",
     "segslam.md",
     "simulated-robots.md",
+    "skeleton.md",
     "steps.md",
     "without-truth.md",
 ]
@@ -77,6 +78,7 @@ def test_links_lead_somewhere(name: str) -> None:
         "maps.md",
         "registration.md",
         "simulated-robots.md",
+        "skeleton.md",
         "steps.md",
         "without-truth.md",
     ],
