@@ -1,6 +1,6 @@
 """A self-balancing robot drives over a campus, outside and through buildings, with two lasers, an IMU, wheels and GPS.
 
-After Thrun and Montemerlo's Segway (Urban GraphSLAM, 2005): it pitches all the time to keep its balance, one laser
+After Montemerlo and Thrun's Segway (2005): it pitches all the time to keep its balance, one laser
 scans a vertical plane to its left, another pans from side to side in front of it, and GPS is there outside only.
 """
 

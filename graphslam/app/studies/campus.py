@@ -1,4 +1,4 @@
-"""The study ``campus``: what fixes outside are worth inside (Urban GraphSLAM, Figure 3).
+"""The study ``campus``: what fixes outside are worth inside (Montemerlo and Thrun 2005, Figure 3).
 
 Every run draws its campus, its robot and its noise, follows the path by scans once, and solves the same graph without
 fixes and with them. What is compared is paired, so a sign test needs no other assumption.
@@ -35,9 +35,10 @@ _WIDE = {"size": (310.0, 310.0), "block": 90.0, "open_share": 0.7, "visits": 3, 
 WORLDS = {
     "blocks": CampusTrialConfig(campus=campus_preset("full", **_WIDE)),
     "block": CampusTrialConfig(campus=campus_preset("block", **_THIN)),
+    "whole": CampusTrialConfig(campus=campus_preset("full", **{**_WIDE, "size": (600.0, 800.0), "movers": 20})),
 }
 """``blocks``: 310 m × 310 m, three buildings on a way of 1.0 to 1.3 km that sees little twice; ``block``: one block,
-round and through."""
+round and through; ``whole``: the whole campus, 1.6 to 2.9 km."""
 QUICK_WORLDS = {
     "quick": replace(WORLDS["block"], campus=campus_preset("quick", size=(66.0, 66.0), block=55.0, every=3, speed=1.5))
 }

@@ -95,7 +95,7 @@ def test_nees_has_bounds_on_both_sides() -> None:
 def test_it_is_found_by_its_name() -> None:
     assert find_study("campus") is STUDY
     assert STUDY.worlds(quick=True) == ("quick",)
-    assert STUDY.worlds(quick=False) == ("blocks", "block", "sessions")
+    assert STUDY.worlds(quick=False) == ("blocks", "block", "whole", "sessions")
     assert STUDY.trial("sessions", False).args == (SESSIONS["sessions"],)
     assert STUDY.default_trials(quick=False) == 20
 
