@@ -11,6 +11,7 @@ import numpy as np
 
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -19,7 +20,8 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
-from graphslam.maps.refined import refined_map, refined_submaps
+from graphslam.maps.moving import moving_points, without_moving
+from graphslam.maps.refined import base_frames, refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.guides import FAR, apart
 from graphslam.refine.refine import Refinement, refine
@@ -127,11 +129,22 @@ def refine_run(
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
+        drawn, moved = _standing(drawn, base_frames(refined))
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("the path is not refined: %s", error)
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
     wrong = None if graph is None else wrong_loops(graph, refined)
-    return Refined(found, refined, drawn, path), findings_of(found, wrong)
+    return Refined(found, refined, drawn, path), [*findings_of(found, wrong), *moved]
+
+
+def _standing(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
+    """Submaps without what moved, where they carry clouds, and how much that was."""
+    if not submaps or bases.shape[1] != 7 or any(s.cloud is None for s in submaps):
+        return submaps, []
+    moving = moving_points(submaps, bases[:-1])
+    gone, every = sum(int(m.sum()) for m in moving), sum(len(m) for m in moving)
+    text = f"{gone} of {every} points ({gone / max(every, 1):.1%}) lie on things that moved and are not in the map."
+    return without_moving(submaps, moving), [Finding("", "moving", text)] if gone else []
 
 
 def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:

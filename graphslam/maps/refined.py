@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.dense import CloudMap
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.points import transform
 from graphslam.core.poses import group_of, level
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -76,7 +78,7 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
 
 
 def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinement, scans: Scans) -> list[Submap]:
-    """The same submaps along the refined path: exits, paths and grids, each with its own scans alone.
+    """The same submaps along the refined path: exits, paths, grids and clouds, each with its own scans alone.
 
     Parameters
     ----------
@@ -102,7 +104,7 @@ def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinem
         a, b = int(ends[k]), int(ends[k + 1])
         poses = g.between(np.broadcast_to(bases[k], (b - a + 1, g.size)), refinement.poses[a : b + 1])
         exit_pose = g.between(bases[k], bases[k + 1])
-        C = _relative(refinement, a, b)
+        C, own = _relative(refinement, a, b), np.arange(a + (k > 0), b + 1)
         turn = g.adjoint(g.between(exit_pose, poses[-1]))  # from the body at the end to the frame of the exit
         P = turn @ C[-1] @ turn.T
         out.append(
@@ -111,7 +113,8 @@ def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinem
                 exit_pose=exit_pose,
                 exit_covariance=0.5 * (P + P.T),
                 trajectory=Trajectory(refinement.times[a : b + 1], poses, C),
-                grid=_drawn(s.grid, scans, np.arange(a + (k > 0), b + 1), poses[int(k > 0) :]),
+                grid=_drawn(s.grid, scans, own, poses[int(k > 0) :]),
+                cloud=None if s.cloud is None else _seen(s.cloud, scans, own, poses[int(k > 0) :]),
                 matches=(),
                 report={**s.report, "refined": True},
             )
@@ -174,3 +177,20 @@ def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> Evid
         if len(points):
             drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
     return drawn
+
+
+def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap | None:
+    """A cloud of the same cell with the returns of some steps, at ``T_base_body`` ``(k, 7|3)``; None without any."""
+    points, origins = [], []
+    scan: list[Index] = []
+    for k, T in zip(steps.tolist(), poses):
+        p, o, met = scans.scan(k)
+        if met.any():
+            points.append(transform(T, p[met]))
+            origins.append(transform(T, o[met][:1]))
+            scan.append(np.full(int(met.sum()), len(scan), np.int64))
+    if not points:
+        return None
+    return CloudMap(
+        points=np.concatenate(points), origins=np.concatenate(origins), scan=np.concatenate(scan), cell=cloud.cell
+    )

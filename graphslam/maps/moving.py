@@ -1,0 +1,161 @@
+"""Things that moved: points where other submaps saw that space is free.
+
+A car leaves points in every scan that saw it, at another place each time. Where it was, submaps before and after see
+through. A point is on something that moved where at least two neighbours know its place as free, with nothing occupied
+beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
+by beams to farther ground look the same. What moves away and never lets its place be seen stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from graphslam.core import se3
+from graphslam.core.dense import CloudMap
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.core.submap import Submap
+from graphslam.evidence.grid import EvidenceGrid
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovingConfig:
+    """What counts as moved."""
+
+    neighbours: int = 4
+    """Submaps before and after that are asked."""
+    free: float = -0.8
+    """Log-odds below which a voxel is known as free."""
+    least_free: int = 2
+    """Neighbours that must know a place as free."""
+    reach: float = 30.0
+    """Points farther from their sensor are left alone [m]: beams lie too wide apart there."""
+    above_ground: float = 0.3
+    """… and those not so far above the lowest point around [m]."""
+    ground_cell: float = 1.0
+    """Edge of the squares in which the lowest point is looked for, with the eight around [m]."""
+    company: int = 6
+    """Points that moved must have so many others …"""
+    company_radius: float = 0.6
+    """… so near [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "ground_cell", "company_radius"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ConfigError(f"moving: {name} = {getattr(self, name)}; wanted > 0")
+        if self.neighbours < 1 or not 1 <= self.least_free <= 2 * self.neighbours or self.company < 0:
+            raise ConfigError("moving: wanted neighbours ≥ 1, least_free of them on both sides at most, company ≥ 0")
+
+
+def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig | None = None) -> list[Mask]:
+    """Which points of the clouds of submaps are on things that moved.
+
+    Parameters
+    ----------
+    submaps : sequence of n Submap
+        In space, in the order of time; those without a grid, or without a cloud that says where points were seen from,
+        neither ask nor answer.
+    bases : (n, 7)
+        ``T_world_base``, z up.
+    config : MovingConfig, optional
+
+    Returns
+    -------
+    list of (m,) bool
+        Of the cloud of each submap; empty where it has none.
+    """
+    c = config or MovingConfig()
+    clouds = [s.cloud if s.grid is not None and s.cloud is not None and s.cloud.dim == 3 else None for s in submaps]
+    out = []
+    for k, cloud in enumerate(clouds):
+        if cloud is None or cloud.origins is None or cloud.scan is None:
+            out.append(np.zeros(0 if cloud is None else len(cloud), np.bool_))
+            continue
+        world = _world(bases[k], cloud.points)
+        near = np.linalg.norm(cloud.points - cloud.origins[cloud.scan], axis=1) < c.reach
+        others = [j for j in range(max(k - c.neighbours, 0), min(k + c.neighbours + 1, len(submaps))) if j != k]
+        around = [world, *(_world(bases[j], other.points) for j in others if (other := clouds[j]) is not None)]
+        asked = np.flatnonzero(near & ~_ground(world, np.concatenate(around), c))
+        free, supported = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
+        for j in others:
+            grid = submaps[j].grid
+            if not isinstance(grid, EvidenceGrid):
+                continue
+            T = np.asarray(se3.se3_between(bases[j], bases[k]))
+            says = _says(grid, _world(T, cloud.points[asked]), c.free)
+            free += says < 0
+            supported += says > 0
+        moved = np.zeros(len(cloud), np.bool_)
+        moved[asked[(free >= c.least_free) & (free > supported)]] = True
+        out.append(_in_company(world, moved, c))
+    return out
+
+
+def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
+    """The submaps with clouds and grids made without the points that moved; the others as they are."""
+    out = []
+    for s, gone in zip(submaps, moving):
+        cloud, grid = s.cloud, s.grid
+        if not gone.any() or cloud is None or cloud.scan is None or not isinstance(grid, EvidenceGrid):
+            out.append(s)
+            continue
+        assert cloud.origins is not None
+        left = CloudMap(points=cloud.points[~gone], origins=cloud.origins, scan=cloud.scan[~gone], cell=cloud.cell)
+        drawn = grid.empty()
+        for k, origin in enumerate(cloud.origins):
+            points = cloud.points[(cloud.scan == k) & ~gone]
+            if len(points):
+                drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
+        out.append(replace(s, cloud=left, grid=drawn, report={**s.report, "points_moved": int(gone.sum())}))
+    return out
+
+
+def _world(T: Array, points: Array) -> Array:
+    return np.asarray(se3.se3_transform(T[None], points))
+
+
+def _says(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int64]:
+    """Of points ``(n, 3)`` in a grid: -1 free with nothing occupied beside, 1 occupied there or beside, 0 neither."""
+    known = grid.log_odds_at(points)
+    out = np.zeros(len(points), np.int64)
+    asked = np.flatnonzero(np.isfinite(known))
+    occupied = np.zeros(len(asked), np.bool_)
+    for step in product((-1, 0, 1), repeat=3):
+        occupied |= grid.occupied_at(points[asked] + grid.voxel_size * np.array(step, dtype=np.float64))
+    out[asked[occupied]] = 1
+    out[asked[~occupied & (known[asked] < free)]] = -1
+    return out
+
+
+def _ground(points: Array, around: Array, c: MovingConfig) -> Mask:
+    """Which points lie little above the lowest one around them."""
+    cell = np.floor(around[:, :2] / c.ground_cell).astype(np.int64)
+    first = cell.min(axis=0) - 1
+    size = cell.max(axis=0) - first + 2
+    lowest = np.full(int(size[0] * size[1]), np.inf)
+    at = cell - first
+    np.minimum.at(lowest, at[:, 0] * size[1] + at[:, 1], around[:, 2])
+    mine = np.floor(points[:, :2] / c.ground_cell).astype(np.int64) - first
+    low = np.full(len(points), np.inf)
+    for i, j in product((-1, 0, 1), repeat=2):
+        low = np.minimum(low, lowest[(mine[:, 0] + i) * size[1] + mine[:, 1] + j])
+    return np.asarray(points[:, 2] - low < c.above_ground)
+
+
+def _in_company(points: Array, moved: Mask, c: MovingConfig) -> Mask:
+    rows = np.flatnonzero(moved)
+    if not len(rows):
+        return moved
+    tree = cKDTree(points[rows])
+    many = tree.query_ball_point(points[rows], c.company_radius, return_length=True) - 1
+    out = np.zeros_like(moved)
+    out[rows[many >= c.company]] = True
+    return out

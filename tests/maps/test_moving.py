@@ -1,0 +1,114 @@
+"""Things that move are kept out of maps: a box that is carried through a hall with pillars."""
+
+import numpy as np
+import pytest
+
+from graphslam.core.dense import CloudMap
+from graphslam.core.errors import ConfigError
+from graphslam.core.submap import Submap
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.moving import MovingConfig, moving_points, without_moving
+from graphslam.sim.raycast import RayCaster
+
+SUBMAPS, SCANS = 12, 4
+
+
+def _box(lower, upper):
+    """Vertices and triangles of a box."""
+    v = np.array([[x, y, z] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return v, np.array([[q[i] for i in t] for q in quads for t in ((0, 1, 2), (0, 2, 3))])
+
+
+def _scene(boxes):
+    vertices, triangles, n = [], [], 0
+    for lower, upper in boxes:
+        v, t = _box(lower, upper)
+        vertices.append(v)
+        triangles.append(t + n)
+        n += len(v)
+    return RayCaster(np.concatenate(vertices), np.concatenate(triangles))
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Submaps along a hall, bases, and which of their points are on the box that moves."""
+    rng = np.random.default_rng(4)
+    hall = [((-12, -8, -1), (22, 8, 4))]
+    pillars = [((x, y, -1), (x + 0.6, y + 0.6, 3)) for x in (-6, 0, 6, 12) for y in (-5, 4.4)]
+    bases = np.tile([0.0, 0, 0, 0, 0, 0, 1], (SUBMAPS, 1))
+    bases[:, 0] = 0.5 * np.arange(SUBMAPS)
+    static = _scene(hall + pillars)
+    submaps, truth = [], []
+    for k in range(SUBMAPS):
+        grid, points, scan, origins, moved = EvidenceGrid(0.2), [], [], [], []
+        for j in range(SCANS):
+            t = k * SCANS + j
+            at = np.array([3.0 + 0.25 * t - 4.0, 2.0, -0.9])
+            mover = _scene([(at, at + [1.5, 0.8, 1.6])])
+            origin = np.array([0.1 * j, 0.0, 0.3])
+            d = rng.normal(size=(2500, 3)) * [1.0, 1.0, 0.4]
+            d /= np.linalg.norm(d, axis=1)[:, None]
+            rays = np.hstack([np.broadcast_to(bases[k, :3] + origin, d.shape), d])
+            far = static.ranges(rays)
+            near = mover.ranges(rays)
+            hit = np.isfinite(near) & (near < far)
+            r = np.where(hit, near, far) + rng.normal(0, 0.015, len(d))
+            p = origin + d * r[:, None]
+            grid.insert_scan(p, np.broadcast_to(origin, p.shape))
+            points.append(p)
+            scan.append(np.full(len(p), j))
+            origins.append(origin)
+            moved.append(hit)
+        cloud = CloudMap(points=np.concatenate(points), origins=np.array(origins), scan=np.concatenate(scan))
+        exit_pose = np.array([0.5, 0, 0, 0, 0, 0, 1])
+        interval = (float(k), float(k + 1))
+        submaps.append(
+            Submap(
+                key=k, interval=interval, exit_pose=exit_pose, exit_covariance=1e-4 * np.eye(6), grid=grid, cloud=cloud
+            )
+        )
+        truth.append(np.concatenate(moved))
+    return submaps, bases, truth
+
+
+def test_what_moved_is_found_and_what_stands_is_left(made):
+    submaps, bases, truth = made
+    found = moving_points(submaps, bases)
+    moved, static = np.concatenate(truth), ~np.concatenate(truth)
+    flagged = np.concatenate(found)
+    z = np.concatenate([s.cloud.points[:, 2] for s in submaps])
+    high = z > -1.0 + 0.4  # what is nearer to the ground is left alone
+    assert moved.sum() > 1000
+    assert np.mean(flagged[moved & high]) > 0.9
+    assert np.mean(flagged[static]) < 0.002
+
+
+def test_its_voxels_are_gone_from_the_maps(made):
+    submaps, bases, truth = made
+    left = without_moving(submaps, moving_points(submaps, bases))
+    before = after = kept = stood = 0
+    for a, b, moved in zip(submaps, left, truth):
+        on = a.cloud.points[moved & (a.cloud.points[:, 2] > -0.4)]
+        before += a.grid.occupied_at(on).sum()
+        after += b.grid.occupied_at(on).sum()
+        still = a.cloud.points[~moved]
+        stood += a.grid.occupied_at(still).sum()
+        kept += b.grid.occupied_at(still).sum()
+    assert before > 1000
+    assert after < 0.05 * before
+    assert kept > 0.99 * stood
+    assert sum(s.report.get("points_moved", 0) for s in left) == sum(m.sum() for m in moving_points(submaps, bases))
+
+
+def test_submaps_without_free_space_are_left_alone(made):
+    submaps, bases, _ = made
+    bare = [
+        Submap(key=s.key, interval=s.interval, exit_pose=s.exit_pose, exit_covariance=s.exit_covariance)
+        for s in submaps
+    ]
+    assert all(len(m) == 0 for m in moving_points(bare, bases))
+    assert without_moving(bare, moving_points(bare, bases)) == bare
+    for wrong in ({"reach": 0.0}, {"neighbours": 0}, {"least_free": 20}):
+        with pytest.raises(ConfigError):
+            MovingConfig(**wrong)
