@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ _SHAPE = {
 
 Points = npt.NDArray[np.float32]
 Labels = npt.NDArray[np.int32]
+T = TypeVar("T", Points, Labels)
 
 
 class Tiles:
@@ -70,7 +72,7 @@ class Tiles:
                 raise FormatError("tile is missing or truncated", where=str(path), got=got, wanted=f"{4 * n + 16 * m}")
             if verify and _digest(path.read_bytes()) != path.stem:
                 raise FormatError("tile was changed: its digest is not its name", where=str(path))
-            count = np.fromfile(path, dtype="<i4", count=n)
+            count = _numbers(path, np.empty(n, dtype="<i4"), 0)
             if count.min(initial=0) < 0 or int(count.sum()) != m:
                 raise FormatError(
                     "measurements of the poses of a tile", where=str(path), got=int(count.sum()), wanted=m
@@ -94,15 +96,16 @@ class Tiles:
 
     def read(self, begin: int, end: int) -> tuple[Points, Labels]:
         """Points ``(m, 3)`` and landmarks ``(m,)`` of the poses ``begin … end - 1``."""
-        points, labels = [], []
+        points: list[Points] = []
+        labels: list[Labels] = []
         for a, b in self.ranges(begin, end):
             k = int(np.searchsorted(self._begin, a, side="right")) - 1
             path = self._path(self._names[k])
             head = 4 * int(self._begin[k + 1] - self._begin[k])
             lo, hi = (int(self.first[i] - self.first[self._begin[k]]) for i in (a, b))
             m = int(self.first[self._begin[k + 1]] - self.first[self._begin[k]])
-            points.append(np.fromfile(path, dtype="<f4", count=3 * (hi - lo), offset=head + 12 * lo).reshape(-1, 3))
-            labels.append(np.fromfile(path, dtype="<i4", count=hi - lo, offset=head + 12 * m + 4 * lo))
+            points.append(_numbers(path, np.empty((hi - lo, 3), dtype="<f4"), head + 12 * lo))
+            labels.append(_numbers(path, np.empty(hi - lo, dtype="<i4"), head + 12 * m + 4 * lo))
         if len(points) == 1:
             return points[0], labels[0]
         return np.concatenate(points), np.concatenate(labels)
@@ -148,6 +151,17 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
         index.append({"file": name, "poses": len(n), "measurements": len(label)})
     write_json(out / _INDEX, {"format": FORMAT, "landmarks": high + 1, "tiles": index})
     return Tiles(out)
+
+
+def _numbers(path: Path, out: T, begin: int) -> T:
+    """``out``, filled from byte ``begin`` of a tile on."""
+    with path.open("rb") as stream:
+        stream.seek(begin)
+        got = stream.readinto(out.data)
+    if got != out.nbytes:
+        wanted = f"{out.nbytes} from byte {begin} on"
+        raise FormatError("tile is truncated", where=str(path), got=f"{got} bytes", wanted=wanted)
+    return out
 
 
 def _digest(data: bytes) -> str:
