@@ -45,6 +45,11 @@ class GpsConfig:
         With a number [m]: one bias per GPS segment with that prior (default: none).
     segment_gap : float
         A pause longer than this [s] starts a new segment.
+    bias_time : float or None
+        With a number [s]: errors last, and fade over this time. A bias then follows from the one before, as a
+        Gauss–Markov process whose σ at any time is ``bias_sigma``; a new one begins after a tenth of this time, and
+        with each segment. Of fixes whose coordinates are not equally sure it has the shape of their covariance, and
+        ``bias_sigma`` is its mean over east and north. Default: biases of segments know nothing of each other.
     """
 
     robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
@@ -52,12 +57,20 @@ class GpsConfig:
     baseline: float = 20.0
     bias_sigma: float | None = None
     segment_gap: float = 2.0
+    bias_time: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "baseline", "bias_sigma", "segment_gap"):
+        for name in ("sigma", "baseline", "bias_sigma", "segment_gap", "bias_time"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"gps.{name} must be positive, got {value}")
+        if self.bias_time is not None and self.bias_sigma is None:
+            raise ConfigError("gps.bias_time needs gps.bias_sigma: the size of the errors that last so long")
+
+    @property
+    def bias_every(self) -> float:
+        """Time for which a bias holds [s]: without ``bias_time`` as long as its segment."""
+        return np.inf if self.bias_time is None else 0.1 * self.bias_time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +210,7 @@ class GpsFixes:
         self.waiting: list[Fix] = []  # for their submap, in the order of time
         self.tied: list[TiedFix] = []  # for a datum
         self.last_time = -np.inf
+        self.bias_begin = -np.inf  # of the last bias
 
     def add(self, gps: Gps, stream: str, config: GpsConfig | None) -> list[int]:
         """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_gps`."""
@@ -336,9 +350,21 @@ class GpsFixes:
         g = self.graph
         if cfg.bias_sigma is None:
             return None
-        if g.structure.count("bias") == 0 or fix.time - previous > cfg.segment_gap:
-            s = g.structure.append("bias", np.zeros(g.dim))
-            record = BiasPriorRecord(g.next_factor(), s, cfg.bias_sigma, dim=g.dim)
+        last = g.structure.count("bias") - 1
+        paused = fix.time - previous > cfg.segment_gap
+        if last < 0 or paused or not 0.0 <= fix.time - self.bias_begin < cfg.bias_every:
+            before, keep = None, 0.0
+            if last >= 0 and cfg.bias_time is not None and fix.time >= self.bias_begin:
+                before, keep = last, float(np.exp(-(fix.time - self.bias_begin) / cfg.bias_time))
+            shape = None
+            if cfg.bias_time is not None and fix.uneven is not None:
+                shape = fix.uneven / (0.5 * np.trace(fix.uneven[:2, :2]))
+            self.bias_begin = fix.time
+            last = g.structure.append("bias", np.zeros(g.dim))
+            sigma = cfg.bias_sigma * float(np.sqrt(1.0 - keep**2))
+            record = BiasPriorRecord(
+                g.next_factor(), last, sigma, dim=g.dim, before=before, keep=keep, shape=shape
+            )  # fmt: skip
             g.ledger.spend(record.factor_id, record.label(), ["-"], (fix.time, fix.time), "prior")
             g.insert(record)
-        return g.structure.count("bias") - 1
+        return last

@@ -123,6 +123,7 @@ def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsI
     if n > most:  # their joint covariance grows with the square of their number
         withheld = withheld.take(np.unique(np.linspace(0, n - 1, most).astype(int)))
     try:
-        return gps_innovations(graph, withheld, sigma=c.sigma, bias_sigma=c.bias_sigma, segment_gap=c.segment_gap)
+        same = c.segment_gap if c.bias_time is None else max(c.segment_gap, c.bias_every)
+        return gps_innovations(graph, withheld, sigma=c.sigma, bias_sigma=c.bias_sigma, segment_gap=same)
     except DataError:  # no withheld fix on the path: the counts of the GPS residuals say so
         return None

@@ -9,6 +9,10 @@ Quantities
 aligned by itself, its shape; ``ate_indoor_anchored``: as the map has it, first base held. ``angle_error``: of the angle
 between the two legs of a corridor [deg]. ``nees_<block>_<where>``: squared error a degree of freedom at one place of
 the way; without ``<where>``: mean over the way.
+
+All graphs of a run are aligned alike: ``ate`` and its parts by the truth of the whole way, ``…_own`` by that of the
+inside, ``…_anchored`` by the first base, which every graph holds, with fixes and without. So where nothing is aligned
+after the fact, fixes can help by no more than they know of that first base.
 """
 
 from __future__ import annotations
@@ -98,7 +102,7 @@ def pair_table(table: pd.DataFrame) -> pd.DataFrame:
     """Every kind with fixes against the same graph without, run by run.
 
     ``ratio``: of the means; ``median_ratio``: of the middle pair; ``half``: share of the runs at half the error or
-    less; ``p``: two-sided sign test.
+    less; ``p``: two-sided sign test of better against worse; ``p_half``: that of half against more than half.
     """
     out: list[tables.Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
@@ -117,6 +121,7 @@ def pair_table(table: pd.DataFrame) -> pd.DataFrame:
                 row |= {"alone": float(a.mean()), "with_fixes": float(b.mean()), "ratio": float(b.mean() / a.mean())}
                 row |= {"median_ratio": float(np.median(b / a)), "half": float(np.mean(b <= 0.5 * a)), "better": better}
                 row["p"] = float(stats.binomtest(better, differ).pvalue) if differ else 1.0
+                row["p_half"] = float(stats.binomtest(int(np.sum(b <= 0.5 * a)), len(a)).pvalue)
                 out.append(row)
     return pd.DataFrame(out)
 

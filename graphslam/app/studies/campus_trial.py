@@ -1,8 +1,8 @@
 """One run over the campus: what fixes outside are worth inside.
 
 ``odometry``: scan-to-window odometry, its submaps one behind the other. ``alone``: the same with loops between them.
-``joint-sparse`` and ``joint``: the same graph, loops and all, with one fix in :attr:`CampusTrialConfig.sparse` seconds,
-then with every fix. So the pair differs in the fixes and in nothing else.
+``joint-white`` and ``joint``: the same graph, the same loops, and fixes: every one as if its error was a new one; or
+as :attr:`CampusTrialConfig.gps` has it, which says how long errors last. So the pair differs in the fixes alone.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from graphslam.app.machine import one_blas_thread
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.streams import split
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3, level
@@ -29,11 +30,12 @@ from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.scan_window.front_end import ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.gps import GpsRecord
 from graphslam.sim.campus import simulate_campus
 from graphslam.sim.campus_config import CampusConfig
 from graphslam.solve.solution import Solution
 
-KINDS = ("odometry", "alone", "joint-sparse", "joint")
+KINDS = ("odometry", "alone", "joint-white", "joint")
 BLOCKS = {"position": slice(3, 6), "plan": slice(3, 5), "heading": slice(2, 3), "level": slice(0, 2)}
 
 
@@ -54,9 +56,8 @@ class CampusTrialConfig:
         )
     )
     back_end: BackEndConfig = field(default_factory=lambda: BackEndConfig(loops=True, level_sigma=0.006, look_every=0))
-    gps: GpsOptions = field(default_factory=lambda: GpsOptions(use="all"))
-    sparse: float = 20.0
-    """Time between the fixes of ``joint-sparse``: errors of fixes are alike for longer than a second [s]."""
+    gps: GpsOptions = field(default_factory=lambda: GpsOptions(use="all", every=20.0, bias_sigma=0.8, bias_time=300.0))
+    """Reflections last for 10 s, so that one fix in 20 s says all; errors of orbits last for minutes."""
 
 
 def run_campus_trial(config: CampusTrialConfig, seed: int) -> list[Measurement]:
@@ -82,11 +83,8 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
     yield from judge.figures("alone", end.finish())
     joined = process_time()
     gps: Gps = log["gps"]
-    few = np.zeros(len(gps.times), dtype=bool)
-    few[np.unique(np.floor(gps.times / config.sparse), return_index=True)[1]] = True
-    for kind, rows in (("joint-sparse", few), ("joint", ~few)):
-        end.add_gps(gps.take(rows), config.gps)
-        yield from judge.figures(kind, end.finish())
+    for kind, how in (("joint-white", GpsOptions(use="all")), ("joint", config.gps)):
+        yield from judge.figures(kind, with_fixes(end, gps, how))
     lost = sum(int(s.report.get("scans_lost", 0)) for s in submaps)
     steps = sum(int(s.report.get("steps", 0)) for s in submaps)
     tied = [r for r in end.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
@@ -96,6 +94,17 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
     yield Measurement("joint", "fixes", float(len(gps.times)))
     for name, seconds in (("simulate", made - begin), ("follow", followed - made), ("graph", joined - followed)):
         yield Measurement("odometry", f"seconds_{name}", seconds, timing=True)
+
+
+def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> Solution:
+    """The graph as it is, with these fixes and no others."""
+    graph = end.graph
+    for fid in [k for k, r in graph.records.items() if isinstance(r, GpsRecord)]:
+        graph.remove(fid, reason="other fixes come in their place")
+    end.add_gps(split(gps, how)[0], how)
+    graph.finish_gps()
+    end.solver.solve_to_optimum()
+    return end.solver.solution()
 
 
 def submap_lift(config: WindowSubmapConfig) -> float:

@@ -33,7 +33,7 @@ from graphslam.core.poses import upright
 from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, se3_transform, skew, so3_exp
 from graphslam.graph.factors.attitude import constant_or_read, skew_of, turn_of, up_turn
 from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, Robust, whitener
 from graphslam.graph.variables import Values, gtsam_key
 
 Index = npt.NDArray[np.int64]
@@ -91,13 +91,29 @@ class GpsRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiasPriorRecord:
-    """Prior ``N(0, sigma² I)`` on the bias of one GPS segment."""
+    """What a bias of fixes is before any fix tells: ``bias - keep · before ~ N(0, sigma² shape)``.
+
+    Parameters
+    ----------
+    bias : int
+    sigma : float
+        [m]
+    before : int or None
+        The bias that it follows from; None: it starts from zero.
+    keep : float
+        Share of that one that is left, ``exp(-Δt/τ)``.
+    shape : (dim, dim) or None
+        Where coordinates are not equally sure; None: the identity.
+    """
 
     factor_id: int
     bias: int
     sigma: float
     group: str = "gps-bias"
     dim: int = 2
+    before: int | None = None
+    keep: float = 0.0
+    shape: Array | None = None
 
     @property
     def rows(self) -> int:
@@ -106,7 +122,7 @@ class BiasPriorRecord:
 
     def variables(self) -> list[str]:
         """Names of the variables."""
-        return [f"bias{self.bias}"]
+        return [*([] if self.before is None else [f"bias{self.before}"]), f"bias{self.bias}"]
 
     def label(self) -> str:
         """Name for messages."""
@@ -384,29 +400,39 @@ def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
 
 
 class BiasPriorBatch(UniformBatch):
-    """Priors on the biases of GPS segments."""
+    """Priors on the biases of GPS segments, and how one follows from another."""
 
     record = BiasPriorRecord
-    slots = ("bias",)
+    slots = ("bias", "bias")
     prior = True
+
+    def __init__(self, records: Sequence[BiasPriorRecord], layout: Any) -> None:
+        super().__init__(records, layout)
+        self._keep = np.array([0.0 if r.before is None else r.keep for r in records])
 
     @staticmethod
     def keys(record: BiasPriorRecord) -> Sequence[int | None]:
-        """The bias."""
-        return (record.bias,)
+        """The one before, if it follows from one, and the bias."""
+        return record.before, record.bias
 
     @staticmethod
     def whitener(record: BiasPriorRecord) -> Array:
-        """Of the prior's σ."""
-        return np.eye(record.dim) / record.sigma
+        """Of the prior's σ and shape."""
+        if record.shape is None:
+            return np.eye(record.dim) / record.sigma
+        return whitener(record.sigma**2 * record.shape, what=record.label())
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""
-        return blocks[0], np.broadcast_to(np.eye(self.dim), (len(self), self.dim, self.dim))
+        before, now = blocks
+        keep, one = self._keep[:, None], np.broadcast_to(np.eye(self.dim), (len(self), self.dim, self.dim))
+        return now - keep * before, np.concatenate([-keep[:, None] * one, one], axis=2)
 
     @classmethod
     def gtsam(cls, record: BiasPriorRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """GTSAM's own."""
+        """GTSAM's own, where it starts from zero and is round."""
+        if record.before is not None or record.shape is not None:
+            return super().gtsam(record, origin)
         noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
         prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
         return prior(gtsam_key(f"bias{record.bias}"), np.zeros(record.dim), noise)
