@@ -226,6 +226,11 @@ class Tracker:
         P[x:, :x] = P[:x, x:].T
         own = P[:x, :x] - K @ S @ K.T
         P[:x, :x] = 0.5 * (own + own.T)
+        # What now and the window share, an error of the whole map, may be metres, and is told in the axes of the pose:
+        # they turn with it. Else it would seem that scans saw some of it, and what they do see would count for less.
+        turned = self.group.adjoint(self.group.exp(-d[: self.w]))
+        P[: self.w] = turned @ P[: self.w]
+        P[:, : self.w] = P[:, : self.w] @ turned.T
         self.pose = self.group.compose(self.pose, self.group.exp(d[: self.w]))
         self.lasting = self.lasting + d[self.w :]
 
@@ -273,7 +278,7 @@ class Tracker:
             seen = np.stack([L, every])
             M = held_directions(L, every, c.normal_sigma, self._unheld(lately + seen))
             H = np.zeros((len(M), self.x))
-            H[:, :w] = M @ L
+            H[:, :w] = M @ L @ g.adjoint(g.exp(-d[:w]))  # from the axes of the pose before corrections
             y = M @ (L @ d[:w] - b)
             gain = self._gain(H, M @ G, slots, 1.0)
             d = gain[0] @ y

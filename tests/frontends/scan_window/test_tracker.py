@@ -292,3 +292,26 @@ def test_numbers_that_cannot_be_are_refused() -> None:
     ):
         with pytest.raises(ConfigError, match="window"):
             ScanWindowConfig(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_where_the_map_lies_is_no_matter_of_the_path(dim: int) -> None:
+    """A map that may lie tens of metres off, and be turned by a radian: scans see nothing of it, nor does it cost."""
+    steps, made = drawn_ring(5, dim, 16.0), []
+    for far in (0.0, 1.0):
+        t = Tracker(steps, CONFIG)
+        g, unsure = t.group, np.zeros(t.w)
+        unsure[g.position], unsure[g.heading] = 30.0 * far, 1.0 * far
+        A = g.adjoint(g.inverse(t.pose))
+        t.P[: t.w, : t.w] += A @ np.diag(unsure**2) @ A.T
+        t.begin()
+        poses = []
+        for _ in range(len(steps)):
+            t.step()
+            poses.append(t.pose)
+        a, b = poses[0], poses[-1]
+        made.append((np.array(poses), relative_covariance((a, b), (a, b), t.joint)))
+    (near, P), (far_off, Q) = made
+    off = group_of(near).log(group_of(near).between(near, far_off))
+    assert np.abs(off).max() < 1e-3
+    np.testing.assert_allclose(np.sqrt(np.diag(Q)), np.sqrt(np.diag(P)), rtol=0.05)
