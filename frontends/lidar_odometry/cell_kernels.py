@@ -49,8 +49,9 @@ class Cells(NamedTuple):
     """Number of points in what is matched to; 0: the cell does not count yet."""
     centre: F8
     """What is matched to ``(b, 3)``."""
-    information: F8
-    """Inverse covariance of a point's distance to it ``(b, 6)``."""
+    root: F8
+    """Square root ``(b, r, 3)`` of the information of a point's distance to it, which is ``rootᵀ root``; one row where
+    only surfaces tell, else three."""
     seen: I8
     """Scan that last put points into it."""
     made: F8
@@ -178,6 +179,20 @@ def _eigen(S: F8, V: F8) -> None:
 
 
 @nb.njit(cache=True)
+def _inverse_root(S: F8, times: float, more: float, out: F8) -> None:
+    """``W`` (3, 3), lower, with ``Wᵀ W = (times S + more I)⁻¹``: inverse of the Cholesky factor."""
+    a = np.sqrt(max(times * S[0, 0], 0.0) + more)
+    b = times * S[1, 0] / a
+    c = times * S[2, 0] / a
+    d = np.sqrt(max(times * S[1, 1] - b * b, 0.0) + more)
+    e = (times * S[2, 1] - b * c) / d
+    f = np.sqrt(max(times * S[2, 2] - c * c - e * e, 0.0) + more)
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 / a, 0.0, 0.0
+    out[1, 0], out[1, 1], out[1, 2] = -b / (a * d), 1.0 / d, 0.0
+    out[2, 0], out[2, 1], out[2, 2] = (b * e - c * d) / (a * d * f), -e / (d * f), 1.0 / f
+
+
+@nb.njit(cache=True)
 def _tell(c: Cells, b: Any, size: float, least: float, planes: bool) -> None:
     """Take the points so far for the cell that is matched to."""
     n = c.number[b]
@@ -185,12 +200,12 @@ def _tell(c: Cells, b: Any, size: float, least: float, planes: bool) -> None:
     s = c.scatter[b]
     S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = s[0], s[1], s[2], s[3], s[4], s[5]
     S[1, 0], S[2, 0], S[2, 1] = s[1], s[2], s[4]
-    V = np.empty((3, 3))
-    _eigen(S, V)
-    A = np.zeros((3, 3))
+    root = c.root[b]
     if planes:
         # Only across a surface do points hold: along it a cell's centre is where the scans happened to fall. Points in
         # a row, as one line of a scanner leaves them, tell of no surface.
+        V = np.empty((3, 3))
+        _eigen(S, V)
         k = 0
         for i in range(1, 3):
             if S[i, i] < S[k, k]:
@@ -200,16 +215,9 @@ def _tell(c: Cells, b: Any, size: float, least: float, planes: bool) -> None:
         flat = (0.12 * size) ** 2
         weight = max(1.0 - across / flat, 0.0) * min(max(second / flat - 0.5, 0.0), 1.0) / (across + least * least)
         for i in range(3):
-            for j in range(3):
-                A[i, j] = weight * V[i, k] * V[j, k]
+            root[0, i] = np.sqrt(weight) * V[i, k]
     else:
-        for k in range(3):
-            weight = 1.0 / (max(S[k, k] / n, 0.0) + least * least)
-            for i in range(3):
-                for j in range(3):
-                    A[i, j] += weight * V[i, k] * V[j, k]
-    I = c.information[b]
-    I[0], I[1], I[2], I[3], I[4], I[5] = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
+        _inverse_root(S, 1.0 / n, least * least, root)
     moved = 0.0
     for i in range(3):
         moved = max(moved, abs(c.mean[b, i] - c.centre[b, i]))
@@ -269,11 +277,11 @@ def keep_since(c: Cells, out: Cells, scan: int) -> None:
             continue
         k = _put(out, c.cube[b])
         out.number[k], out.told[k], out.seen[k], out.made[k] = c.number[b], c.told[b], c.seen[b], c.made[b]
-        out.mean[k], out.scatter[k], out.centre[k], out.information[k] = (
+        out.mean[k], out.scatter[k], out.centre[k], out.root[k] = (
             c.mean[b],
             c.scatter[b],
             c.centre[b],
-            c.information[b],
+            c.root[b],
         )
 
 
@@ -371,34 +379,54 @@ def normal_equations(
         then the sum of weights times traces of information, of these times the points (3), and times their squares
         (6: xx, xy, xz, yy, yz, zz).
     """
-    R, t = pose
+    notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
+    _normal_equations(c, points, pose, size, scale, (H, g, told), notes)
+
+
+@nb.njit(cache=True)
+def _normal_equations(
+    c: Cells,
+    points: F8,
+    pose: tuple[F8, F8],
+    size: float,
+    scale: float,
+    out: tuple[F8, F8, F8],
+    notes: tuple[I8, I8],
+) -> None:
+    """``notes``: the cached cube in which each point lay the last time, and the cell it was told then."""
+    (R, t), (H, g, told), (asked, found) = pose, out, notes
+    fine = FINE / size
     H[:, :] = 0.0
     g[:] = 0.0
     told[:] = 0.0
     inverse = 1.0 / (scale * scale)
-    A = np.empty((3, 3))
-    B = np.empty((3, 3))
-    J = np.empty((3, 6))
-    Q = np.empty((3, 6))
+    rows = c.root.shape[1]
+    r = np.empty(3)
+    J = np.empty(6)
     for p in range(len(points)):
         a, b, e = points[p, 0], points[p, 1], points[p, 2]
         x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * e + t[0]
         y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * e + t[1]
         z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * e + t[2]
-        at = _nearest(c, x, y, z, size)
+        cube = _pack(x, y, z, fine)
+        if cube != asked[p]:
+            asked[p], found[p] = cube, _nearest(c, x, y, z, size)
+        at = found[p]
         if at < 0:
             continue
-        rx, ry, rz = x - c.centre[at, 0], y - c.centre[at, 1], z - c.centre[at, 2]
-        I = c.information[at]
-        vx = I[0] * rx + I[1] * ry + I[2] * rz
-        vy = I[1] * rx + I[3] * ry + I[4] * rz
-        vz = I[2] * rx + I[4] * ry + I[5] * rz
-        m = rx * vx + ry * vy + rz * vz
-        w = 1.0 / (1.0 + m * inverse)
-        w *= w
-        trace = I[0] + I[3] + I[5]
+        x -= c.centre[at, 0]
+        y -= c.centre[at, 1]
+        z -= c.centre[at, 2]
+        W = c.root[at]
+        m, trace = 0.0, 0.0
+        for k in range(rows):
+            r[k] = W[k, 0] * x + W[k, 1] * y + W[k, 2] * z
+            m += r[k] * r[k]
+            trace += W[k, 0] * W[k, 0] + W[k, 1] * W[k, 1] + W[k, 2] * W[k, 2]
         if trace <= 0.0:
             continue
+        w = 1.0 / (1.0 + m * inverse)
+        w *= w
         told[0] += w
         told[1] += 1.0
         told[2] += w * m
@@ -413,38 +441,122 @@ def normal_equations(
         told[10] += trace * b * b
         told[11] += trace * b * e
         told[12] += trace * e * e
-        # world information in the body's axes
-        A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2] = I[0], I[1], I[2], I[3], I[4], I[5]
-        A[1, 0], A[2, 0], A[2, 1] = I[1], I[2], I[4]
+        for k in range(rows):
+            # the row in the body's axes; its residual's derivative is [p × u, u]
+            ux = R[0, 0] * W[k, 0] + R[1, 0] * W[k, 1] + R[2, 0] * W[k, 2]
+            uy = R[0, 1] * W[k, 0] + R[1, 1] * W[k, 1] + R[2, 1] * W[k, 2]
+            uz = R[0, 2] * W[k, 0] + R[1, 2] * W[k, 1] + R[2, 2] * W[k, 2]
+            J[0], J[1], J[2] = b * uz - e * uy, e * ux - a * uz, a * uy - b * ux
+            J[3], J[4], J[5] = ux, uy, uz
+            for i in range(6):
+                v = w * J[i]
+                g[i] += v * r[k]
+                for j in range(i, 6):
+                    H[i, j] += v * J[j]
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+
+
+@nb.njit(cache=True)
+def _rotation(w: F8, R: F8, V: F8) -> None:
+    """Rotation by a vector, and the left Jacobian."""
+    x = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    if x < 1e-4:
+        a, b, d = 1.0 - x * x / 6.0, 0.5 - x * x / 24.0, 1.0 / 6.0 - x * x / 120.0
+    else:
+        a, b, d = np.sin(x) / x, (1.0 - np.cos(x)) / (x * x), (x - np.sin(x)) / (x * x * x)
+    K = np.zeros((3, 3))
+    K[0, 1], K[0, 2], K[1, 2] = -w[2], w[1], -w[0]
+    K[1, 0], K[2, 0], K[2, 1] = w[2], -w[1], w[0]
+    for i in range(3):
+        for j in range(3):
+            square = K[i, 0] * K[0, j] + K[i, 1] * K[1, j] + K[i, 2] * K[2, j]
+            one = 1.0 if i == j else 0.0
+            R[i, j] = one + a * K[i, j] + b * square
+            V[i, j] = one + b * K[i, j] + d * square
+
+
+@nb.njit(cache=True)
+def _log(R: F8, t: F8, out: F8) -> None:
+    """Logarithm (6,) of a motion that turns by less than a right angle."""
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    k = 1.0 + angle * angle / 6.0 if angle < 1e-4 else angle / sine
+    w = out[:3]
+    w[0], w[1], w[2] = k * x, k * y, k * z
+    # inverse of the left Jacobian: t - w × t / 2 + q w × (w × t)
+    q = 1.0 / 12.0 if angle < 1e-3 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / (angle * angle)
+    a = w[1] * t[2] - w[2] * t[1], w[2] * t[0] - w[0] * t[2], w[0] * t[1] - w[1] * t[0]
+    out[3] = t[0] - 0.5 * a[0] + q * (w[1] * a[2] - w[2] * a[1])
+    out[4] = t[1] - 0.5 * a[1] + q * (w[2] * a[0] - w[0] * a[2])
+    out[5] = t[2] - 0.5 * a[2] + q * (w[0] * a[1] - w[1] * a[0])
+
+
+@nb.njit(cache=True, nogil=True)
+def descend(
+    c: Cells,
+    points: F8,
+    pose: tuple[F8, F8],
+    start: tuple[F8, F8, F8],
+    size: float,
+    scale: float,
+    stop: tuple[float, float, int],
+    out: tuple[F8, F8, F8],
+) -> int:
+    """Gauss–Newton steps of a pose, in place, until it stands still; how many.
+
+    Parameters
+    ----------
+    pose : (3, 3), (3,)
+        Improved in place.
+    start : (3, 3), (3,), (6, 6)
+        A pose that is known beforehand, and its information, right tangent.
+    stop : (float, float, int)
+        A step below this [rad], [m] is the last; most steps.
+    out : (6, 6), (6,), (13,)
+        As of `normal_equations`, before the last step.
+
+    Returns
+    -------
+    steps : int
+        Negative, less one: there was no room for another step.
+    """
+    (R, t), (H, g, _) = pose, out
+    start_R, start_t, prior = start
+    notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
+    turn, left = np.empty((3, 3)), np.empty((3, 3))
+    off, d = np.empty(6), np.empty(6)
+    dR, dt = np.empty((3, 3)), np.empty(3)
+    for step in range(stop[2]):
+        if c.used[0] + len(points) > len(c.cube):
+            return -step - 1
+        _normal_equations(c, points, pose, size, scale, out, notes)
+        for i in range(3):
+            dt[i] = 0.0
+            for j in range(3):
+                dt[i] += start_R[j, i] * (t[j] - start_t[j])
+                dR[i, j] = start_R[0, i] * R[0, j] + start_R[1, i] * R[1, j] + start_R[2, i] * R[2, j]
+        _log(dR, dt, off)
+        d[:] = -np.linalg.solve(H + prior, g + prior @ off)
+        # a step as long as a cell is a guess
+        for part, least in ((3, 0.5 * size), (0, 0.2)):
+            length = np.sqrt(d[part] ** 2 + d[part + 1] ** 2 + d[part + 2] ** 2)
+            if length > least:
+                d *= least / length
+        _rotation(d[:3], turn, left)
+        u = left @ d[3:]
+        for i in range(3):
+            t[i] += R[i, 0] * u[0] + R[i, 1] * u[1] + R[i, 2] * u[2]
         for i in range(3):
             for j in range(3):
-                B[i, j] = A[i, 0] * R[0, j] + A[i, 1] * R[1, j] + A[i, 2] * R[2, j]
-        # J = [-[p]x, I]; Q = Rᵀ A R J
-        J[0, 0], J[0, 1], J[0, 2] = 0.0, e, -b
-        J[1, 0], J[1, 1], J[1, 2] = -e, 0.0, a
-        J[2, 0], J[2, 1], J[2, 2] = b, -a, 0.0
-        for i in range(3):
-            n0 = R[0, i] * B[0, 0] + R[1, i] * B[1, 0] + R[2, i] * B[2, 0]
-            n1 = R[0, i] * B[0, 1] + R[1, i] * B[1, 1] + R[2, i] * B[2, 1]
-            n2 = R[0, i] * B[0, 2] + R[1, i] * B[1, 2] + R[2, i] * B[2, 2]
-            for j in range(3):
-                Q[i, j] = w * (n0 * J[0, j] + n1 * J[1, j] + n2 * J[2, j])
-            Q[i, 3], Q[i, 4], Q[i, 5] = w * n0, w * n1, w * n2
-        ux = w * (R[0, 0] * vx + R[1, 0] * vy + R[2, 0] * vz)
-        uy = w * (R[0, 1] * vx + R[1, 1] * vy + R[2, 1] * vz)
-        uz = w * (R[0, 2] * vx + R[1, 2] * vy + R[2, 2] * vz)
-        g[0] += b * uz - e * uy
-        g[1] += e * ux - a * uz
-        g[2] += a * uy - b * ux
-        g[3] += ux
-        g[4] += uy
-        g[5] += uz
-        for i in range(3):
-            for j in range(6):
-                H[i, j] += J[0, i] * Q[0, j] + J[1, i] * Q[1, j] + J[2, i] * Q[2, j]
-        for i in range(3):
-            for j in range(6):
-                H[3 + i, j] += Q[i, j]
+                dR[i, j] = R[i, 0] * turn[0, j] + R[i, 1] * turn[1, j] + R[i, 2] * turn[2, j]
+        R[:, :] = dR
+        turned = np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
+        if turned < stop[0] and np.sqrt(d[3] ** 2 + d[4] ** 2 + d[5] ** 2) < stop[1]:
+            return step + 1
+    return stop[2]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -476,11 +588,10 @@ def information_by_slot(
         at[p] = _nearest(c, x, y, z, size)
     order[:] = np.argsort(at)
     inverse = 1.0 / (scale * scale)
-    A = np.empty((3, 3))
-    J = np.zeros((3, 6))
-    J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+    rows = c.root.shape[1]
+    r = np.empty(3)
+    J = np.empty((3, 6))
     S = np.zeros((3, 6))
-    u = np.zeros(3)
     k = 0
     while k < n:
         cell = at[order[k]]
@@ -488,10 +599,8 @@ def information_by_slot(
             k += 1
             continue
         slot = min(np.searchsorted(ends, c.made[cell]), len(ends) - 1)
-        I = c.information[cell]
-        A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2] = I[0], I[1], I[2], I[3], I[4], I[5]
-        A[1, 0], A[2, 0], A[2, 1] = I[1], I[2], I[4]
-        B = R.T @ A @ R
+        W = c.root[cell]
+        U = W @ R
         S[:, :] = 0.0
         # blocks of 8 × 8 × 8 cells
         block = (
@@ -502,22 +611,29 @@ def information_by_slot(
             p = order[k]
             k += 1
             a, b, e = points[p, 0], points[p, 1], points[p, 2]
-            rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * e + t[0] - c.centre[cell, 0]
-            ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * e + t[1] - c.centre[cell, 1]
-            rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * e + t[2] - c.centre[cell, 2]
-            m = rx * rx * I[0] + ry * ry * I[3] + rz * rz * I[5]
-            m += 2.0 * (rx * ry * I[1] + rx * rz * I[2] + ry * rz * I[4])
+            x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * e + t[0] - c.centre[cell, 0]
+            y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * e + t[1] - c.centre[cell, 1]
+            z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * e + t[2] - c.centre[cell, 2]
+            m = 0.0
+            for q in range(rows):
+                r[q] = W[q, 0] * x + W[q, 1] * y + W[q, 2] * z
+                m += r[q] * r[q]
             w = 1.0 / (1.0 + m * inverse)
             w *= w
-            J[0, 1], J[0, 2], J[1, 2] = e, -b, a
-            J[1, 0], J[2, 0], J[2, 1] = -e, b, -a
-            H[slot] += w * (J.T @ (B @ J))
-            u[0] = w * (I[0] * rx + I[1] * ry + I[2] * rz)
-            u[1] = w * (I[1] * rx + I[3] * ry + I[4] * rz)
-            u[2] = w * (I[2] * rx + I[4] * ry + I[5] * rz)
-            G[part] += J.T @ (R.T @ u)
-            S += w * J
-        M += S.T @ (B @ S)
+            for q in range(rows):
+                u = U[q]
+                J[q, 0], J[q, 1], J[q, 2] = b * u[2] - e * u[1], e * u[0] - a * u[2], a * u[1] - b * u[0]
+                J[q, 3], J[q, 4], J[q, 5] = u[0], u[1], u[2]
+                for i in range(6):
+                    v = w * J[q, i]
+                    S[q, i] += v
+                    G[part, i] += v * r[q]
+                    for j in range(6):
+                        H[slot, i, j] += v * J[q, j]
+        for q in range(rows):
+            for i in range(6):
+                for j in range(6):
+                    M[i, j] += S[q, i] * S[q, j]
 
 
 @nb.njit(cache=True, nogil=True)

@@ -70,7 +70,7 @@ class CellMap:
 
     def __init__(self, config: LevelConfig) -> None:
         self.config = config
-        self.cells = _empty(_FIRST_ROOM)
+        self.cells = _empty(_FIRST_ROOM, 1 if config.planes else 3)
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.cells.told[: self.cells.used[0]]))
@@ -101,7 +101,7 @@ class CellMap:
     def _copy(self, scan: int, more: int) -> None:
         c = self.cells
         kept = int(np.count_nonzero((c.seen[: c.used[0]] >= scan) & (c.number[: c.used[0]] > 0)))
-        out = _empty(2 * (kept + more))
+        out = _empty(2 * (kept + more), c.root.shape[1])
         kernels.keep_since(c, out, scan)
         self.cells = out
 
@@ -125,12 +125,21 @@ class CellMap:
     def fit(self, points: Array, R: Array, t: Array, scale: float) -> Fit:
         """Normal equations of points ``(n, 3)`` in the body, at a pose."""
         self.room(len(points))
-        H, g, told = np.empty((6, 6)), np.empty(6), np.empty(13)
-        kernels.normal_equations(self.cells, points, (R, t), self.config.size, scale, H, g, told)
-        n = max(len(points), 1)
-        return Fit(
-            H, g, _every(told[3:]), told[0] / n, told[1] / n, told[0] / max(told[1], 1.0), told[2] / max(told[0], 1e-12)
-        )
+        out = np.empty((6, 6)), np.empty(6), np.empty(13)
+        kernels.normal_equations(self.cells, points, (R, t), self.config.size, scale, *out)
+        return _fit(len(points), *out)
+
+    def descend(
+        self, points: Array, R: Array, t: Array, scale: float, prior: Array, still: tuple[float, float], most: int
+    ) -> Fit:
+        """Gauss–Newton steps, at most so many, of a pose that is improved in place (see `cell_kernels.descend`)."""
+        out = np.empty((6, 6)), np.empty(6), np.empty(13)
+        start, size, done = (R.copy(), t.copy(), prior), self.config.size, -1
+        while done < 0:
+            self.room(2 * len(points))
+            most += done + 1
+            done = kernels.descend(self.cells, points, (R, t), start, size, scale, (*still, most), out)
+        return _fit(len(points), *out)
 
     def by_slot(self, points: Array, R: Array, t: Array, scale: float, ends: Array) -> tuple[Array, Array, Array]:
         """See `cell_kernels.information_by_slot`: ``(s, 6, 6)``, ``(6, 6)`` and ``(c, 6)``."""
@@ -138,6 +147,13 @@ class CellMap:
         H, M, G = np.empty((len(ends), 6, 6)), np.empty((6, 6)), np.empty((PARTS, 6))
         kernels.information_by_slot(self.cells, points, (R, t), self.config.size, scale, ends, (H, M, G))
         return H, M, G
+
+
+def _fit(n: int, H: Array, g: Array, told: Array) -> Fit:
+    near = max(told[1], 1.0)
+    return Fit(
+        H, g, _every(told[3:]), told[0] / max(n, 1), told[1] / max(n, 1), told[0] / near, told[2] / max(told[0], 1e-12)
+    )
 
 
 def _every(m: Array) -> Array:
@@ -151,7 +167,7 @@ def _every(m: Array) -> Array:
     return out
 
 
-def _empty(blocks: int) -> kernels.Cells:
+def _empty(blocks: int, rows: int) -> kernels.Cells:
     blocks = max(blocks, _FIRST_ROOM)
     if blocks > 1 << 26:
         raise DataError("the map of a lidar is too large", got=f"{blocks} cells", wanted=f"at most {1 << 26}")
@@ -165,7 +181,7 @@ def _empty(blocks: int) -> kernels.Cells:
         scatter=np.zeros((blocks, 6)),
         told=np.zeros(blocks, np.int32),
         centre=np.zeros((blocks, 3)),
-        information=np.zeros((blocks, 6)),
+        root=np.zeros((blocks, rows, 3)),
         seen=np.full(blocks, -1, np.int64),
         made=np.zeros(blocks),
         around=np.zeros((blocks, 27), np.int32),

@@ -66,9 +66,9 @@ class JointErrors:
         n = len(self.P)
         G = np.zeros((6, n))
         G[:, :6] = K @ L @ se3.se3_adjoint(se3.se3_inverse(motion))
-        for k in range(len(self.ends)):
-            if H[k].any():
-                G[:, 12 + 6 * k : 18 + 6 * k] = K @ H[k] @ se3.se3_adjoint(se3.se3_between(pose, self.poses[2 + k]))
+        if self.ends:
+            slots = K @ H @ se3.se3_adjoint(se3.se3_between(pose, self.poses[2:]))
+            G[:, 12:] = slots.transpose(1, 0, 2).reshape(6, -1)
         own = K @ (M + L + total @ bent @ total.T) @ K.T
         GP = G @ self.P
         new = GP @ G.T + own

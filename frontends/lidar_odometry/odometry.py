@@ -400,28 +400,15 @@ class LidarOdometry:
 
     def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, Fit]:
         """Gauss–Newton on one level after the other."""
-        R, t = _split(pose)
+        R, t = _split(pose.copy())
         fit = None
         last = self.levels[-1]
         for level in levels:
             some = points if level is last else points[evenly(len(points), COARSE_POINTS)]
-            # a coarse match is the start of a finer one
-            still = STILL if level is last else (0.01 * level.config.size / 5.0, 0.01 * level.config.size)
-            for _ in range(MOST_STEPS):
-                fit = level.fit(some, R, t, SCALE)
-                if level is last:
-                    # where the finest cells tell little yet, the coarser ones' word stands
-                    off = np.asarray(se3.se3_log(se3.se3_between(pose, np.concatenate([t, se3.matrix_to_quat(R)]))))
-                    d = -np.linalg.solve(fit.H + COARSE, fit.g + COARSE @ off)
-                else:
-                    d = -np.linalg.solve(fit.H + 1e-3 * np.eye(6), fit.g)
-                # a step as long as a cell is a guess
-                d *= min(1.0, 0.5 * level.config.size / max(float(np.linalg.norm(d[3:])), 1e-12))
-                d *= min(1.0, 0.2 / max(float(np.linalg.norm(d[:3])), 1e-12))
-                t = t + R @ (np.asarray(se3.so3_left_jacobian(d[:3])) @ d[3:])
-                R = R @ np.asarray(se3.quat_to_matrix(se3.so3_exp(d[:3])))
-                if np.linalg.norm(d[:3]) < still[0] and np.linalg.norm(d[3:]) < still[1]:
-                    break
+            size = level.config.size
+            # a coarse match is the start of a finer one; where the finest cells tell little yet, its word stands
+            still, prior = (STILL, COARSE) if level is last else ((0.002 * size, 0.01 * size), 1e-3 * np.eye(6))
+            fit = level.descend(some, R, t, SCALE, prior, still, MOST_STEPS)
         assert fit is not None
         return np.concatenate([t, se3.matrix_to_quat(R)]), fit
 

@@ -43,10 +43,9 @@ def test_cells_are_those_of_the_plain_twin(made):
     full = level.cells.told[: level.cells.used[0]][told] == level.cells.number[: level.cells.used[0]][told]
     assert full.sum() > 10
     np.testing.assert_allclose(level.centres[full], centres[at[full]], atol=1e-12)
-    fast = level.cells.information[: level.cells.used[0]][told][full]
+    root = level.cells.root[: level.cells.used[0]][told][full]
     slow = information[at[full]]
-    rows, columns = np.triu_indices(3)
-    np.testing.assert_allclose(fast, slow[:, rows, columns], rtol=1e-7, atol=1e-7 * np.abs(slow).max())
+    np.testing.assert_allclose(root.mT @ root, slow, rtol=1e-7, atol=1e-7 * np.abs(slow).max())
 
 
 def test_no_cell_is_farther_than_the_nearest_by_more_than_a_cached_cube(made):
@@ -90,9 +89,8 @@ def test_normal_equations_are_those_of_the_plain_twin_and_of_differences(made):
     body = np.ascontiguousarray(points[rng.integers(0, len(points), 300)])
     fit = level.fit(body, np.ascontiguousarray(R), t, SCALE)
     at = level.nearest(np.ascontiguousarray(body @ R.T + t))
-    rows, columns = np.triu_indices(3)
-    A = np.zeros((len(at), 3, 3))
-    A[:, rows, columns] = A[:, columns, rows] = level.cells.information[at]
+    root = level.cells.root[at]
+    A = root.mT @ root
     cells = [level.cells.centre[k] if k >= 0 else None for k in at]
     H, g, overlap = plain_fit(body, R, t, cells, A, SCALE)
     np.testing.assert_allclose(fit.H, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
@@ -108,6 +106,34 @@ def test_normal_equations_are_those_of_the_plain_twin_and_of_differences(made):
     np.testing.assert_allclose(fit.g, numeric, rtol=1e-5, atol=1e-5 * np.abs(g).max())
     # what surfaces turned anyhow would say is no less, in any direction
     assert np.linalg.eigvalsh(fit.every - fit.H).min() > -1e-6 * np.abs(fit.every).max()
+
+
+def test_descent_is_that_of_the_plain_steps(made):
+    level, points = made
+    rng = np.random.default_rng(12)
+    size = level.config.size
+    start = np.asarray(se3.se3_exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.2 * size, 3)]))
+    body = np.ascontiguousarray(points[rng.integers(0, len(points), 2000)])
+    prior = np.diag([400.0] * 3 + [25.0] * 3)
+    plain = start
+    for steps in range(1, 6):
+        fit = level.fit(body, np.ascontiguousarray(se3.quat_to_matrix(plain[3:])), plain[:3].copy(), SCALE)
+        off = se3.se3_log(se3.se3_between(start, plain))
+        d = -np.linalg.solve(fit.H + prior, fit.g + prior @ off)
+        d *= min(1.0, 0.5 * size / np.linalg.norm(d[3:]))
+        d *= min(1.0, 0.2 / np.linalg.norm(d[:3]))
+        plain = se3.se3_compose(plain, se3.se3_exp(d))
+        R, t = np.ascontiguousarray(se3.quat_to_matrix(start[3:])), start[:3].copy()
+        last = level.descend(body, R, t, SCALE, prior, (0.0, 0.0), steps)
+        np.testing.assert_allclose(t, plain[:3], atol=1e-9)
+        np.testing.assert_allclose(R, se3.quat_to_matrix(plain[3:]), atol=1e-9)
+        np.testing.assert_allclose(last.H, fit.H, rtol=1e-6, atol=1e-9 * np.abs(fit.H).max())
+    R, t = np.ascontiguousarray(se3.quat_to_matrix(plain[3:])), plain[:3].copy()
+    level.descend(body, R, t, SCALE, np.zeros((6, 6)), (1e-4, 1e-4), 50)
+    before = R.copy(), t.copy()
+    level.descend(body, R, t, SCALE, np.zeros((6, 6)), (1e-3, 1e-3), 50)
+    assert np.abs(R - before[0]).max() < 1e-3  # it stands still
+    assert np.abs(t - before[1]).max() < 1e-3
 
 
 def test_information_by_slot_adds_up():
