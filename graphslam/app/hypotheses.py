@@ -204,7 +204,10 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
     check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
     solution = found.choice.best.alternative.solution
     solved = make_map(solution, list(submaps), {}, 1)
-    refined, said = refine_run(config, taken.scans, submaps, solved, gps=solution.T_gps_world is not None)
+    gps = None
+    if solution.T_gps_world is not None and run.fixes is not None:
+        gps = (run.fixes, build(GpsOptions, values.get("gps", {}), "gps"))
+    refined, said = refine_run(config, taken.scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
         return replace(found, refined=refined, findings=said)
     options: MapConfig = build(MapConfig, values.get("map", {}), "map")

@@ -13,10 +13,12 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.gps import GpsConfig
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
@@ -85,7 +87,7 @@ def refine_run(
     submaps: Sequence[Submap],
     m: GlobalMap,
     *,
-    gps: bool = False,
+    gps: tuple[Gps, GpsConfig] | None = None,
     graph: PoseGraph | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Refined | None, list[Finding]]:
@@ -99,8 +101,8 @@ def refine_run(
     submaps : sequence of Submap
     m : GlobalMap
         Solved.
-    gps : bool
-        Fixes are in the graph.
+    gps : (Gps, GpsConfig), optional
+        Fixes that are in the graph, and how they entered: they hold the refined path, too.
     graph : PoseGraph, optional
         What the map was solved from: its loops are held against the refined path.
 
@@ -113,13 +115,10 @@ def refine_run(
     """
     if not config.use or scans is None:
         return None, []
-    if gps:
-        text = "The path was not refined by its scans: the refinement does not hold GPS yet, which the graph used."
-        return None, [Finding("look", "refine-left-out", text)]
     path = m.trajectory
     try:
         start = path.interpolate(np.clip(scans.times, path.times[0], path.times[-1]))
-        found = refine(scans, start, config, progress=progress)
+        found = refine(scans, start, config, gps=gps, progress=progress)
         if not found.better:
             text = (
                 "The path was not refined by its scans: they agree less at the refined path "
@@ -186,6 +185,10 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
     out.spend(SCAN_PAIRS, "scan-pairs", streams, (float(r.times[0]), float(r.times[-1])))
+    held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
+    for stream in sorted(held):
+        out.spend(SCAN_PAIRS, "fixes", [stream], (float(r.times[0]), float(r.times[-1])))
+    streams = streams | held
     factors = len({e.factor_id for e in entries})
     text = (
         f"The refined path spends {', '.join(sorted(streams)) or 'the scans'} once (scan-pairs). The {factors} factors "
@@ -219,6 +222,21 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
         f"(before: {r.agreement[0]:.0%})."
     )
     out = [Finding("good", "refined", text)]
+    if (f := r.fixes) is not None:
+        text = (
+            f"{f.used} fixes hold the refined path; they lie {f.rms:.2f} m from it (RMS), with a median χ² of "
+            f"{f.typical:.2f} times that of errors as stated."
+        )
+        if f.left:
+            text += f" {f.left} others were left out: before, after or in a gap of the path."
+        if f.wild:
+            text += f" {f.wild} of them are farther off than chance allows and count little."
+        if f.contradicted:
+            text += (
+                " So errors of fixes are larger than stated, or last: state gps.bias_sigma and gps.bias_time, or a "
+                "larger gps.sigma; the covariance of this path is too small."
+            )
+        out.append(Finding("look" if f.contradicted else "good", "refine-fixes", text))
     if wrong:
         some = "; ".join(f"x{i} and x{j} by {d:.1f} m, {np.rad2deg(t):.0f}°" for i, j, d, t in wrong[:4])
         text = (

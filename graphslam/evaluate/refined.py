@@ -92,6 +92,9 @@ def refinement_metrics(out: Metrics, r: Refinement) -> None:
     out.add("refine_agreement_graph", r.agreement[0])
     out.add("refine_left_apart", len(r.refused))
     out.add("refine_motion_chi2_per_dof", r.motion, "", "one")
+    if r.fixes is not None:
+        out.add("refine_fixes", r.fixes.used)
+        out.add("refine_fixes_rms", r.fixes.rms, "m", "lower")
     bias = r.yaw_bias[:, 1]
     out.add("refine_yaw_bias", float(np.mean(bias)), "rad/s")
     for name, unit in (("scale", ""), ("side", "rad"), ("rise", "rad"), ("clock", "s")):
@@ -109,4 +112,5 @@ def refinement_facts(r: Refinement) -> dict[str, Any]:
         "yaw_bias": r.yaw_bias.tolist(),
         "motion_chi2_per_dof": r.motion,
         "left_apart": r.times[r.refused].tolist() if len(r.refused) else [],
+        "fixes": None if (f := r.fixes) is None else {**asdict(f), "T_gps_world": f.T_gps_world.tolist()},
     }

@@ -145,13 +145,14 @@ def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array,
 
 
 def arm_jacobian(T: Array, lever: Array) -> Array:
-    """Derivative ``(q, dim, dof)`` of ``T Exp(ξ) · lever``."""
+    """Derivative ``(q, dim, dof)`` of ``T Exp(ξ) · lever``, of one lever ``(dim,)`` or one each ``(q, dim)``."""
     group = group_of(T)
     G = np.zeros((len(T), group.dim, group.dof))
     if group.dim == 2:
         R = rotation2(T[:, 2])
         G[:, :, :2] = R
-        G[:, :, 2] = R @ np.array([-lever[1], lever[0]])
+        beside = np.stack([-lever[..., 1], lever[..., 0]], axis=-1)
+        G[:, :, 2] = (R @ beside[..., None])[..., 0]
     else:
         R = quat_to_matrix(T[:, 3:])
         G[:, :, :3], G[:, :, 3:] = -R @ skew(lever), R

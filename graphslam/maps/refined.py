@@ -74,6 +74,7 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
         trajectory=Trajectory(refinement.times, refinement.poses, refinement.covariances),
         node_poses=g.compose(refinement.poses[at], beside),
         node_covariances=0.5 * (C + np.swapaxes(C, 1, 2)),
+        T_gps_world=m.T_gps_world if refinement.fixes is None else refinement.fixes.T_gps_world,
     )
 
 

@@ -21,6 +21,8 @@ from graphslam.linear.block_cholesky import BlockFactor
 from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]
+States = tuple[Array, ...]
+"""Yaw bias at the knots ``(k,)``, constants ``(c,)``; with fixes their datum and biases follow."""
 
 SAMPLED = 24
 """Steps at which the leverage of the odometry is computed."""
@@ -166,7 +168,7 @@ class MotionModel:
             C[0] = C[1]
         return np.asarray(C * s[:, None] * s[None, :] * self.bridge[:, None, None])
 
-    def widen(self, poses: Array, states: tuple[Array, Array], factor: BlockFactor) -> None:
+    def widen(self, poses: Array, states: States, factor: BlockFactor) -> None:
         """Widen what the motion promises where the scans show more: its σ by component, and the walk of the yaw bias.
 
         A residual is smaller than the error by as much as it took part in the estimate (its leverage
@@ -200,19 +202,19 @@ class MotionModel:
             spread = float(np.median(z[decided] ** 2 / left_walk[decided])) / MEDIAN
             self.walk = float(np.sqrt(max(spread, 1.0)))
 
-    def _state_rows(self, states: tuple[Array, Array]) -> Array:
-        bias, constants = states
+    def _state_rows(self, states: States) -> Array:
+        bias, constants = states[:2]
         a = self.nodes[:, 2] - len(self.steps)
         return np.column_stack([bias[a], bias[a + 1], np.tile(constants, (len(a), 1))])
 
-    def terms(self, poses: Array, states: tuple[Array, Array]) -> list[Terms]:
+    def terms(self, poses: Array, states: States) -> list[Terms]:
         """All factors at a path ``(n, 7|3)`` and states (yaw bias at the knots ``(k,)``, constants ``(c,)``)."""
         out = [self._odometry(poses, states), *self._priors(states)]
         if self.gravity:
             out += self._gravity(poses, states)
         return out
 
-    def _increments(self, poses: Array, states: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _increments(self, poses: Array, states: States) -> tuple[Array, Array]:
         """Errors of the increments ``(n - 1, m)`` and their derivatives by the two poses and the states."""
         g = self.group
         step = g.between(poses[:-1], poses[1:])
@@ -222,7 +224,7 @@ class MotionModel:
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
         return e[:, self.keep], J[:, self.keep]
 
-    def _odometry(self, poses: Array, states: tuple[Array, Array]) -> Terms:
+    def _odometry(self, poses: Array, states: States) -> Terms:
         e, J = self._increments(poses, states)
         W = self.whiteners()
         if self.group.dim == 2:
@@ -232,8 +234,8 @@ class MotionModel:
         dof = self.group.dof
         return Terms(np.einsum("kij,kj->ki", W, e), W @ J, self.nodes, (dof, dof, 1, 1, self.constants), "odometry")
 
-    def _priors(self, states: tuple[Array, Array]) -> list[Terms]:
-        bias, constants = states
+    def _priors(self, states: States) -> list[Terms]:
+        bias, constants = states[:2]
         s, n, K = self.sigmas, len(self.steps), len(self.knots)
         first = Terms(
             np.array([[bias[0] / s.yaw_bias]]), np.array([[[1.0 / s.yaw_bias]]]), np.array([[n]]), (1,), "yaw bias"
@@ -252,7 +254,7 @@ class MotionModel:
         )
         return [first, walk, fixed]
 
-    def _gravity(self, poses: Array, states: tuple[Array, Array]) -> list[Terms]:
+    def _gravity(self, poses: Array, states: States) -> list[Terms]:
         """Errors of roll and pitch are an Ornstein–Uhlenbeck process: each is new only in so far as it is not the last.
 
         So every reading is spent once, be it as an absolute one or as the change since the one before.

@@ -11,13 +11,13 @@ from scipy.optimize import nnls
 from graphslam.core.geometry import Array
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
-from graphslam.refine.motion import MotionModel, Terms
+from graphslam.refine.fixes import FixModel
+from graphslam.refine.motion import MotionModel, States, Terms
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import rotations
 
 Index = npt.NDArray[np.int64]
-States = tuple[Array, Array]
 
 
 class Pattern:
@@ -159,7 +159,7 @@ def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> A
 
 
 class Problem:
-    """Scans, motion and gravity on the nodes of a path.
+    """Scans, motion, gravity and fixes on the nodes of a path.
 
     Parameters
     ----------
@@ -167,10 +167,12 @@ class Problem:
     cloud : Cloud
     held : (7,) or (3,)
         Where the first pose is held.
+    fixes : FixModel, optional
     """
 
-    def __init__(self, motion: MotionModel, cloud: Cloud, held: Array) -> None:
-        self.motion, self.cloud, self.held = motion, cloud, held
+    def __init__(self, motion: MotionModel, cloud: Cloud, held: Array, fixes: FixModel | None = None) -> None:
+        self.motion, self.cloud, self.held, self.fixes = motion, cloud, held, fixes
+        self.widths = motion.widths if fixes is None else np.concatenate([motion.widths, fixes.widths])
         self._key: object = None
         self._pattern: Pattern | None = None
 
@@ -192,7 +194,7 @@ class Problem:
                     for v in range(u):
                         a.append(t.nodes[:, u])
                         b.append(t.nodes[:, v])
-            self._pattern = Pattern(self.motion.widths, np.concatenate(a), np.concatenate(b))
+            self._pattern = Pattern(self.widths, np.concatenate(a), np.concatenate(b))
             self._key, self._held = key, (pairs.source, extra)  # held: an address is a name while it lives
         assert self._pattern is not None
         return self._pattern
@@ -207,7 +209,8 @@ class Problem:
         extra: list[Terms] | None = None,
     ) -> tuple[Solved, Array]:
         """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``."""
-        pattern, motion = self._pattern_of(pairs, extra or []), self.motion
+        more = [*(extra or []), *([] if self.fixes is None else self.fixes.terms(poses, states))]
+        pattern, motion = self._pattern_of(pairs, more), self.motion
         n, w = motion.steps_count, motion.group.dof
         H, g = np.zeros(pattern.size), np.zeros(pattern.widths.sum())
         gp = np.zeros((n, w))
@@ -220,7 +223,7 @@ class Problem:
             )
         }  # fmt: skip
         g[: n * w] = gp.ravel()
-        for terms in [*motion.terms(poses, states), motion.gauge(poses, self.held), *(extra or [])]:
+        for terms in [*motion.terms(poses, states), motion.gauge(poses, self.held), *more]:
             parts[terms.name] = parts.get(terms.name, 0.0) + pattern.add(terms, H, g)
         factor = pattern.symbolic.factor(pattern.offset, H)
         return Solved(pattern, factor, parts), -factor.solve(g)
@@ -231,4 +234,8 @@ class Problem:
         g = self.motion.group
         K = len(self.motion.knots)
         rest = step[n * w :]
-        return g.compose(poses, g.exp(step[: n * w].reshape(n, w))), (states[0] + rest[:K], states[1] + rest[K:])
+        c = self.motion.constants
+        out: States = (states[0] + rest[:K], states[1] + rest[K : K + c])
+        if self.fixes is not None:
+            out = (*out, *self.fixes.moved(states, step))
+        return g.compose(poses, g.exp(step[: n * w].reshape(n, w))), out

@@ -18,12 +18,15 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.core.records import Gps
 from graphslam.frontends.odometry.recorded import chain
+from graphslam.graph.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
+from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
-from graphslam.refine.motion import MotionModel
+from graphslam.refine.motion import MotionModel, States
 from graphslam.refine.nodes import find_nodes, path_between, scans_at
-from graphslam.refine.problem import Problem, Solved, States, pair_noise, point_information, residuals
+from graphslam.refine.problem import Problem, Solved, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 
@@ -133,6 +136,8 @@ class Refinement:
         Steps that are nodes of the problem; between them the path follows the odometry.
     own : (n, d, d)
         Covariance of steps between nodes that they do not share with a node.
+    fixes : FixReport or None
+        What fixes did; None: there were none, or their way is too short to say where north is.
     """
 
     times: Array
@@ -152,6 +157,7 @@ class Refinement:
     solved: Solved
     nodes: Index
     own: Array
+    fixes: FixReport | None = None
 
     @property
     def better(self) -> bool:
@@ -177,6 +183,7 @@ def refine(
     start: Array,
     config: RefineConfig | None = None,
     *,
+    gps: tuple[Gps, GpsConfig] | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Refinement:
     """Refine a path by the scans of its steps.
@@ -187,6 +194,8 @@ def refine(
     start : (n, 7) or (n, 3)
         Poses of the base at the stamps of the steps; in space the frame is level.
     config : RefineConfig, optional
+    gps : (Gps, GpsConfig), optional
+        Fixes that hold the path, too, and how they enter.
     progress : callable, optional
         Told each round in words.
 
@@ -209,7 +218,7 @@ def refine(
     few = 3 <= len(nodes) < len(steps)
     if not few:
         nodes = np.arange(len(steps), dtype=np.int64)
-    work = _Work(scans_at(steps, nodes) if few else steps, start[nodes], config, progress or (lambda _: None))
+    work = _Work(scans_at(steps, nodes) if few else steps, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
     found = work.run()
@@ -253,7 +262,14 @@ def _reach(steps: Scans) -> float:
 class _Work:
     """A refinement while it goes on."""
 
-    def __init__(self, steps: Scans, start: Array, config: RefineConfig, tell: Callable[[str], Any]) -> None:
+    def __init__(
+        self,
+        steps: Scans,
+        start: Array,
+        config: RefineConfig,
+        gps: tuple[Gps, GpsConfig] | None,
+        tell: Callable[[str], Any],
+    ) -> None:
         self.steps, self.start, self.config, self.tell = steps, start, config, tell
         self.group = group_of(start)
         turn = config.chunk_turn if steps.group.dim == 2 else np.inf
@@ -262,15 +278,22 @@ class _Work:
         )
         self.motion = MotionModel(steps, knot=config.knot, bridge=self.cloud.bridge())
         self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
-        self.problem = Problem(self.motion, self.cloud, start[0].copy())
+        fixes = None if gps is None else FixModel(*gps, self.motion, start)
+        self.fixes = fixes if fixes is not None and gps is not None and fixes.ready(gps[1].baseline, start) else None
+        self.problem = Problem(self.motion, self.cloud, start[0].copy(), self.fixes)
         self.poses = start.copy()
-        self.states: States = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
+        self.states = self.first_states()
         self.rounds: list[Round] = []
         self.surfaces: Surfaces | None = None
         self.first: Surfaces | None = None
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
         self.most = max(FEWEST, round(self.reach / config.chunk_length))
+
+    def first_states(self) -> States:
+        """No lasting errors; fixes as they lie at the path."""
+        own = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
+        return own if self.fixes is None else (*own, *self.fixes.start(self.poses))
 
     def run(self) -> Refinement:
         """All rounds; from the odometry's path once more where the start turns out to be wrong."""
@@ -291,7 +314,7 @@ class _Work:
         """
         first = self.attempt()
         self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
-        self.states = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
+        self.states = self.first_states()
         self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
         self.cloud = self.problem.cloud = self.raw
         self.rounds = []
@@ -462,4 +485,5 @@ class _Work:
             solved=solved,
             nodes=np.arange(n, dtype=np.int64),
             own=np.zeros((n, w, w)),
+            fixes=None if self.fixes is None else self.fixes.report(self.poses, self.states),
         )

@@ -325,8 +325,8 @@ def _judge(
     imu_metrics(out, back.graph, drops)
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     clock, graph_path = time.perf_counter(), global_map.trajectory
-    with_gps = solution.T_gps_world is not None
-    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=with_gps, graph=back.graph)
+    fixes = None if gps is None or solution.T_gps_world is None else (split(gps, settings.gps)[0], settings.gps)
+    refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
     ledger = back.graph.ledger
     if refined is not None:
         global_map = refined.map
@@ -354,7 +354,7 @@ def _judge(
     reckoned = dead_reckoning(log, global_map.trajectory)
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
-        residuals = gps_metrics(out, global_map.trajectory, gps, withheld, solution.T_gps_world)
+        residuals = gps_metrics(out, global_map.trajectory, gps, withheld, global_map.T_gps_world)
         if back.graph.dim == 2:
             dead_reckoning_metrics(out, reckoned, gps)
     truth, identities = map_truth(log, submaps), "run"

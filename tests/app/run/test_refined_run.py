@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ from graphslam.app.run.pipeline import again, run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.localise import localise
+from graphslam.core import se3
 from graphslam.core.errors import FormatError, GraphSlamError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3, level
+from graphslam.core.records import Gps
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.io.tum import read_tum
 from graphslam.maps.refined import base_frames
@@ -84,6 +87,31 @@ def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
     assert "refine" not in " ".join(page.problems)
     for text in ("Refinement by scans", "scale of the wheels", "Bias of the yaw rate at its knots", "scan-pairs"):
         assert text in page.html, text
+
+
+def test_fixes_hold_the_refined_path_and_its_frame_scores_those_kept_back(undrawn: None) -> None:
+    log = drive(9)
+    assert log.truth is not None
+    path = log.truth.trajectory
+    turn = np.array([30.0, -20.0, 5.0, 0.0, 0.0, np.sin(0.4), np.cos(0.4)])  # T_gps_truth
+    rng = np.random.default_rng(3)
+    times, true = path.times[:: max(1, len(path) // 80)], path.poses[:: max(1, len(path) // 80)]
+    z = se3.se3_transform(turn, true[:, :3]) + 0.05 * rng.standard_normal((len(true), 3))
+    gps = Gps(times=times, positions=z, sigma=np.full(len(z), 0.05), lever=np.zeros(3))
+    log = replace(log, streams={**log.streams, "gps": gps})
+    options = OPTIONS | {"gps": {"use": "every-second", "baseline": 5.0}, "map": {"fuse": False}}
+    r = run(log, frontend="segslam", seed=2, config=options, progress=False)
+    assert r.refined is not None
+    assert r.refined.refinement.fixes is not None
+    assert {f.code: f.level for f in r.verdict}["refine-fixes"] == "good"
+    np.testing.assert_array_equal(r.map.T_gps_world, r.refined.refinement.fixes.T_gps_world)
+    assert r.metric("gps_withheld_rmse") < 0.13  # of fixes whose own errors are 0.087 m
+    assert r.metric("path_rmse_aligned") < 0.03
+    assert r.ledger is not None
+    spent = r.ledger[r.ledger["kind"] == EXCLUSIVE]
+    assert set(spent["factor"]) == {"scan-pairs", "fixes"}
+    assert set(spent[spent["factor"] == "fixes"]["stream"]) == {"gps"}
+    assert "refine-streams" not in {f.code for f in r.verdict}
 
 
 def test_the_ledger_says_what_the_refined_path_spends(finished: Run) -> None:
