@@ -19,6 +19,7 @@ STOREY = {
     "graphslam.graph": 2,
     "graphslam.frontends": 2,
     "graphslam.association": 3,
+    "graphslam.calibrate": 3,
     "graphslam.solve": 4,
     "graphslam.skeleton": 4,
     "graphslam.join": 5,

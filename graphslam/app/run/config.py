@@ -1,6 +1,7 @@
 """Configuration of a run: one frozen dataclass per part, defaults in code, a TOML file optional and partial.
 
-Order of precedence: defaults, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
+Order of precedence: defaults, what the log says of its own noise (:mod:`graphslam.calibrate`) where no preset was made for
+it, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
 Unknown keys are refused with their full name; the effective configuration is written into the run folder.
 """
 
@@ -13,6 +14,7 @@ from importlib import resources
 from typing import Any
 
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions, ImuOptions
+from graphslam.calibrate.corrections import CalibrateConfig
 from graphslam.maps.run_map import MapConfig
 from graphslam.refine.config import RefineConfig
 
@@ -37,6 +39,8 @@ class RunConfig:
     """The path refined by its scans, of front ends that work on scans."""
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
     """The fused map."""
+    calibrate: CalibrateConfig = dataclasses.field(default_factory=CalibrateConfig)
+    """Noise and lasting errors, told from the log itself before the run."""
 
 
 def preset(name: str) -> dict[str, Any]:

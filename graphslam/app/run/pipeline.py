@@ -16,6 +16,7 @@ from graphslam.app.folders.generations import consistent
 from graphslam.app.folders.lock import locked
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
+from graphslam.app.run.calibration import prepared
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
@@ -148,15 +149,21 @@ def _run(
     begin = time.perf_counter()
     log = load_log_source(source)
     seconds = {"load": time.perf_counter() - begin}
-    options = merge(recommended(log, frontend), config)
+    suggested = recommended(log, frontend)
+    options = merge(suggested, config)
     settings: cfg.RunConfig = build(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
-    effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     noticed = check_streams(log)
+    recorded, clock = log, time.perf_counter()
+    log, applied, said, _ = prepared(log, front, settings.calibrate, config, own=bool(suggested), seed=seed)
+    settings = replace(settings, calibrate=applied)
+    seconds["calibrate"] = time.perf_counter() - clock
+    noticed = [*noticed, *(Noticed("", f) for f in said)]
+    effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
     back = _back_end(log, settings, solver, [ProgressBar(log, progress), *observers])
     if out is None:
         return _made(log, front, back, settings, effective, None, seconds, begin, undo or (), noticed)
-    effective["run"]["log"] = log_digest(log)
+    effective["run"]["log"] = log_digest(recorded)
     effective = tomllib.loads(dump_toml(effective))  # as it comes back from the folder, order and all
     with RunFolder.start(out, effective, resume=resume) as folder:
         if undo is None:  # what was taken out of a run stays out when it is gone on with
@@ -301,6 +308,7 @@ def effective_config(
         "beacons": as_dict(settings.beacons),
         "refine": as_dict(settings.refine),
         "map": as_dict(settings.map),
+        "calibrate": as_dict(settings.calibrate),
     }
 
 

@@ -1,0 +1,1 @@
+"""Noise and lasting errors of a robot's sensors, estimated from a log itself, without truth."""

@@ -1,0 +1,35 @@
+"""Which calibration a log can have, by what is in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from graphslam.calibrate.estimate import Calibration
+from graphslam.calibrate.sighted import QUICK, Effort, calibrate_sightings
+from graphslam.calibrate.windows import Seen
+from graphslam.core.errors import DataError
+from graphslam.core.log import SensorLog
+from graphslam.frontends.landmarks.prepare import landmark_stream
+
+
+def calibrate_log(log: SensorLog, kind: str, effort: Effort = QUICK, config: Any = None, *, seed: int = 0) -> Calibration:
+    """What a log says of its own noise and lasting errors, without truth.
+
+    Parameters
+    ----------
+    log : SensorLog
+    kind : {"sightings", "scans"}
+        What is looked at beside the motion.
+    effort : Effort
+    config : object
+        Of a front end that reads them: how landmarks are detected, how scans become steps.
+    seed : int
+
+    Raises
+    ------
+    DataError, MissingDataError
+        The log says nothing.
+    """
+    if kind == "sightings":
+        return calibrate_sightings(Seen.of(log, *landmark_stream(log, config.detector)), effort, seed=seed)
+    raise DataError("scans are not calibrated", where=log.name)

@@ -1,0 +1,198 @@
+"""What a calibration says of a log, as figures, and the log with them applied."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array, se2_exp, se2_log
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import group_of
+from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, Stream, VelocityControls
+from graphslam.frontends.odometry.motion import MotionNoise, motion_stream, steering_odometry, velocity_odometry
+
+_LEAST = (1e-9, 1e-10)
+_MOVING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corrections:
+    """Errors of a robot that are taken out of its log, and the noise that it is then given.
+
+    What is left at its default is left as the log has it. The noise of the motion is that of random walks: each
+    variance grows with the way, with what is turned, and with the time in motion.
+    """
+
+    yaw_bias: float = 0.0
+    """The yaw rate of the motion is too high by it, while the robot moves [rad/s]."""
+    distance_scale: float = 1.0
+    """Distances of the motion are too long by this factor."""
+    turn_per_metre: float = 0.0
+    """The motion turns too much by it for each metre driven [rad/m]."""
+    turn_scale: float = 1.0
+    """Turns of the motion are too large by this factor."""
+    clock: float = 0.0
+    """Stamps of the motion are late by it, compared with those of the sightings [s]."""
+    range_scale: float = 1.0
+    """Ranges of landmarks are too long by this factor."""
+    range_offset: float = 0.0
+    """… and then by this length [m]."""
+    sensor_yaw: float = 0.0
+    """The sensor is turned to the left by it, beside what the log says [rad]."""
+    along_metre: float | None = None
+    """σ of the distance after one metre [m/√m]; None: the log's or the front end's own noise."""
+    along_second: float = 0.0
+    """σ of the distance after one second [m/√s]."""
+    lateral_metre: float = 0.0
+    """σ to the side after one metre [m/√m]."""
+    heading_metre: float = 0.0
+    """σ of the heading after one metre [rad/√m]."""
+    heading_radian: float = 0.0
+    """σ of the heading after one radian turned [rad/√rad]."""
+    heading_second: float = 0.0
+    """σ of the heading after one second in motion [rad/√s]."""
+    range_sigma: float | None = None
+    """σ of a range [m]; None: the log's own."""
+    bearing_sigma: float | None = None
+    """σ of a bearing [rad]; None: the log's own."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ConfigError(f"calibration: {name} = {value}; wanted a finite number")
+        for name in ("distance_scale", "turn_scale", "range_scale", "range_sigma", "bearing_sigma"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigError(f"calibration: {name} = {value}; wanted > 0")
+        for name in (*NOISE, "along_metre"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise ConfigError(f"calibration: {name} = {value}; wanted ≥ 0")
+
+    @property
+    def neutral(self) -> bool:
+        """Does it change nothing?"""
+        return self == Corrections()
+
+    def without_motion_noise(self) -> Corrections:
+        """The same with the noise of the motion left as it is."""
+        return replace(self, along_metre=None, **dict.fromkeys(NOISE, 0.0))
+
+    def without_sensor_noise(self) -> Corrections:
+        """The same with the σ of the sightings left as they are."""
+        return replace(self, range_sigma=None, bearing_sigma=None)
+
+
+NOISE = ("along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateConfig:
+    """Noise and lasting errors from the log itself, before a run."""
+
+    use: Literal["auto", "always", "none"] = "auto"
+    """``auto``: where no preset was made for this very set; ``always``; ``none``. Figures that are given stand, and then
+    nothing is estimated."""
+    given: Corrections | None = None
+    """Figures to be applied, as ``graphslam calibrate`` writes them."""
+    budget: float = 1.0
+    """Share of the usual work that an estimate inside a run may take; 1: a few seconds."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.budget <= 100:
+            raise ConfigError(f"calibrate.budget = {self.budget}; wanted above 0, at most 100")
+
+
+def calibrated(log: SensorLog, c: Corrections) -> SensorLog:
+    """The log with the corrections applied: motion, sightings and their stated noise; its truth is left alone.
+
+    Raises
+    ------
+    MissingDataError
+        No motion in it.
+    """
+    if c.neutral:
+        return log
+    name, motion = motion_stream(log)
+    streams: dict[str, Stream] = {name: corrected_motion(motion, c)}  # first: of two odometries it is the one that counts
+    for other, stream in log.streams.items():
+        if other != name:
+            streams[other] = corrected_sightings(stream, c) if isinstance(stream, LandmarkObservations) else stream
+    return replace(log, streams=streams)
+
+
+def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObservations:
+    """Sightings with their ranges, their mounting and their σ put right; those whose range vanishes are left out."""
+    if (c.range_scale, c.range_offset, c.sensor_yaw) == (1.0, 0.0, 0.0) and c.range_sigma is c.bearing_sigma is None:
+        return s
+    ranges = (s.ranges - c.range_offset) / c.range_scale
+    sigmas = s.sigmas.copy()
+    if c.range_sigma is not None:
+        sigmas[:, 0] = c.range_sigma / c.range_scale
+    if c.bearing_sigma is not None:
+        sigmas[s.has_bearing, 1] = c.bearing_sigma
+    return replace(s, ranges=ranges, sigmas=sigmas, T_base_sensor=s.T_base_sensor + np.array([0.0, 0.0, c.sensor_yaw]))
+
+
+def corrected_motion(motion: Any, c: Corrections) -> Any:
+    """A stream of motion put right; with noise of its own it becomes recorded odometry, record for record."""
+    if c.clock:
+        motion = replace(motion, times=motion.times - c.clock)
+    if isinstance(motion, Odometry):
+        return _odometry(motion, c)
+    if c.along_metre is not None:
+        made = steering_odometry if isinstance(motion, SteeringControls) else velocity_odometry
+        return _odometry(made(motion, motion.times, MotionNoise()), c)
+    if isinstance(motion, VelocityControls):
+        moving = (motion.speed != 0.0) | (motion.yaw_rate != 0.0)
+        speed = motion.speed / c.distance_scale
+        rate = motion.yaw_rate - moving * c.yaw_bias - np.abs(motion.speed) * c.turn_per_metre
+        return replace(motion, speed=speed, yaw_rate=rate - (c.turn_scale - 1.0) * motion.yaw_rate)
+    g = motion.geometry
+    bend = np.tan(motion.steering) / g.wheelbase * (2.0 - c.turn_scale)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bias = np.where(motion.speed != 0.0, c.yaw_bias / motion.speed, 0.0)
+    bend = bend - np.sign(motion.speed) * c.turn_per_metre - bias
+    return replace(motion, speed=motion.speed / c.distance_scale, steering=np.arctan(bend * g.wheelbase))
+
+
+def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
+    g = group_of(odometry.increments)
+    planar = g.dof == 3
+    xi = se2_log(odometry.increments) if planar else g.log(odometry.increments)
+    place, heading = (slice(0, 2), 2) if planar else (g.position, g.heading)
+    metres = np.linalg.norm(xi[:, place], axis=1)
+    turned = np.abs(xi[:, heading]) if planar else np.linalg.norm(xi[:, :3], axis=1)
+    seconds = np.concatenate([[0.0], np.diff(odometry.times)])[: len(metres)]
+    seconds = seconds * ((metres > _MOVING) | (turned > _MOVING))
+    changed = xi.copy()
+    changed[:, heading] -= c.yaw_bias * seconds + c.turn_per_metre * metres + (c.turn_scale - 1.0) * xi[:, heading]
+    changed[:, place] /= c.distance_scale
+    increments = odometry.increments
+    if not np.array_equal(changed, xi):
+        increments = se2_exp(changed) if planar else g.exp(changed)
+        increments[0] = odometry.increments[0]
+    if c.along_metre is None:
+        return replace(odometry, increments=increments)
+    return replace(odometry, increments=increments, covariances=walks(c, metres, turned, seconds, g.dof))
+
+
+def walks(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:
+    """Covariances ``(n, dof, dof)`` of increments, right tangent."""
+    along = (c.along_metre or 0.0) ** 2 * metres + c.along_second**2 * seconds + _LEAST[0]
+    side = c.lateral_metre**2 * metres + _LEAST[0]
+    heading = c.heading_metre**2 * metres + c.heading_radian**2 * turned + c.heading_second**2 * seconds + _LEAST[1]
+    if dof == 3:
+        P = np.zeros((len(metres), 3, 3))
+        P[:, 0, 0], P[:, 1, 1], P[:, 2, 2] = along, side, heading
+        return P
+    P = np.zeros((len(metres), 6, 6))
+    for k in range(3):
+        P[:, k, k] = heading
+        P[:, 3 + k, 3 + k] = np.maximum(along, side)
+    return P

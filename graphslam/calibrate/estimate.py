@@ -1,0 +1,202 @@
+"""What a calibration found: constants with their gates, noise, and the sentences that say so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from graphslam.calibrate.corrections import Corrections
+from graphslam.core.config import as_dict
+from graphslam.core.findings import Finding
+
+SURE = 3.0
+"""A constant is applied where it is so many σ from what changes nothing,"""
+GAIN = 5.0
+"""… gains so much likelihood over noise alone [nats],"""
+AGREE = 2.0
+"""… and differs by less than so many σ between the two lengths of windows."""
+LASTS = 1.5
+"""Noise that is so much larger in long windows than in short ones lasts."""
+ALIKE = 0.3
+"""… and so does that whose whitened residuals are so alike from one to the next."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """One constant.
+
+    Parameters
+    ----------
+    name : str
+        As in :class:`~graphslam.calibrate.corrections.Corrections`; logarithms and shares as the kernels have them.
+    value, sigma : float
+    gain : float
+        Likelihood that it gains over noise alone [nats]; NaN where that was not worth a fit.
+    other, other_sigma : float
+        The same in windows of another length; NaN where there are none.
+    why_not : str
+        Why it is not applied; empty where it is.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    gain: float = math.nan
+    other: float = math.nan
+    other_sigma: float = math.nan
+    why_not: str = ""
+
+    @property
+    def applied(self) -> bool:
+        """Is it taken out of the log?"""
+        return not self.why_not
+
+    def gated(self) -> Estimate:
+        """The same with the verdict of the gates."""
+        why = ""
+        if not abs(self.value) > SURE * self.sigma:
+            why = "no more than chance"
+        elif not self.gain > GAIN:
+            why = f"it gains {max(self.gain, 0.0):.1f} nats over noise alone, and more than {GAIN:g} are asked for"
+        elif abs(self.value - self.other) > AGREE * math.hypot(self.sigma, self.other_sigma):
+            why = f"windows of another length say {in_words(self.name, self.other, self.other_sigma)}"
+        return replace(self, why_not=why)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """What a log says of its own noise.
+
+    Parameters
+    ----------
+    kind : str
+        What was looked at: ``sightings``, ``ranges``, ``scans`` or ``clouds``.
+    corrections : Corrections
+        What is applied.
+    estimates : tuple of Estimate
+    noise : mapping of str to float
+        Standard deviations, as they were fitted.
+    notes : tuple of Finding
+        What else is to be said.
+    data : str
+        Of how much of the log it is made.
+    """
+
+    kind: str
+    corrections: Corrections
+    estimates: tuple[Estimate, ...] = ()
+    noise: dict[str, float] = field(default_factory=dict)
+    notes: tuple[Finding, ...] = ()
+    data: str = ""
+
+    def findings(self) -> list[Finding]:
+        """Lines of a verdict: what is applied, what is not, and why."""
+        out = []
+        for e in self.estimates:
+            said = in_words(e.name, e.value, e.sigma)
+            if e.applied:
+                text = f"Calibrated from {self.data}: {said}: {MENDED[e.name]} (gain {e.gain:.0f} nats)."
+                out.append(Finding("", "calibrated", text))
+            elif e.why_not != "no more than chance":
+                text = f"From {self.data}: {said}, perhaps; left as it is: {e.why_not}."
+                out.append(Finding("look", "calibration-left", text))
+        chance = [NAMES[e.name] for e in self.estimates if e.why_not == "no more than chance"]
+        if chance:
+            out.append(Finding("", "calibrated", f"No lasting error was found of {' or '.join(chance)}."))
+        if self.noise:
+            out.append(Finding("", "calibrated", f"Noise from {self.data}: {noise_in_words(self.noise)}."))
+        return [*out, *self.notes]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON object."""
+        return {
+            "kind": self.kind,
+            "data": self.data,
+            "given": as_dict(self.corrections),
+            "estimates": [
+                {k: _number(getattr(e, k)) for k in e.__dataclass_fields__} | {"applied": e.applied}
+                for e in self.estimates
+            ],
+            "noise": {k: float(v) for k, v in self.noise.items()},
+            "lines": [f.as_row() for f in self.findings()],
+        }
+
+
+NAMES = {
+    "yaw_bias": "the yaw rate",
+    "distance_scale": "the distances of the motion",
+    "turn_per_metre": "the turn per metre",
+    "turn_scale": "the turns",
+    "range_scale": "the scale of the ranges",
+    "range_offset": "the zero of the ranges",
+    "sensor_yaw": "the sensor's direction",
+    "clock": "the clocks",
+}
+MENDED = {
+    "yaw_bias": "subtracted",
+    "distance_scale": "divided out",
+    "turn_per_metre": "subtracted",
+    "turn_scale": "divided out",
+    "range_scale": "divided out",
+    "range_offset": "subtracted",
+    "sensor_yaw": "put right",
+    "clock": "put right",
+}
+
+
+def in_words(name: str, value: float, sigma: float) -> str:
+    """A constant with its σ as a sentence without an end."""
+    deg = np.rad2deg
+    if name == "yaw_bias":
+        return f"yaw rate {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/s too {'high' if value > 0 else 'low'}"
+    if name == "distance_scale":
+        return f"distances of the motion {100 * abs(np.expm1(value)):.2f} ± {100 * sigma:.2f} % too {_long(value)}"
+    if name == "turn_per_metre":
+        return f"the motion turns {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/m too far to the {_left(value)}"
+    if name == "turn_scale":
+        return f"turns {100 * abs(value):.2f} ± {100 * sigma:.2f} % too {'large' if value > 0 else 'small'}"
+    if name == "range_scale":
+        return f"range scale {1 + value:.4f} ± {sigma:.4f} relative to the wheels"
+    if name == "range_offset":
+        return f"ranges {abs(value):.3f} ± {sigma:.3f} m too {_long(value)}"
+    if name == "sensor_yaw":
+        return f"sensor turned {deg(abs(value)):.2f} ± {deg(sigma):.2f} deg further to the {_left(value)} than stated"
+    if name == "clock":
+        return f"stamps of the motion {abs(value):.3f} ± {sigma:.3f} s too {'late' if value > 0 else 'early'}"
+    return f"{name} {value:.4g} ± {sigma:.2g}"
+
+
+def noise_in_words(noise: dict[str, float]) -> str:
+    """Standard deviations as a list."""
+    units = {
+        "along_metre": ("along the way", "m/√m"),
+        "along_second": ("along the way", "m/√s"),
+        "lateral_metre": ("to the side", "m/√m"),
+        "heading_metre": ("heading", "rad/√m"),
+        "heading_radian": ("heading", "rad/√rad"),
+        "heading_second": ("heading", "rad/√s"),
+        "range_sigma": ("ranges", "m"),
+        "bearing_sigma": ("bearings", "rad"),
+    }
+    found = [f"{units[k][0]} {v:.3g} {units[k][1]}" for k, v in noise.items() if k in units]
+    return ", ".join(found)
+
+
+def rounded(x: float) -> float:
+    """Five digits: what is written is what is used, on every machine."""
+    return float(f"{x:.5g}")
+
+
+def _long(value: float) -> str:
+    return "long" if value > 0 else "short"
+
+
+def _left(value: float) -> str:
+    return "left" if value > 0 else "right"
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,334 @@
+"""Compiled elimination of one window of a log: a chain of poses, and landmarks, visits and constants that border it."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+YAW_BIAS, DISTANCE_SCALE, TURN_PER_METRE, TURN_SCALE, RANGE_SCALE, RANGE_OFFSET, SENSOR_YAW = range(7)
+CONSTANTS = 7
+RHS = CONSTANTS
+HEAD = CONSTANTS + 1
+(
+    ALONG_METRE,
+    ALONG_SECOND,
+    LATERAL_METRE,
+    HEADING_METRE,
+    HEADING_RADIAN,
+    HEADING_SECOND,
+    RANGE,
+    BEARING,
+    VISIT_RANGE,
+    VISIT_BEARING,
+    RATE_SIGMA,
+    RATE_TIME,
+    SPEED_SIGMA,
+    SPEED_TIME,
+    FLOOR_POSITION,
+    FLOOR_HEADING,
+) = range(16)
+PARAMETERS = 16
+_FAR = 1e-8  # information of where a landmark is before it is seen [1/m²]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def wrap(a):
+    """Angle in (-π, π]."""
+    return math.pi - (math.pi - a) % (2.0 * math.pi)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _row(jp, jn, cols, vals, n, A, An, B, C, Cn, S):
+    """Add one whitened residual row: blocks of this pose, the next one, and ``n`` border columns."""
+    D = len(jp)
+    for a in range(D):
+        if jp[a] != 0.0:
+            for b in range(D):
+                A[a, b] += jp[a] * jp[b]
+                B[a, b] += jp[a] * jn[b]
+            for i in range(n):
+                C[a, cols[i]] += jp[a] * vals[i]
+        if jn[a] != 0.0:
+            for b in range(D):
+                An[a, b] += jn[a] * jn[b]
+            for i in range(n):
+                Cn[a, cols[i]] += jn[a] * vals[i]
+    for i in range(n):
+        for j in range(n):
+            a, b = cols[i], cols[j]
+            if a <= b:
+                S[a, b] += vals[i] * vals[j]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor, p, damping, L, X, C, S, chi2):
+    """Linearise a window, and eliminate its poses, then its nuisances, onto the constants.
+
+    poses : (n, D) x, y, heading, and for D = 5 the lasting errors of yaw rate [rad/s] and speed [m/s].
+    nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first sighting.
+    g : (CONSTANTS,)
+    steps : (n, 8) dx, dy, turn, seconds, metres into pose k, and variances along, to the side and of the heading that
+        stand in place of the model's where the first is above 0; row 0 is not read.
+    first : (n + 1,) sightings of pose k are ``first[k]:first[k + 1]``.
+    sightings : (q, 2) range and bearing; a bearing of nan is none.
+    slots : (q, 2) nuisance of the landmark, and of the visit or -1.
+    kinds : (M,) 0 landmark, 1 visit.
+    sensor : (3,) sensor in the base.
+    p : (PARAMETERS,) standard deviations and times.
+    damping : share added to every diagonal, Levenberg-Marquardt.
+    L (n, D, D), X (n, D, D), C (n, D, HEAD + 2 M), S (HEAD + 2 M, HEAD + 2 M), chi2 (6,) out: what
+    :func:`substitute` needs; S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in
+    row RHS; chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
+
+    Returns
+    -------
+    (float, float)
+        ln det of all that was eliminated, and the sum of ln σ of all residuals.
+    """
+    n, D = poses.shape
+    M = len(nuisance)
+    m = HEAD + 2 * M
+    S[:] = 0.0
+    C[:] = 0.0
+    chi2[:] = 0.0
+    logdet, volume = 0.0, 0.0
+    A, An = np.zeros((D, D)), np.zeros((D, D))
+    jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
+    cols, vals = np.zeros(16, np.int64), np.zeros(16)
+    cols[0] = RHS
+    for a in range(3):
+        A[a, a] = 1e12
+    if D == 5:
+        for a, s in ((3, p[RATE_SIGMA]), (4, p[SPEED_SIGMA])):
+            jp[:] = 0.0
+            jp[a] = 1.0 / s
+            vals[0] = -poses[0, a] / s
+            _row(jp, zero, cols, vals, 1, A, An, X[0], C[0], C[0], S)
+            chi2[5] += vals[0] * vals[0]
+            volume += math.log(s)
+    for j in range(M):
+        for c in range(2):
+            s = 0.0
+            if kinds[j] == 1:
+                s = p[VISIT_RANGE] if c == 0 else p[VISIT_BEARING]
+                volume += math.log(s)
+                cols[1], vals[0], vals[1] = HEAD + 2 * j + c, -nuisance[j, c] / s, 1.0 / s
+                _row(zero, zero, cols, vals, 2, A, An, X[0], C[0], C[0], S)
+                chi2[5] += vals[0] * vals[0]
+            else:
+                S[HEAD + 2 * j + c, HEAD + 2 * j + c] += _FAR
+    known = 0
+    for k in range(n):
+        X[k] = 0.0
+        An[:] = 0.0
+        x, y, th = poses[k, 0], poses[k, 1], poses[k, 2]
+        c, s = math.cos(th), math.sin(th)
+        ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
+        for q in range(first[k], first[k + 1]):
+            j, v = slots[q, 0], slots[q, 1]
+            known = max(known, j + 1, v + 1)
+            dx, dy = nuisance[j, 0] - x - ox, nuisance[j, 1] - y - oy
+            r2 = dx * dx + dy * dy + 1e-12
+            r = math.sqrt(r2)
+            base = HEAD + 2 * j
+            grow = 1.0 + g[RANGE_SCALE]
+            w = 1.0 / p[RANGE]
+            volume += math.log(p[RANGE])
+            # residual: predicted less measured
+            e = grow * r + g[RANGE_OFFSET] - sightings[q, 0]
+            jp[:] = 0.0
+            jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
+            jp[2] = w * grow * (dx * oy - dy * ox) / r
+            cols[1], vals[1] = base, w * grow * dx / r
+            cols[2], vals[2] = base + 1, w * grow * dy / r
+            cols[3], vals[3] = RANGE_SCALE, w * r
+            cols[4], vals[4] = RANGE_OFFSET, w
+            count = 5
+            if v >= 0:
+                e += nuisance[v, 0]
+                cols[5], vals[5] = HEAD + 2 * v, w
+                count = 6
+            vals[0] = -w * e
+            chi2[3] += vals[0] * vals[0]
+            _row(jp, zero, cols, vals, count, A, An, X[k], C[k], C[k], S)
+            if sightings[q, 1] == sightings[q, 1]:
+                w = 1.0 / p[BEARING]
+                volume += math.log(p[BEARING])
+                e = math.atan2(dy, dx) - th - sensor[2] - g[SENSOR_YAW] - sightings[q, 1]
+                if v >= 0:
+                    e += nuisance[v, 1]
+                e = wrap(e)
+                jp[:] = 0.0
+                jp[0], jp[1] = w * dy / r2, -w * dx / r2
+                jp[2] = w * (-(dx * ox + dy * oy) / r2 - 1.0)
+                cols[1], vals[1] = base, -w * dy / r2
+                cols[2], vals[2] = base + 1, w * dx / r2
+                cols[3], vals[3] = SENSOR_YAW, -w
+                count = 4
+                if v >= 0:
+                    cols[4], vals[4] = HEAD + 2 * v + 1, w
+                    count = 5
+                vals[0] = -w * e
+                chi2[4] += vals[0] * vals[0]
+                _row(jp, zero, cols, vals, count, A, An, X[k], C[k], C[k], S)
+        if k + 1 < n:
+            ux, uy, turn, dt, d = steps[k + 1, 0], steps[k + 1, 1], steps[k + 1, 2], steps[k + 1, 3], steps[k + 1, 4]
+            rate = poses[k, 3] if D == 5 else 0.0
+            speed = poses[k, 4] if D == 5 else 0.0
+            less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn + rate * dt
+            h = 0.5 * turn
+            cx, cyy = math.cos(h) * ux + math.sin(h) * uy, -math.sin(h) * ux + math.cos(h) * uy
+            shrink = math.exp(-g[DISTANCE_SCALE])
+            phi = th + h - 0.5 * less
+            cp, sp = math.cos(phi), math.sin(phi)
+            mx, my = poses[k + 1, 0] - x, poses[k + 1, 1] - y
+            qx, qy = cp * mx + sp * my, -sp * mx + cp * my
+            ex, ey = qx - shrink * cx + speed * dt, qy - shrink * cyy
+            et = wrap(poses[k + 1, 2] - th - turn + less)
+            var_x = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
+            var_y = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
+            var_t = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
+            var_t += p[FLOOR_HEADING] ** 2
+            if steps[k + 1, 5] > 0.0:
+                var_x, var_y, var_t = steps[k + 1, 5], steps[k + 1, 6], steps[k + 1, 7]
+            volume += 0.5 * (math.log(var_x) + math.log(var_y) + math.log(var_t))
+            for row in range(3):
+                jp[:] = 0.0
+                jn[:] = 0.0
+                if row == 0:
+                    w, e, dphi = 1.0 / math.sqrt(var_x), ex, qy
+                    jp[0], jp[1], jn[0], jn[1] = -w * cp, -w * sp, w * cp, w * sp
+                    scale = shrink * cx
+                    if D == 5:
+                        jp[4] = w * dt
+                elif row == 1:
+                    w, e, dphi = 1.0 / math.sqrt(var_y), ey, -qx
+                    jp[0], jp[1], jn[0], jn[1] = w * sp, -w * cp, -w * sp, w * cp
+                    scale = shrink * cyy
+                else:
+                    w, e, dphi, scale = 1.0 / math.sqrt(var_t), et, -1.0, 0.0
+                    jn[2] = w
+                jp[2] = w * dphi
+                # constants turn the chord by half of what they take from the turn, and the heading by all of it
+                part = -0.5 * dphi if row < 2 else 1.0
+                if D == 5:
+                    jp[3] = w * part * dt
+                cols[1], vals[1] = YAW_BIAS, w * part * dt
+                cols[2], vals[2] = DISTANCE_SCALE, w * scale
+                cols[3], vals[3] = TURN_PER_METRE, w * part * d
+                cols[4], vals[4] = TURN_SCALE, w * part * turn
+                vals[0] = -w * e
+                chi2[row] += vals[0] * vals[0]
+                _row(jp, jn, cols, vals, 5, A, An, X[k], C[k], C[k + 1], S)
+            if D == 5:
+                for a in range(3, 5):
+                    sigma = p[RATE_SIGMA] if a == 3 else p[SPEED_SIGMA]
+                    left = math.exp(-max(dt, 1e-6) / (p[RATE_TIME] if a == 3 else p[SPEED_TIME]))
+                    new = sigma * math.sqrt(1.0 - left * left)
+                    jp[:] = 0.0
+                    jn[:] = 0.0
+                    jp[a], jn[a] = -left / new, 1.0 / new
+                    vals[0] = -(poses[k + 1, a] - left * poses[k, a]) / new
+                    chi2[5] += vals[0] * vals[0]
+                    volume += math.log(new)
+                    _row(jp, jn, cols, vals, 1, A, An, X[k], C[k], C[k + 1], S)
+        if damping > 0.0:
+            for a in range(D):
+                A[a, a] *= 1.0 + damping
+        # Cholesky of the pose, then what it leaves to the next one and to the border
+        active = HEAD + 2 * known
+        for a in range(D):
+            for b in range(a + 1):
+                t = A[a, b]
+                for i in range(b):
+                    t -= L[k, a, i] * L[k, b, i]
+                if a == b:
+                    if not t > 0.0:
+                        return np.nan, volume
+                    L[k, a, a] = math.sqrt(t)
+                    logdet += math.log(t)
+                else:
+                    L[k, a, b] = t / L[k, b, b]
+                    L[k, b, a] = 0.0
+        for a in range(D):
+            for b in range(D):
+                t = X[k, a, b]
+                for i in range(a):
+                    t -= L[k, a, i] * X[k, i, b]
+                X[k, a, b] = t / L[k, a, a]
+            for i in range(a):
+                w = L[k, a, i]
+                for b in range(active):
+                    C[k, a, b] -= w * C[k, i, b]
+            w = 1.0 / L[k, a, a]
+            for b in range(active):
+                C[k, a, b] *= w
+        for i in range(D):
+            for a in range(D):
+                w = X[k, i, a]
+                for b in range(D):
+                    An[a, b] -= w * X[k, i, b]
+                if k + 1 < n:
+                    for b in range(active):
+                        C[k + 1, a, b] -= w * C[k, i, b]
+            for a in range(active):
+                w = C[k, i, a]
+                if w != 0.0:
+                    for b in range(a, active):
+                        S[a, b] -= w * C[k, i, b]
+        A, An = An, A
+    if damping > 0.0:
+        for j in range(HEAD, m):
+            S[j, j] *= 1.0 + damping
+    for j in range(m - 1, HEAD - 1, -1):
+        pivot = S[j, j]
+        if not pivot > 0.0:
+            return np.nan, volume
+        logdet += math.log(pivot)
+        for a in range(j):
+            w = S[a, j] / pivot
+            if w != 0.0:
+                for b in range(a, j):
+                    S[a, b] -= w * S[b, j]
+    return logdet, volume
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def substitute(L, X, C, S, dg, d_poses, d_nuisance):
+    """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
+    n, D = d_poses.shape
+    m = C.shape[2]
+    y = np.zeros(m)
+    y[:CONSTANTS] = dg
+    y[RHS] = -1.0
+    for j in range(HEAD, m):
+        t = 0.0
+        for a in range(j):
+            t += S[a, j] * y[a]
+        y[j] = -t / S[j, j]
+        d_nuisance[(j - HEAD) // 2, (j - HEAD) % 2] = y[j]
+    for k in range(n - 1, -1, -1):
+        for a in range(D - 1, -1, -1):
+            t = 0.0
+            for b in range(m):
+                t += C[k, a, b] * y[b]
+            if k + 1 < n:
+                for b in range(D):
+                    t += X[k, a, b] * d_poses[k + 1, b]
+            for b in range(a + 1, D):
+                t += L[k, b, a] * d_poses[k, b]
+            d_poses[k, a] = -t / L[k, a, a]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def compose_steps(increments, start, poses):
+    """Chain increments ``(n, >= 3)`` from ``start`` into ``poses`` (n, >= 3); row 0 of the increments is not read."""
+    poses[0, 0], poses[0, 1], poses[0, 2] = start[0], start[1], start[2]
+    for k in range(1, len(poses)):
+        c, s = math.cos(poses[k - 1, 2]), math.sin(poses[k - 1, 2])
+        x, y = increments[k, 0], increments[k, 1]
+        poses[k, 0] = poses[k - 1, 0] + c * x - s * y
+        poses[k, 1] = poses[k - 1, 1] + s * x + c * y
+        poses[k, 2] = wrap(poses[k - 1, 2] + increments[k, 2])

@@ -1,0 +1,194 @@
+"""Noise and constants of wheels and of a sensor that sights landmarks, by greatest likelihood of smoothed windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.calibrate import kernels as K
+from graphslam.calibrate.smoothing import CONSTANTS, START, Smoothing, Window, keep_sightings, numbered
+from graphslam.calibrate.windows import Seen, cut
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+
+WHEELS = ("along_metre", "along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
+TRIMS = (5.0, 4.0)
+"""Sightings with a whitened residual above are left out, with a new fit after each."""
+LASTING = ("rate_sigma", "rate_time", "speed_sigma", "speed_time")
+
+
+def smoothing_of(windows: Sequence[Window], sensor: Array, free: Sequence[str], *, visits: bool = False) -> Smoothing:
+    """Windows with the noise that is to be found in them."""
+    bearings = any(np.isfinite(w.sightings[:, 1]).any() for w in windows)
+    fitted = [*WHEELS, "range"] + ["bearing"] * bearings
+    fitted += (["visit_range"] + ["visit_bearing"] * bearings) if visits else []
+    return Smoothing(list(windows), np.asarray(sensor, dtype=np.float64), tuple(free), tuple(fitted))
+
+
+def sighted(seen: Seen, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False) -> Smoothing:
+    """Smoothing of windows of range and bearing, where the odometry starts it."""
+    windows = [w for w, _ in cut(seen, seconds, count, visits=visits)]
+    return smoothing_of(windows, seen.sightings.T_base_sensor, free, visits=visits)
+
+
+def trimmed(s: Smoothing, limit: float) -> Smoothing:
+    """The smoothing without sightings whose residual is above ``limit`` standard deviations."""
+    seen, _ = s.residuals()
+    good = [np.nan_to_num(np.abs(r), nan=0.0).max(axis=1, initial=0.0) < limit for r in seen]
+    return s if all(g.all() for g in good) else keep_sightings(s, good)
+
+
+def fitted(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
+    """Fit, trim and fit again; the smoothing and its objective."""
+    s.settle(8)
+    s = trimmed(s, 12.0)  # a wrong identity by metres would make its noise that of all
+    value = s.fit(budget=budget, rounds=2 if trims else 4)
+    for limit in trims:
+        less = trimmed(s, limit)
+        if less is s:
+            continue
+        s = less
+        value = s.fit(budget=budget, rounds=2)
+    return s, value
+
+
+def without(s: Smoothing, constant: str, *, budget: int = 150) -> tuple[Smoothing, float]:
+    """The smoothing with a constant left out, its noise fitted anew, and its objective."""
+    alone = s.copy(free=tuple(c for c in s.free if c != constant))
+    alone.constants[CONSTANTS.index(constant)] = 0.0
+    return alone, alone.fit(budget=budget, rounds=3)
+
+
+def ranged(
+    seen: Seen, until: float, *, seed: int = 0, starts: int = 16, first: float = 150.0
+) -> tuple[Smoothing, Smoothing] | None:
+    """One window of ranges alone, from a dead start: layouts of beacons over its beginning, then ever more of it.
+
+    Parameters
+    ----------
+    seen : Seen
+    until : float
+        Seconds of the log that are used.
+    seed : int
+    starts : int
+        Layouts that are tried.
+    first : float
+        Seconds of the log over which they are tried.
+
+    Returns
+    -------
+    (Smoothing, Smoothing) or None
+        Of the whole stretch, and of about half of it.
+    """
+    free = ("yaw_bias", "range_scale", "range_offset")
+    rng = SeedTree(seed).child("calibrate", "ranges").generator()
+    s, (begin, _) = seen.sightings, seen.span
+    (whole,) = [w for w, _ in cut(seen, 1e9)][:1] or (None,)
+    if whole is None:
+        return None
+    scans = whole.rows[np.minimum(whole.first[:-1], len(whole.rows) - 1)]
+    times = s.times[np.searchsorted(s.offsets, scans, side="right") - 1]
+    ends = [until]
+    while ends[0] > 1.5 * first:
+        ends.insert(0, 0.5 * ends[0])
+    places: dict[int, Array] = {}
+    constants, sigmas = np.zeros(K.CONSTANTS), {**START, "range": 1.0}
+    poses = np.zeros((0, 3))
+    made: list[Smoothing] = []
+    for end in ends:  # a bias of a third of a degree a second is half a turn over the whole log
+        n = int(np.searchsorted(times, begin + end, side="right"))
+        if n < 20:
+            continue
+        tries: list[tuple[float, Smoothing]] = []
+        for trial in range(1 if len(poses) else starts):
+            g = constants.copy()
+            if not len(poses):
+                g[K.YAW_BIAS] = rng.normal(0.0, 0.005) if trial else 0.0
+            path = _extended(whole, poses, n, g)
+            w = _part(whole, path, places, rng)
+            one = smoothing_of([w], s.T_base_sensor, free)
+            one.constants, one.sigmas = g, {**sigmas, "range": max(sigmas["range"], 1.0)}
+            tries.append((one.settle(60), one))
+        best = min(tries, key=lambda x: x[0])[1]
+        best.fit(budget=120, rounds=2)
+        best = trimmed(best, 5.0)
+        best.fit(budget=120, rounds=2)
+        constants, sigmas, poses = best.constants, best.sigmas, best.windows[0].poses
+        names = _names(whole, best.windows[0])
+        places = {int(l): best.windows[0].nuisance[j] for j, l in enumerate(names)}
+        made.append(best)
+    return (made[-1], made[-2] if len(made) > 1 else made[-1]) if made else None
+
+
+def _names(whole: Window, w: Window) -> Array:
+    """Landmark of the whole window that each of a part's is."""
+    of_row = dict(zip(whole.rows.tolist(), whole.slots[:, 0].tolist()))
+    out = np.full(len(w.nuisance), -1)
+    for row, (l, _) in zip(w.rows.tolist(), w.slots.tolist()):
+        out[l] = of_row[row]
+    return out
+
+
+def _extended(whole: Window, poses: Array, n: int, g: Array) -> Array:
+    """Path of ``n`` poses that goes on from those known by steps without what the constants take away."""
+    u = whole.steps[:n].copy()
+    u[:, 2] -= g[K.YAW_BIAS] * u[:, 3]
+    out = np.zeros((n, 3))
+    known = min(len(poses), n)
+    out[:known] = poses[:known]
+    rest = out[max(known - 1, 0) :]
+    K.compose_steps(u[max(known - 1, 0) :], out[max(known - 1, 0)].copy(), rest)
+    return out
+
+
+def _part(whole: Window, path: Array, places: dict[int, Array], rng: np.random.Generator) -> Window:
+    """The first poses of a window, beacons without a place put anywhere on their first circle that fits."""
+    n = len(path)
+    q = int(whole.first[n])
+    slots, order = numbered(whole.slots[:q])
+    k = np.repeat(np.arange(n), np.diff(whole.first[: n + 1]))
+    nuisance = np.zeros((len(order), 2))
+    for j, l in enumerate(order.tolist()):
+        if l in places:
+            nuisance[j] = places[l]
+            continue
+        mine = np.flatnonzero(slots[:, 0] == j)
+        at, r = path[k[mine], :2], whole.sightings[mine, 0]
+        nuisance[j] = _anywhere(at, r, rng)
+    return Window(
+        steps=whole.steps[:n],
+        first=whole.first[: n + 1],
+        sightings=whole.sightings[:q],
+        slots=slots,
+        kinds=np.zeros(len(order), dtype=np.int64),
+        rows=whole.rows[:q],
+        poses=path.copy(),
+        nuisance=nuisance,
+    )
+
+
+def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
+    """A place that explains ranges from places on a path: one of the two best of 24 on a circle, by chance."""
+    i = int(np.argmin(r))
+    angle = np.arange(24) * (2 * np.pi / 24)
+    found = []
+    for x in at[i] + r[i] * np.column_stack([np.cos(angle), np.sin(angle)]):
+        for _ in range(8):
+            d = x - at
+            length = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-6)
+            J = d / length[:, None]
+            e = r - length
+            x = x + np.linalg.lstsq(J.T @ J + 1e-3 * np.eye(2), J.T @ np.clip(e, -10.0, 10.0), rcond=None)[0]
+        found.append((float(np.sum(np.minimum(np.abs(r - np.hypot(*(x - at).T)), 5.0))), x))
+    found.sort(key=lambda f: f[0])
+    best = found[0][1]
+    other = next((x for _, x in found if np.linalg.norm(x - best) > 2.0), best)
+    return best if rng.random() < 0.7 else other
+
+
+def at_shift(s: Smoothing, seen: Seen, stamps: Sequence[Array], shift: float) -> Smoothing:
+    """The smoothing with its motion cut at stamps that are later by ``shift``."""
+    windows = [replace(w, steps=seen.steps(t, shift)) for w, t in zip(s.windows, stamps)]
+    return s.copy(windows=windows)

@@ -1,0 +1,336 @@
+"""Calibration of logs with landmarks: of range and bearing in windows, of ranges alone over one stretch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.calibrate import kernels as K
+from graphslam.calibrate import landmarks as L
+from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.estimate import ALIKE, LASTS, SURE, Calibration, Estimate, rounded
+from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window
+from graphslam.calibrate.windows import Seen, cut
+from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.records import SteeringControls
+from graphslam.frontends.odometry.motion import motion_stream
+
+SHORT, LONG = 15.0, 60.0
+"""Lengths of the windows [s]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """How much of a log is looked at, and how hard."""
+
+    windows: int | None = 20
+    """Short windows at most; a quarter as many long ones. None: all of the log."""
+    poses: int = 2000
+    """Poses of all short windows together; of the one stretch of ranges alone."""
+    clock: bool = False
+    """Is the offset of the clocks looked for?"""
+    lasting: bool = False
+    """Are errors of the motion that last looked for (Gauss-Markov)?"""
+
+
+QUICK = Effort()
+FULL = Effort(windows=60, poses=6000, clock=True, lasting=True)
+
+
+def calibrate_sightings(seen: Seen, effort: Effort = QUICK, *, seed: int = 0) -> Calibration:
+    """What wheels and sightings say of their own noise and lasting errors.
+
+    Raises
+    ------
+    DataError
+        Too little is seen twice, or nothing moves.
+    """
+    if not np.any(seen.sightings.has_bearing):
+        return _ranges_alone(seen, effort, seed)
+    return _range_and_bearing(seen, effort)
+
+
+def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
+    steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
+    free = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    count = _count(seen, SHORT, effort)
+    short, short_value = L.fitted(L.sighted(seen, SHORT, count, free))
+    _enough(short, seen)
+    start = dict(short.sigmas), short.constants.copy()
+    long = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), free)
+    long.sigmas, long.constants = dict(start[0]), start[1].copy()
+    clock = None
+    long, long_value = L.fitted(long, trims=L.TRIMS[1:])
+    notes: list[Finding] = []
+    if effort.clock:
+        clock = profile_clock(short, seen, _stamps(seen, short, SHORT, count))
+    if clock is not None and clock.applied:
+        return _again(seen, clock, effort)
+    estimates, short, long = gates(short, short_value, long)
+    if clock is not None:
+        estimates.append(clock)
+    noise, lasts = chosen_noise(short, long)
+    alike = alike_residuals(long)
+    if lasts or alike > ALIKE:
+        two, _ = two_levels(seen, long, count)
+        noise |= two
+        notes.append(_lasting_note(short, long, alike))
+    return _made("sightings", seen, estimates, noise, notes, _data(short))
+
+
+def _again(seen: Seen, clock: Estimate, effort: Effort) -> Calibration:
+    """The calibration with the motion's clock put right."""
+    mended = Seen.of(calibrated(seen.log, Corrections(clock=rounded(clock.value))), seen.name, seen.sightings)
+    found = _range_and_bearing(mended, replace(effort, clock=False))
+    corrections = replace(found.corrections, clock=rounded(clock.value))
+    return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
+
+
+def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> Calibration:
+    begin, end = seen.span
+    rate = len(seen.sightings.times) / max(end - begin, 1e-9)
+    until = end - begin if effort.windows is None else min(effort.poses / max(rate, 1e-9), end - begin)
+    found = L.ranged(seen, until, seed=seed)
+    if found is None:
+        raise DataError("too few ranges to calibrate with", where=seen.log.name)
+    whole, half = found
+    estimates, whole, half = gates(whole, whole.objective(), half)
+    noise, lasts = chosen_noise(half, whole)
+    alike = alike_residuals(whole)
+    notes = []
+    ratio = next(e for e in estimates if e.name == "range_scale")
+    if ratio.applied:
+        text = "Which of ranges and wheels has the right metre cannot be told from this log: the wheels' is taken."
+        notes.append(Finding("", "calibrated", text))
+    if lasts or alike > ALIKE:
+        notes.append(_lasting_note(half, whole, alike))
+    return _made("ranges", seen, estimates, noise, notes, f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})")
+
+
+def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
+    """The constants of a smoothing, held against those of windows of another length; and both with none but those that
+    are applied.
+    """
+    out = []
+    first = s
+    sd = np.sqrt(np.diag(s.covariance))
+    for name in first.free:
+        i = CONSTANTS.index(name)
+        gain = math.nan
+        if abs(s.constants[i]) > SURE * sd[i]:
+            alone, alone_value = L.without(s, name)
+            gain = alone_value - value
+            if gain < 0.0:
+                s, value, sd = alone, alone_value, np.nan_to_num(np.sqrt(np.diag(alone.covariance)), nan=0.0)
+                out.append(_estimate(name, first, other, gain))
+                continue
+        out.append(_estimate(name, s, other, gain))
+    applied = tuple(e.name for e in out if e.applied)
+    if applied == first.free:
+        return out, s, other
+    left = []
+    for x in (s, other):
+        alone = x.copy(free=applied)
+        for name in set(first.free) - set(applied):
+            alone.constants[CONSTANTS.index(name)] = 0.0
+        alone.fit(budget=200, rounds=3)
+        left.append(alone)
+    again = [e if not e.applied else replace(e, **_values(e.name, *left)) for e in out]
+    return again, left[0], left[1]
+
+
+def _values(name: str, s: Smoothing, other: Smoothing) -> dict[str, float]:
+    i = CONSTANTS.index(name)
+    found = {"value": s.constants[i], "sigma": np.sqrt(s.covariance[i, i])}
+    found |= {"other": other.constants[i], "other_sigma": np.sqrt(other.covariance[i, i])}
+    return {k: float(v) for k, v in found.items()}
+
+
+def _estimate(name: str, s: Smoothing, other: Smoothing, gain: float) -> Estimate:
+    return Estimate(name=name, gain=float(gain), **_values(name, s, other)).gated()
+
+
+def chosen_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], bool]:
+    """The larger of two σ, the motion's as one model; and whether noise of either kind lasts."""
+    pairs = [(s, _typical(s)) for s in (short, long)]
+    heading = [_heading_variance(s, t) for s, t in pairs]
+    best = long if heading[1] >= heading[0] else short
+    noise = {k: best.sigmas[k] for k in ("heading_metre", "heading_radian", "heading_second")}
+    along = [s.sigmas["along_metre"] ** 2 * t[0] + s.sigmas["along_second"] ** 2 * t[2] for s, t in pairs]
+    best = long if along[1] >= along[0] else short
+    noise |= {k: best.sigmas[k] for k in ("along_metre", "along_second")}
+    noise["lateral_metre"] = max(short.sigmas["lateral_metre"], long.sigmas["lateral_metre"])
+    lasts = False
+    for k in ("range", "bearing"):
+        if k in short.fitted:
+            noise[f"{k}_sigma"] = max(short.sigmas[k], long.sigmas[k])
+            lasts |= long.sigmas[k] > LASTS * short.sigmas[k]
+    return noise, lasts
+
+
+def _typical(s: Smoothing) -> Array:
+    """Metres, radians and seconds of a typical step."""
+    steps = np.concatenate([w.steps[1:] for w in s.windows])
+    return np.array([steps[:, 4].mean(), np.abs(steps[:, 2]).mean(), steps[:, 3].mean()])
+
+
+def _heading_variance(s: Smoothing, step: Array) -> float:
+    v = [s.sigmas[k] ** 2 for k in ("heading_metre", "heading_radian", "heading_second")]
+    return float(v @ step)
+
+
+def alike_residuals(s: Smoothing) -> float:
+    """Correlation of residuals of one landmark from one sighting to the next, the larger of range and bearing."""
+    seen, _ = s.residuals()
+    products, squares = np.zeros(2), np.zeros(2)
+    for w, r in zip(s.windows, seen):
+        for l in np.unique(w.slots[:, 0]):
+            x = np.nan_to_num(r[w.slots[:, 0] == l])
+            if len(x) > 2:
+                products += (x[1:] * x[:-1]).sum(axis=0)
+                squares += (x**2).sum(axis=0) * (len(x) - 1) / len(x)
+    return float(np.max(products / np.maximum(squares, 1e-12)))
+
+
+def two_levels(seen: Seen, long: Smoothing, count: int | None) -> tuple[dict[str, float], Smoothing]:
+    """σ of a sighting that, taken for white, is as sure of a visit as one with a constant for each visit.
+
+    A visit of n sightings whose common error has σ_v tells its landmark's range to σ² / n + σ_v². A front end that
+    knows white noise alone is told the root of n times that.
+    """
+    s = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), long.free, visits=True)
+    for k in long.fitted:
+        s.sigmas[k] = long.sigmas[k]
+    s.constants = long.constants.copy()
+    s, _ = L.fitted(s, trims=L.TRIMS[1:], budget=300)
+    n = sightings_of_a_visit(s.windows)
+    out = {}
+    for k in ("range", "bearing"):
+        if f"visit_{k}" in s.fitted:
+            out[f"{k}_sigma"] = math.sqrt(s.sigmas[k] ** 2 + n * s.sigmas[f"visit_{k}"] ** 2)
+            out[f"{k}_white"], out[f"{k}_visit"] = s.sigmas[k], s.sigmas[f"visit_{k}"]
+    return out, s
+
+
+def sightings_of_a_visit(windows: Sequence[Window]) -> float:
+    """Sightings of the visit that a sighting, drawn at random, belongs to."""
+    n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
+    n = n[n > 0]
+    return float((n**2).sum() / max(n.sum(), 1))
+
+
+def profile_clock(s: Smoothing, seen: Seen, stamps: Sequence[Array]) -> Estimate:
+    """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
+
+    Parameters
+    ----------
+    s : Smoothing
+        Fitted without an offset.
+    stamps : sequence of (n,)
+        Of the poses of its windows.
+    """
+    period = seen.period
+    scores: dict[int, float] = {}
+
+    def score(k: int) -> float:
+        if k not in scores:
+            moved = L.at_shift(s, seen, stamps, k * 0.5 * period)
+            moved.settle(8)
+            moved.fit(budget=60, rounds=1)
+            scores[k] = moved.objective()
+        return scores[k]
+
+    best = min((0, 2, -2), key=score)
+    while True:
+        near = min((best - 2, best, best + 2), key=score)
+        if near == best or abs(near) > 40:
+            break
+        best = near
+    best = min((best - 1, best, best + 1), key=score)
+    a, b, c = score(best - 1), score(best), score(best + 1)
+    bend = max(a - 2.0 * b + c, 1e-6)
+    at = best + float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5))
+    # of a straight course every offset fits; noise of the records themselves blurs it by their spacing
+    sigma = max(0.5 * period / math.sqrt(bend), 0.1 * period)
+    return Estimate(
+        name="clock",
+        value=at * 0.5 * period,
+        sigma=sigma,
+        gain=score(0) - b,
+        other=at * 0.5 * period,
+        other_sigma=sigma,
+    ).gated()
+
+
+def _stamps(seen: Seen, s: Smoothing, seconds: float, count: int | None) -> list[Array]:
+    """Stamps of the poses of a smoothing's windows."""
+    at = {int(w.rows[0]): t for w, t in cut(seen, seconds, count)}
+    out = []
+    for w in s.windows:
+        # the windows kept their poses when sightings were trimmed; the first row may have gone
+        k = int(np.searchsorted(w.first, 0, side="right")) - 1
+        row = int(w.rows[0])
+        found = at.get(row)
+        if found is None or len(found) != len(w.poses):
+            found = next(t for r, t in sorted(at.items(), reverse=True) if r <= row and len(t) == len(w.poses))
+        out.append(found)
+        del k
+    return out
+
+
+def _count(seen: Seen, seconds: float, effort: Effort) -> int | None:
+    """Windows that keep the number of poses within bounds."""
+    if effort.windows is None:
+        return None
+    rate = len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
+    return int(np.clip(effort.poses / max(rate * seconds, 1.0), 6, effort.windows))
+
+
+def _enough(s: Smoothing, seen: Seen) -> None:
+    n = sum(len(w.rows) for w in s.windows)
+    if n < 50:
+        raise DataError("too few sightings of landmarks that are seen twice", where=seen.log.name, got=n, wanted=50)
+
+
+def _data(s: Smoothing) -> str:
+    n = sum(len(w.rows) for w in s.windows)
+    return f"{len(s.windows)} windows with {n} sightings"
+
+
+def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
+    r = [s.sigmas["range"] for s in (short, long)]
+    text = f"Range errors last (sigma {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones; residuals of one "
+    text += f"landmark are alike by {alike:.2f}): what is seen from one side again and again is less sure than it looks."
+    return Finding("look", "errors-last", text)
+
+
+def _made(
+    kind: str, seen: Seen, estimates: list[Estimate], noise: dict[str, float], notes: list[Finding], data: str
+) -> Calibration:
+    applied = {e.name: e.value for e in estimates if e.applied}
+    values: dict[str, float] = {}
+    for name, value in applied.items():
+        if name == "distance_scale":
+            values[name] = rounded(math.exp(value))
+        elif name in ("range_scale", "turn_scale"):
+            values[name] = rounded(1.0 + value)
+        else:
+            values[name] = rounded(value)
+    names = Corrections.__dataclass_fields__
+    values |= {k: rounded(v) for k, v in noise.items() if k in names}
+    return Calibration(
+        kind=kind,
+        corrections=Corrections(**values),
+        estimates=tuple(estimates),
+        noise={k: float(v) for k, v in noise.items()},
+        notes=tuple(notes),
+        data=data,
+    )
+
+
+__all__ = ["FULL", "K", "QUICK", "Effort", "calibrate_sightings"]

@@ -1,0 +1,337 @@
+"""One smoothing of a log in windows, and the likelihood of its noise with poses and landmarks integrated out.
+
+Every window is a chain of poses with landmarks of its own; constants (biases, scales, angles) are shared by all. With
+Laplace's approximation the negative log likelihood of the standard deviations is
+
+    ½ χ² + ½ ln det H + Σ ln σ
+
+at the optimum: H is block-tridiagonal in the poses, bordered by landmarks, visits and constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from graphslam.calibrate import kernels as K
+from graphslam.core.geometry import Array
+
+Ints = npt.NDArray[np.int64]
+CONSTANTS = (
+    "yaw_bias",
+    "distance_scale",
+    "turn_per_metre",
+    "turn_scale",
+    "range_scale",
+    "range_offset",
+    "sensor_yaw",
+)
+"""In the order of the kernels: rad/s, ln, rad/m, rad/rad, share, m, rad."""
+PRIOR = np.array([0.1, 0.2, 0.1, 0.2, 0.2, 0.5, 0.2])
+"""σ of each before the log was looked at."""
+SIGMAS = (
+    "along_metre",
+    "along_second",
+    "lateral_metre",
+    "heading_metre",
+    "heading_radian",
+    "heading_second",
+    "range",
+    "bearing",
+    "visit_range",
+    "visit_bearing",
+    "rate_sigma",
+    "rate_time",
+    "speed_sigma",
+    "speed_time",
+    "floor_position",
+    "floor_heading",
+)
+"""In the order of the kernels: m/√m, m/√s, m/√m, rad/√m, rad/√rad, rad/√s, m, rad, m, rad, rad/s, s, m/s, s, m, rad."""
+START = {
+    **{"along_metre": 0.05, "along_second": 0.02, "lateral_metre": 0.03, "heading_metre": 0.01},
+    **{"heading_radian": 0.02, "heading_second": 0.005, "range": 0.2, "bearing": 0.02},
+    **{"visit_range": 0.1, "visit_bearing": 0.01, "rate_sigma": 0.03, "rate_time": 5.0},
+    **{"speed_sigma": 0.05, "speed_time": 5.0, "floor_position": 1e-3, "floor_heading": 1e-4},
+}
+WIDTH = 2.0
+"""σ of the logarithm of a standard deviation before the log was looked at, about its start."""
+
+
+@dataclass(slots=True)
+class Window:
+    """A stretch of the log with a frame and landmarks of its own.
+
+    Parameters
+    ----------
+    steps : (n, 8)
+        dx, dy, turn, seconds in motion, metres, from the pose before; row 0 is zero. Then variances that stand in place
+        of the model's, where they are above 0.
+    first : (n + 1,) int64
+        Sightings of pose k are rows ``first[k]:first[k + 1]``.
+    sightings : (q, 2)
+        Range and bearing; NaN where there is no bearing.
+    slots : (q, 2) int64
+        Landmark, and visit or -1, as a row of ``nuisance``.
+    kinds : (M,) int64
+        0 a landmark, 1 a visit.
+    rows : (q,) int64
+        Of the sightings in the stream.
+    poses : (n, 3 or 5)
+    nuisance : (M, 2)
+    """
+
+    steps: Array
+    first: Ints
+    sightings: Array
+    slots: Ints
+    kinds: Ints
+    rows: Ints
+    poses: Array
+    nuisance: Array
+
+
+@dataclass(slots=True)
+class Smoothing:
+    """Windows, their states, and what is shared by all.
+
+    Parameters
+    ----------
+    windows : list of Window
+    sensor : (3,)
+        Sensor in the base.
+    free : tuple of str
+        Constants that are estimated; the others are held.
+    constants : (7,)
+    sigmas : mapping of str to float
+        All of :data:`SIGMAS`.
+    fitted : tuple of str
+        Those that are estimated.
+    """
+
+    windows: list[Window]
+    sensor: Array
+    free: tuple[str, ...]
+    fitted: tuple[str, ...]
+    constants: Array = field(default_factory=lambda: np.zeros(K.CONSTANTS))
+    sigmas: dict[str, float] = field(default_factory=lambda: dict(START))
+    covariance: Array = field(default_factory=lambda: np.full((K.CONSTANTS, K.CONSTANTS), np.nan))
+    evaluations: int = 0
+    _memory: list[tuple[Array, ...]] = field(default_factory=list)
+
+    def copy(self, **changes: object) -> Smoothing:
+        """The same state, to be changed on its own."""
+        windows = [replace(w, poses=w.poses.copy(), nuisance=w.nuisance.copy()) for w in self.windows]
+        return replace(
+            self,
+            **{"windows": windows, "constants": self.constants.copy(), "sigmas": dict(self.sigmas)} | changes,  # type: ignore[arg-type]
+            _memory=[],
+        )
+
+    @property
+    def _index(self) -> Ints:
+        return np.array([CONSTANTS.index(c) for c in self.free], dtype=np.int64)
+
+    def _parameters(self) -> Array:
+        return np.array([self.sigmas[s] for s in SIGMAS])
+
+    def _buffers(self) -> list[tuple[Array, ...]]:
+        if len(self._memory) != len(self.windows):
+            self._memory = []
+            for w in self.windows:
+                (n, D), m = w.poses.shape, K.HEAD + 2 * len(w.nuisance)
+                shapes = ((n, D, D), (n, D, D), (n, D, m), (m, m), (6,))
+                self._memory.append(tuple(np.zeros(s) for s in shapes))
+        return self._memory
+
+    def _eliminated(self, p: Array, damping: float = 0.0) -> tuple[float, float, Array, Array]:
+        """ln det, Σ ln σ, information of the constants ``(HEAD, HEAD)``, and χ² by class."""
+        logdet, volume, S, chi2 = 0.0, 0.0, np.zeros((K.HEAD, K.HEAD)), np.zeros(6)
+        for w, buffers in zip(self.windows, self._buffers()):
+            a, b = K.eliminate(
+                *(w.poses, w.nuisance, self.constants, w.steps, w.first, w.sightings, w.slots, w.kinds),
+                *(self.sensor, p, damping, *buffers),
+            )
+            logdet, volume = logdet + a, volume + b
+            S += buffers[3][: K.HEAD, : K.HEAD]
+            chi2 += buffers[4]
+        self.evaluations += 1
+        return logdet, volume, np.triu(S) + np.triu(S, 1).T, chi2
+
+    def _with_prior(self, S: Array) -> tuple[Array, Array, float]:
+        """Information and right side of the free constants, and χ² with their prior."""
+        i = self._index
+        W = 1.0 / PRIOR[i] ** 2
+        H = S[np.ix_(i, i)] + np.diag(W)
+        return H, S[i, K.RHS] - W * self.constants[i], float(S[K.RHS, K.RHS] + np.sum(W * self.constants[i] ** 2))
+
+    def objective(self, sigmas: Mapping[str, float] | None = None) -> float:
+        """Negative log likelihood at the optimum of the problem linearised where the states are [nats]."""
+        if sigmas is not None:
+            kept, self.sigmas = self.sigmas, {**self.sigmas, **sigmas}
+            try:
+                return self.objective()
+            finally:
+                self.sigmas = kept
+        logdet, volume, S, _ = self._eliminated(self._parameters())
+        H, h, chi2 = self._with_prior(S)
+        if len(h):
+            chi2 -= float(h @ np.linalg.solve(H, h))
+            logdet += float(np.linalg.slogdet(H)[1])
+        i = self._index
+        value = 0.5 * chi2 + 0.5 * logdet + volume + float(np.sum(np.log(PRIOR[i])))
+        value += sum(0.5 * (np.log(self.sigmas[s] / START[s]) / WIDTH) ** 2 for s in self.fitted)
+        return value if np.isfinite(value) else 1e12
+
+    def total(self) -> float:
+        """χ² of all residuals and priors where the states are."""
+        _, _, _, chi2 = self._eliminated(self._parameters())
+        i = self._index
+        return float(chi2.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
+
+    def settle(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
+        """Gauss-Newton with Levenberg's damping where a step fails; returns χ²."""
+        p, damping = self._parameters(), 0.0
+        i = self._index
+        value = np.inf
+        for _ in range(iterations):
+            logdet, _, S, parts = self._eliminated(p, damping)
+            now = float(parts.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
+            if not np.isfinite(logdet) or not np.isfinite(now):
+                damping = max(10.0 * damping, 1e-4)
+                if damping > 1e6:
+                    break
+                continue
+            H, h, _ = self._with_prior(S)
+            step = np.zeros(K.CONSTANTS)
+            step[i] = np.linalg.solve(H, h) if len(i) else 0.0
+            kept = [(w.poses, w.nuisance) for w in self.windows], self.constants
+            for w, (L, X, C, SS, _) in zip(self.windows, self._buffers()):
+                dp, dn = np.zeros_like(w.poses), np.zeros_like(w.nuisance)
+                K.substitute(L, X, C, SS, step, dp, dn)
+                w.poses, w.nuisance = w.poses + dp, w.nuisance + dn
+            self.constants = self.constants + step
+            value = self.total()
+            if not value <= now + 1e-9 * now + 1e-9:
+                for w, (poses, nuisance) in zip(self.windows, kept[0]):
+                    w.poses, w.nuisance = poses, nuisance
+                self.constants = kept[1]
+                damping, value = max(10.0 * damping, 1e-4), now
+                if damping > 1e6:
+                    break
+                continue
+            damping = 0.1 * damping if damping > 1e-6 else 0.0
+            if now - value < tolerance * max(1.0, 1e-3 * now):
+                break
+        return value
+
+    def fit(self, *, rounds: int = 4, budget: int = 400, tolerance: float = 0.05) -> float:
+        """Standard deviations of greatest likelihood, states and constants with them; returns the objective.
+
+        The search is that of the problem linearised at the states, which then settle under what it found; a few
+        rounds of that do.
+        """
+        self.settle()
+        names = list(self.fitted)
+        value = self.objective()
+        for _ in range(rounds if names else 0):
+            x0 = np.log([self.sigmas[s] for s in names])
+
+            def negative(x: Array) -> float:
+                return self.objective(dict(zip(names, np.exp(x).tolist())))
+
+            found = minimize(
+                negative,
+                x0,
+                method="L-BFGS-B",
+                bounds=[(a - 3.0, a + 3.0) for a in x0],
+                options={
+                    "eps": 1e-3,
+                    "ftol": tolerance / max(abs(value), 1.0),
+                    "maxfun": budget,
+                    "maxls": 10,
+                },
+            )
+            self.sigmas.update(dict(zip(names, np.exp(found.x).tolist())))
+            self.settle(6)
+            before, value = value, self.objective()
+            if before - value < 10.0 * tolerance and float(np.max(np.abs(found.x - x0))) < 0.1:
+                break
+        self._constants_covariance()
+        return value
+
+    def _constants_covariance(self) -> None:
+        i = self._index
+        H, _, _ = self._with_prior(self._eliminated(self._parameters())[2])
+        self.covariance = np.full((K.CONSTANTS, K.CONSTANTS), np.nan)
+        if len(i):
+            self.covariance[np.ix_(i, i)] = np.linalg.inv(H)
+
+    def residuals(self) -> tuple[list[Array], list[Array]]:
+        """Whitened residuals ``(q, 2)`` of the sightings of each window, NaN without a bearing; and steps ``(n, 3)``."""
+        g, s = self.constants, self.sigmas
+        seen, moved = [], []
+        for w in self.windows:
+            k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))
+            x = w.poses[k]
+            c, si = np.cos(x[:, 2]), np.sin(x[:, 2])
+            o = np.column_stack([c * self.sensor[0] - si * self.sensor[1], si * self.sensor[0] + c * self.sensor[1]])
+            d = w.nuisance[w.slots[:, 0]] - x[:, :2] - o
+            visit = np.where(w.slots[:, 1:] >= 0, w.nuisance[w.slots[:, 1]], 0.0)
+            r = (1 + g[K.RANGE_SCALE]) * np.hypot(d[:, 0], d[:, 1]) + g[K.RANGE_OFFSET] + visit[:, 0]
+            b = np.arctan2(d[:, 1], d[:, 0]) - x[:, 2] - self.sensor[2] - g[K.SENSOR_YAW] + visit[:, 1]
+            b = np.pi - np.mod(np.pi - (b - w.sightings[:, 1]), 2 * np.pi)
+            seen.append(np.column_stack([(r - w.sightings[:, 0]) / s["range"], b / s["bearing"]]))
+            u = w.steps[1:]
+            less = g[K.YAW_BIAS] * u[:, 3] + g[K.TURN_PER_METRE] * u[:, 4] + g[K.TURN_SCALE] * u[:, 2]
+            if w.poses.shape[1] == 5:
+                less = less + w.poses[:-1, 3] * u[:, 3]
+            e = np.diff(w.poses[:, 2]) - u[:, 2] + less
+            v = s["heading_metre"] ** 2 * u[:, 4] + s["heading_radian"] ** 2 * np.abs(u[:, 2])
+            v = v + s["heading_second"] ** 2 * u[:, 3] + s["floor_heading"] ** 2
+            moved.append((np.pi - np.mod(np.pi - e, 2 * np.pi)) / np.sqrt(v))
+        return seen, moved
+
+
+def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) -> Smoothing:
+    """The smoothing without some of its sightings; what is seen less than twice then is no landmark."""
+    windows = []
+    for w, good in zip(smoothing.windows, keep):
+        windows.append(rebuilt(w, good))
+    return smoothing.copy(windows=[w for w in windows if len(w.sightings) > 3])
+
+
+def rebuilt(w: Window, good: npt.NDArray[np.bool_]) -> Window:
+    """A window with some of its sightings, nuisances renumbered in the order in which they are seen first."""
+    good = good.copy()
+    landmark = w.slots[:, 0]
+    least = 2 if np.isfinite(w.sightings[:, 1]).any() else 4
+    counts = np.bincount(landmark[good], minlength=len(w.nuisance))
+    good &= counts[landmark] >= least
+    k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))[good]
+    slots, order = numbered(w.slots[good])
+    return Window(
+        steps=w.steps,
+        first=np.searchsorted(k, np.arange(len(w.poses) + 1)).astype(np.int64),
+        sightings=np.ascontiguousarray(w.sightings[good]),
+        slots=slots,
+        kinds=np.ascontiguousarray(w.kinds[order]),
+        rows=w.rows[good],
+        poses=w.poses.copy(),
+        nuisance=np.ascontiguousarray(w.nuisance[order]),
+    )
+
+
+def numbered(slots: Ints) -> tuple[Ints, Ints]:
+    """Slots ``(q, 2)`` numbered in the order of their first sighting, and the old number of each new one."""
+    flat = slots.ravel()
+    names, first, inverse = np.unique(flat, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    order = order[names[order] >= 0]
+    rank = np.full(len(names), -1, dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return np.ascontiguousarray(rank[inverse].reshape(slots.shape)), names[order].astype(np.int64)

@@ -1,0 +1,231 @@
+"""Windows of a log: its motion between the stamps of sightings, and tracks of landmarks that live in one window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.calibrate import kernels as K
+from graphslam.calibrate.smoothing import Ints, Window, numbered, rebuilt
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, se2_compose, se2_transform
+from graphslam.core.log import SensorLog
+from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
+from graphslam.frontends.odometry.motion import Motion, MotionNoise, dead_reckoning, motion_stream
+
+LONGEST = 1.0
+"""A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
+VISIT = 5.0
+"""A landmark that was out of sight for longer is visited anew [s]."""
+_HOLD = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The motion and the sightings of a log, ready to be cut into windows.
+
+    Parameters
+    ----------
+    log : SensorLog
+    name : str
+        Of the stream of sightings.
+    sightings : LandmarkObservations
+    clock : Array
+        Stamps of the motion's records, and at them the seconds in motion and the metres since the first (3, r).
+    """
+
+    log: SensorLog
+    name: str
+    sightings: LandmarkObservations
+    clock: Array
+
+    @classmethod
+    def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> Seen:
+        """Of a log whose sightings are in the stream ``name``, or were detected in it."""
+        _, motion = motion_stream(log)
+        return cls(log, name, sightings, driven(motion))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Over which there is motion [s]."""
+        return float(self.clock[0, 0]), float(self.clock[0, -1])
+
+    @property
+    def period(self) -> float:
+        """Usual time between records of the motion [s]."""
+        return float(np.median(np.diff(self.clock[0])))
+
+    def steps(self, stamps: Array, shift: float = 0.0) -> Array:
+        """Motion between stamps ``(n, 8)``: dx, dy, turn, seconds in motion, metres, no variances; row 0 is zero.
+
+        Parameters
+        ----------
+        stamps : (n,)
+            Of the sightings.
+        shift : float
+            The motion's clock is ahead of that of the sightings by it [s].
+        """
+        t = np.asarray(stamps) + shift
+        odometry, _ = dead_reckoning(self.log, t, MotionNoise(), hold=_HOLD + abs(shift))
+        out = np.zeros((len(t), 8))
+        out[1:, :3] = odometry.increments[1:]
+        for column in (1, 2):
+            out[1:, 2 + column] = np.diff(np.interp(t, self.clock[0], self.clock[column]))
+        return out
+
+    def breaks(self) -> Array:
+        """Stamps after which the motion has a gap, and those at which it ends ``(k, 2)``."""
+        dt = np.diff(self.clock[0])
+        k = np.flatnonzero(dt > max(3.0 * float(np.median(dt)), LONGEST))
+        return np.column_stack([self.clock[0, k], self.clock[0, k + 1]])
+
+
+def driven(motion: Motion) -> Array:
+    """Stamps of the motion's records, seconds in motion and metres driven until each ``(3, r)``."""
+    t = motion.times
+    dt = np.diff(t)
+    if isinstance(motion, Odometry):
+        if motion.increments.shape[1] != 3:
+            raise DataError("the odometry is not planar", got=motion.increments.shape, wanted="(n, 3)")
+        metres = np.hypot(motion.increments[1:, 0], motion.increments[1:, 1])
+        turned = np.abs(motion.increments[1:, 2])
+    else:
+        metres = np.abs(motion.speed[:-1]) * dt
+        rate = motion.yaw_rate if isinstance(motion, VelocityControls) else motion.speed * motion.steering
+        turned = np.abs(rate[:-1]) * dt
+    moved = (metres > 1e-3 * dt) | (turned > 1e-3 * dt)
+    total = [np.concatenate([[0.0], np.cumsum(x)]) for x in (dt * moved, metres)]
+    return np.stack([t, *total])
+
+
+def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = False) -> list[tuple[Window, Array]]:
+    """Windows of a length, and the stamps of their poses.
+
+    Parameters
+    ----------
+    seen : Seen
+    seconds : float
+    count : int, optional
+        At most so many, spread over the log; all by default.
+    visits : bool
+        With a constant for each visit of a landmark.
+    """
+    s, (begin, end) = seen.sightings, seen.span
+    used = np.flatnonzero((np.diff(s.offsets) > 0) & (s.times >= begin - _HOLD) & (s.times <= end + _HOLD))
+    if len(used) < 5:
+        return []
+    t = s.times[used]
+    seconds = min(seconds, float(t[-1] - t[0]))
+    gaps = seen.breaks()
+    piece = np.searchsorted(gaps[:, 0], t) if len(gaps) else np.zeros(len(t), dtype=np.int64)
+    starts, k = [], 0
+    while k < len(t):
+        last = int(np.searchsorted(t, t[k] + seconds, side="right"))
+        last = min(last, int(np.searchsorted(piece, piece[k], side="right")))
+        if last - k >= 5 and t[last - 1] - t[k] > 0.3 * seconds:
+            starts.append((k, last))
+        k = max(last, k + 1)
+    metres = np.interp(t, seen.clock[0], seen.clock[2])
+    if count is not None and len(starts) > count:
+        moved = [i for i, (a, b) in enumerate(starts) if metres[b - 1] - metres[a] > 0.1]
+        moved = moved or list(range(len(starts)))
+        chosen = np.unique(np.linspace(0, len(moved) - 1, min(count, len(moved))).round().astype(int))
+        starts = [starts[moved[i]] for i in chosen]
+    out = []
+    for a, b in starts:
+        scans = used[a:b]
+        made = make_window(seen, scans, visits=visits)
+        if made is not None:
+            out.append((made, s.times[scans]))
+    return out
+
+
+def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
+    """Window of these scans, landmarks where the odometry puts them; None where nothing is seen twice."""
+    s = seen.sightings
+    steps = seen.steps(s.times[scans])
+    poses = np.zeros((len(scans), 3))
+    K.compose_steps(steps, np.zeros(3), poses)
+    rows = np.concatenate([np.arange(s.offsets[k], s.offsets[k + 1]) for k in scans])
+    k = np.repeat(np.arange(len(scans)), np.diff(s.offsets)[scans])
+    bearing = s.has_bearing[rows]
+    z = np.column_stack([s.ranges[rows], np.where(bearing, s.bearings[rows], np.nan)])
+    points = points_of(z, se2_compose(poses, np.broadcast_to(s.T_base_sensor, poses.shape))[k])
+    if s.ids is not None and np.any(s.ids[rows] >= 0):
+        track = s.ids[rows].astype(np.int64)
+    else:
+        track = follow(points, k)
+    good = track >= 0
+    names, landmark = np.unique(track[good], return_inverse=True)
+    rows, k, z, points = rows[good], k[good], z[good], points[good]
+    if not len(rows):
+        return None
+    visit = visits_of(landmark, s.times[scans][k]) + len(names) if visits else np.full(len(rows), -1)
+    slots, order = numbered(np.column_stack([landmark, visit]).astype(np.int64))
+    kinds = (order >= len(names)).astype(np.int64)
+    nuisance = np.zeros((len(order), 2))
+    for j in np.flatnonzero(kinds == 0):
+        mine = points[landmark == order[j]]
+        nuisance[j] = np.median(mine[np.isfinite(mine[:, 0])], axis=0) if np.isfinite(mine[:, 0]).any() else np.nan
+    w = Window(
+        steps=steps,
+        first=np.searchsorted(k, np.arange(len(scans) + 1)).astype(np.int64),
+        sightings=z,
+        slots=slots,
+        kinds=kinds,
+        rows=rows,
+        poses=poses,
+        nuisance=nuisance,
+    )
+    w = rebuilt(w, np.ones(len(rows), dtype=np.bool_))
+    return w if len(w.sightings) > 3 else None
+
+
+def points_of(z: Array, sensor: Array) -> Array:
+    """Where sightings ``(q, 2)`` put their landmarks, from sensors ``(q, 3)``; NaN without a bearing."""
+    local = np.column_stack([z[:, 0] * np.cos(z[:, 1]), z[:, 0] * np.sin(z[:, 1])])
+    return np.asarray(se2_transform(sensor, local))
+
+
+def visits_of(landmark: Ints, times: Array) -> Ints:
+    """Number of the visit of each sighting ``(q,)``, sightings in order of time."""
+    out = np.full(len(landmark), -1, dtype=np.int64)
+    count = 0
+    for l in np.unique(landmark):
+        mine = np.flatnonzero(landmark == l)
+        step = np.concatenate([[0], np.cumsum(np.diff(times[mine]) > VISIT)])
+        out[mine] = count + step
+        count += int(step[-1]) + 1
+    return out
+
+
+def follow(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, lost: int = 10) -> Ints:
+    """Tracks ``(q,)`` of points seen from poses ``k``: nearest, mutual, and clearly nearer than the second; -1: none.
+
+    A landmark stands where it was seen last by the odometry, so that a track does not need the odometry to be right for
+    longer than from one sighting to the next.
+    """
+    track = np.full(len(points), -1, dtype=np.int64)
+    place = np.zeros((0, 2))
+    last = np.zeros(0, dtype=np.int64)
+    for pose in np.unique(k):
+        rows = np.flatnonzero(k == pose)
+        rows = rows[np.isfinite(points[rows, 0])]
+        live = np.flatnonzero(pose - last <= lost)
+        new = rows
+        if len(live) and len(rows):
+            d = np.linalg.norm(points[rows, None] - place[live][None], axis=2)
+            best, mine = d.argmin(axis=1), d.argmin(axis=0)
+            second = np.partition(np.column_stack([d, np.full((len(rows), 2), np.inf)]), 1, axis=1)[:, 1]
+            i = np.arange(len(rows))
+            mutual = (mine[best] == i) & (d[i, best] < gate) & (second > ratio * d[i, best])
+            track[rows[mutual]] = live[best[mutual]]
+            place[live[best[mutual]]] = points[rows[mutual]]
+            last[live[best[mutual]]] = pose
+            new = rows[~mutual & (d.min(axis=1) > gate)]
+        track[new] = len(place) + np.arange(len(new))
+        place = np.concatenate([place, points[new]])
+        last = np.concatenate([last, np.full(len(new), pose, dtype=np.int64)])
+    return track
+

@@ -1,0 +1,63 @@
+"""The compiled smoothing against a slow twin, and what it finds in windows whose noise is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.calibrate import kernels as K
+from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window, numbered
+from tests.reference.slow_smoothing import objective_and_step, residuals, states_of
+
+
+def window(rng, n=7, landmarks=4, states=3, visits=True, bearings=True):
+    """A window with everything in it, its states off their optimum."""
+    steps = np.column_stack([rng.normal(0.5, 0.1, n), rng.normal(0, 0.05, n), rng.normal(0, 0.2, n)])
+    steps = np.column_stack([steps, rng.uniform(0.1, 0.3, n), np.hypot(steps[:, 0], steps[:, 1]), np.zeros((n, 3))])
+    steps[n - 1, 5:] = 0.01, 0.02, 0.03
+    poses = np.zeros((n, states))
+    K.compose_steps(steps, np.array([0.3, -0.2, 0.1]), poses)
+    poses[1:] += 0.03 * rng.standard_normal((n - 1, states))
+    places = rng.uniform(-4, 4, (landmarks, 2)) + [2.0, 0.0]
+    slots, seen, first = [], [], [0]
+    for k in range(n):
+        for l in range(landmarks):
+            if rng.random() < 0.7:
+                d = places[l] - poses[k, :2]
+                seen.append([np.hypot(*d) + rng.normal(0, 0.1), np.arctan2(d[1], d[0]) - poses[k, 2]])
+                slots.append([l, landmarks + 2 * l + (k > n // 2) if visits else -1])
+        first.append(len(seen))
+    seen = np.array(seen)
+    if not bearings:
+        seen[::2, 1] = np.nan
+    slots, order = numbered(np.array(slots, dtype=np.int64))
+    kinds = (order >= landmarks).astype(np.int64)
+    nuisance = np.where(kinds[:, None] == 1, 0.02 * rng.standard_normal((len(order), 2)), 0.0)
+    nuisance[kinds == 0] = places[order[kinds == 0]] + 0.1 * rng.standard_normal((int((kinds == 0).sum()), 2))
+    rows = np.arange(len(seen))
+    return Window(steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance)
+
+
+@pytest.mark.parametrize(("states", "visits", "bearings"), [(3, False, True), (3, True, False), (5, True, True)])
+def test_likelihood_and_step_are_those_of_dense_algebra(states, visits, bearings):
+    rng = np.random.default_rng(4)
+    windows = [window(rng, states=states, visits=visits, bearings=bearings) for _ in range(2)]
+    s = Smoothing(windows, np.array([0.4, -0.1, 0.2]), CONSTANTS, ("range", "heading_metre"))
+    s.constants[:] = 0.02 * rng.standard_normal(7)
+    s.sigmas["range"] = 0.31
+    wanted, step = objective_and_step(s)
+    assert s.objective() == pytest.approx(wanted, abs=1e-3)
+    before = states_of(s)
+    moved = s.copy()
+    moved.settle(iterations=1)
+    np.testing.assert_allclose(states_of(moved) - before, step, atol=2e-5)
+
+
+def test_settled_states_are_a_minimum_of_the_residuals():
+    rng = np.random.default_rng(5)
+    s = Smoothing([window(rng) for _ in range(2)], np.zeros(3), ("yaw_bias", "range_offset"), ())
+    value = s.settle()
+    x = states_of(s)
+    assert value == pytest.approx(float(np.sum(residuals(s, x)[0] ** 2)), rel=1e-9)
+    for _ in range(20):
+        assert np.sum(residuals(s, x + 1e-3 * rng.standard_normal(len(x)))[0] ** 2) > value
