@@ -25,7 +25,7 @@ _VERBS = {
     **dict.fromkeys(("load", "simulate", "run", "open_run", "local_maps", "first_particles"), "graphslam.app.verbs"),
     **dict.fromkeys(("compare", "join_submaps", "solve_file"), "graphslam.app.verbs"),
     **dict.fromkeys(("study", "open_study", "find_study"), "graphslam.app.verbs"),
-    "refine_path": "graphslam.app.verbs",
+    **dict.fromkeys(("refine_path", "calibrate_log"), "graphslam.app.verbs"),
     "merge": "graphslam.app.sessions.merge",
     "localise": "graphslam.app.sessions.localise",
     "export": "graphslam.app.export",

@@ -10,13 +10,14 @@ import pandas as pd
 
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
+from graphslam.app.run.calibration import calibrate_log as calibrate_log
 from graphslam.app.run.front_ends import front_end_names, recommended
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import open_run as open_run
-from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.pipeline import run as run
 from graphslam.app.run.run import Run
+from graphslam.app.run.source import load_log_source
 from graphslam.app.studies.definition import find_study as find_study
 from graphslam.app.studies.study import open_study as open_study
 from graphslam.app.studies.study import study as study
@@ -39,7 +40,17 @@ from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 
 __all__ = [
-    *("compare", "find_study", "first_particles", "front_ends", "join_submaps", "joiners", "load", "local_maps"),
+    *(
+        "calibrate_log",
+        "compare",
+        "find_study",
+        "first_particles",
+        "front_ends",
+        "join_submaps",
+        "joiners",
+        "load",
+        "local_maps",
+    ),
     *("open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
 ]
 

@@ -12,7 +12,9 @@ from graphslam.core.log import SensorLog
 from graphslam.frontends.landmarks.prepare import landmark_stream
 
 
-def calibrate_log(log: SensorLog, kind: str, effort: Effort = QUICK, config: Any = None, *, seed: int = 0) -> Calibration:
+def calibrate_streams(
+    log: SensorLog, kind: str, effort: Effort = QUICK, config: Any = None, *, seed: int = 0
+) -> Calibration:
     """What a log says of its own noise and lasting errors, without truth.
 
     Parameters

@@ -96,8 +96,8 @@ class CalibrateConfig:
     """Noise and lasting errors from the log itself, before a run."""
 
     use: Literal["auto", "always", "none"] = "auto"
-    """``auto``: where no preset was made for this very set; ``always``; ``none``. Figures that are given stand, and then
-    nothing is estimated."""
+    """``auto``: where no preset was made for this very set; ``always``; ``none``. Figures that are given stand, and
+    then nothing is estimated."""
     given: Corrections | None = None
     """Figures to be applied, as ``graphslam calibrate`` writes them."""
     budget: float = 1.0
@@ -119,7 +119,9 @@ def calibrated(log: SensorLog, c: Corrections) -> SensorLog:
     if c.neutral:
         return log
     name, motion = motion_stream(log)
-    streams: dict[str, Stream] = {name: corrected_motion(motion, c)}  # first: of two odometries it is the one that counts
+    streams: dict[str, Stream] = {
+        name: corrected_motion(motion, c)
+    }  # first: of two odometries it is the one that counts
     for other, stream in log.streams.items():
         if other != name:
             streams[other] = corrected_sightings(stream, c) if isinstance(stream, LandmarkObservations) else stream

@@ -110,6 +110,10 @@ class Calibration:
             out.append(Finding("", "calibrated", f"Noise from {self.data}: {noise_in_words(self.noise)}."))
         return [*out, *self.notes]
 
+    def config(self) -> dict[str, Any]:
+        """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""
+        return {"use": "none", "given": as_dict(self.corrections)}
+
     def as_dict(self) -> dict[str, Any]:
         """JSON object."""
         return {

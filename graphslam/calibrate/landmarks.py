@@ -29,7 +29,7 @@ def smoothing_of(windows: Sequence[Window], sensor: Array, free: Sequence[str], 
 
 def sighted(seen: Seen, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False) -> Smoothing:
     """Smoothing of windows of range and bearing, where the odometry starts it."""
-    windows = [w for w, _ in cut(seen, seconds, count, visits=visits)]
+    windows = cut(seen, seconds, count, visits=visits)
     return smoothing_of(windows, seen.sightings.T_base_sensor, free, visits=visits)
 
 
@@ -85,11 +85,9 @@ def ranged(
     free = ("yaw_bias", "range_scale", "range_offset")
     rng = SeedTree(seed).child("calibrate", "ranges").generator()
     s, (begin, _) = seen.sightings, seen.span
-    (whole,) = [w for w, _ in cut(seen, 1e9)][:1] or (None,)
+    (whole,) = cut(seen, 1e9)[:1] or (None,)
     if whole is None:
         return None
-    scans = whole.rows[np.minimum(whole.first[:-1], len(whole.rows) - 1)]
-    times = s.times[np.searchsorted(s.offsets, scans, side="right") - 1]
     ends = [until]
     while ends[0] > 1.5 * first:
         ends.insert(0, 0.5 * ends[0])
@@ -98,7 +96,7 @@ def ranged(
     poses = np.zeros((0, 3))
     made: list[Smoothing] = []
     for end in ends:  # a bias of a third of a degree a second is half a turn over the whole log
-        n = int(np.searchsorted(times, begin + end, side="right"))
+        n = int(np.searchsorted(whole.times, begin + end, side="right"))
         if n < 20:
             continue
         tries: list[tuple[float, Smoothing]] = []
@@ -158,6 +156,7 @@ def _part(whole: Window, path: Array, places: dict[int, Array], rng: np.random.G
         at, r = path[k[mine], :2], whole.sightings[mine, 0]
         nuisance[j] = _anywhere(at, r, rng)
     return Window(
+        times=whole.times[:n],
         steps=whole.steps[:n],
         first=whole.first[: n + 1],
         sightings=whole.sightings[:q],
@@ -188,7 +187,7 @@ def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
     return best if rng.random() < 0.7 else other
 
 
-def at_shift(s: Smoothing, seen: Seen, stamps: Sequence[Array], shift: float) -> Smoothing:
+def at_shift(s: Smoothing, seen: Seen, shift: float) -> Smoothing:
     """The smoothing with its motion cut at stamps that are later by ``shift``."""
-    windows = [replace(w, steps=seen.steps(t, shift)) for w, t in zip(s.windows, stamps)]
+    windows = [replace(w, steps=seen.steps(w.times, shift)) for w in s.windows]
     return s.copy(windows=windows)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from graphslam.calibrate import kernels as K
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.corrections import Corrections, calibrated
 from graphslam.calibrate.estimate import ALIKE, LASTS, SURE, Calibration, Estimate, rounded
 from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window
-from graphslam.calibrate.windows import Seen, cut
+from graphslam.calibrate.windows import Seen
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
@@ -32,14 +32,14 @@ class Effort:
     """Short windows at most; a quarter as many long ones. None: all of the log."""
     poses: int = 2000
     """Poses of all short windows together; of the one stretch of ranges alone."""
-    clock: bool = False
+    clock: bool = True
     """Is the offset of the clocks looked for?"""
     lasting: bool = False
     """Are errors of the motion that last looked for (Gauss-Markov)?"""
 
 
 QUICK = Effort()
-FULL = Effort(windows=60, poses=6000, clock=True, lasting=True)
+FULL = Effort(windows=60, poses=6000, lasting=True)
 
 
 def calibrate_sightings(seen: Seen, effort: Effort = QUICK, *, seed: int = 0) -> Calibration:
@@ -65,10 +65,10 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
     long = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), free)
     long.sigmas, long.constants = dict(start[0]), start[1].copy()
     clock = None
-    long, long_value = L.fitted(long, trims=L.TRIMS[1:])
+    long, _ = L.fitted(long, trims=L.TRIMS[1:])
     notes: list[Finding] = []
     if effort.clock:
-        clock = profile_clock(short, seen, _stamps(seen, short, SHORT, count))
+        clock = profile_clock(short, seen)
     if clock is not None and clock.applied:
         return _again(seen, clock, effort)
     estimates, short, long = gates(short, short_value, long)
@@ -144,7 +144,7 @@ def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate],
     return again, left[0], left[1]
 
 
-def _values(name: str, s: Smoothing, other: Smoothing) -> dict[str, float]:
+def _values(name: str, s: Smoothing, other: Smoothing) -> dict[str, Any]:
     i = CONSTANTS.index(name)
     found = {"value": s.constants[i], "sigma": np.sqrt(s.covariance[i, i])}
     found |= {"other": other.constants[i], "other_sigma": np.sqrt(other.covariance[i, i])}
@@ -224,22 +224,21 @@ def sightings_of_a_visit(windows: Sequence[Window]) -> float:
     return float((n**2).sum() / max(n.sum(), 1))
 
 
-def profile_clock(s: Smoothing, seen: Seen, stamps: Sequence[Array]) -> Estimate:
+def profile_clock(s: Smoothing, seen: Seen) -> Estimate:
     """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
 
     Parameters
     ----------
     s : Smoothing
         Fitted without an offset.
-    stamps : sequence of (n,)
-        Of the poses of its windows.
+    seen : Seen
     """
     period = seen.period
     scores: dict[int, float] = {}
 
     def score(k: int) -> float:
         if k not in scores:
-            moved = L.at_shift(s, seen, stamps, k * 0.5 * period)
+            moved = L.at_shift(s, seen, k * 0.5 * period)
             moved.settle(8)
             moved.fit(budget=60, rounds=1)
             scores[k] = moved.objective()
@@ -267,22 +266,6 @@ def profile_clock(s: Smoothing, seen: Seen, stamps: Sequence[Array]) -> Estimate
     ).gated()
 
 
-def _stamps(seen: Seen, s: Smoothing, seconds: float, count: int | None) -> list[Array]:
-    """Stamps of the poses of a smoothing's windows."""
-    at = {int(w.rows[0]): t for w, t in cut(seen, seconds, count)}
-    out = []
-    for w in s.windows:
-        # the windows kept their poses when sightings were trimmed; the first row may have gone
-        k = int(np.searchsorted(w.first, 0, side="right")) - 1
-        row = int(w.rows[0])
-        found = at.get(row)
-        if found is None or len(found) != len(w.poses):
-            found = next(t for r, t in sorted(at.items(), reverse=True) if r <= row and len(t) == len(w.poses))
-        out.append(found)
-        del k
-    return out
-
-
 def _count(seen: Seen, seconds: float, effort: Effort) -> int | None:
     """Windows that keep the number of poses within bounds."""
     if effort.windows is None:
@@ -305,7 +288,9 @@ def _data(s: Smoothing) -> str:
 def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
     r = [s.sigmas["range"] for s in (short, long)]
     text = f"Range errors last (sigma {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones; residuals of one "
-    text += f"landmark are alike by {alike:.2f}): what is seen from one side again and again is less sure than it looks."
+    text += (
+        f"landmark are alike by {alike:.2f}): what is seen from one side again and again is less sure than it looks."
+    )
     return Finding("look", "errors-last", text)
 
 
@@ -331,6 +316,3 @@ def _made(
         notes=tuple(notes),
         data=data,
     )
-
-
-__all__ = ["FULL", "K", "QUICK", "Effort", "calibrate_sightings"]

@@ -68,6 +68,8 @@ class Window:
 
     Parameters
     ----------
+    times : (n,)
+        Stamps of the poses [s].
     steps : (n, 8)
         dx, dy, turn, seconds in motion, metres, from the pose before; row 0 is zero. Then variances that stand in place
         of the model's, where they are above 0.
@@ -85,6 +87,7 @@ class Window:
     nuisance : (M, 2)
     """
 
+    times: Array
     steps: Array
     first: Ints
     sightings: Array
@@ -272,7 +275,7 @@ class Smoothing:
             self.covariance[np.ix_(i, i)] = np.linalg.inv(H)
 
     def residuals(self) -> tuple[list[Array], list[Array]]:
-        """Whitened residuals ``(q, 2)`` of the sightings of each window, NaN without a bearing; and steps ``(n, 3)``."""
+        """Whitened residuals of sightings ``(q, 2)``, NaN without a bearing, and of turns ``(n,)``, by window."""
         g, s = self.constants, self.sigmas
         seen, moved = [], []
         for w in self.windows:
@@ -315,6 +318,7 @@ def rebuilt(w: Window, good: npt.NDArray[np.bool_]) -> Window:
     k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))[good]
     slots, order = numbered(w.slots[good])
     return Window(
+        times=w.times,
         steps=w.steps,
         first=np.searchsorted(k, np.arange(len(w.poses) + 1)).astype(np.int64),
         sightings=np.ascontiguousarray(w.sightings[good]),

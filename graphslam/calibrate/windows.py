@@ -99,8 +99,8 @@ def driven(motion: Motion) -> Array:
     return np.stack([t, *total])
 
 
-def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = False) -> list[tuple[Window, Array]]:
-    """Windows of a length, and the stamps of their poses.
+def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = False) -> list[Window]:
+    """Windows of a length.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = 
         scans = used[a:b]
         made = make_window(seen, scans, visits=visits)
         if made is not None:
-            out.append((made, s.times[scans]))
+            out.append(made)
     return out
 
 
@@ -169,6 +169,7 @@ def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
         mine = points[landmark == order[j]]
         nuisance[j] = np.median(mine[np.isfinite(mine[:, 0])], axis=0) if np.isfinite(mine[:, 0]).any() else np.nan
     w = Window(
+        times=s.times[scans],
         steps=steps,
         first=np.searchsorted(k, np.arange(len(scans) + 1)).astype(np.int64),
         sightings=z,
@@ -228,4 +229,3 @@ def follow(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, los
         place = np.concatenate([place, points[new]])
         last = np.concatenate([last, np.full(len(new), pose, dtype=np.int64)])
     return track
-

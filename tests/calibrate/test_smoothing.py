@@ -35,7 +35,7 @@ def window(rng, n=7, landmarks=4, states=3, visits=True, bearings=True):
     nuisance = np.where(kinds[:, None] == 1, 0.02 * rng.standard_normal((len(order), 2)), 0.0)
     nuisance[kinds == 0] = places[order[kinds == 0]] + 0.1 * rng.standard_normal((int((kinds == 0).sum()), 2))
     rows = np.arange(len(seen))
-    return Window(steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance)
+    return Window(np.arange(n) * 1.0, steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance)
 
 
 @pytest.mark.parametrize(("states", "visits", "bearings"), [(3, False, True), (3, True, False), (5, True, True)])

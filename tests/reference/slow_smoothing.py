@@ -1,4 +1,4 @@
-"""One window smoothed the slow and obvious way: residuals as they are defined, Jacobians by differences, dense algebra."""
+"""Windows smoothed the slow and obvious way: residuals as they are defined, Jacobians by differences, dense algebra."""
 
 from __future__ import annotations
 
@@ -91,9 +91,7 @@ def objective_and_step(s: Smoothing, h: float = 1e-6) -> tuple[float, np.ndarray
     """Negative log likelihood of the linearised problem, and the Gauss-Newton step of all states."""
     x = states_of(s)
     r, volume = residuals(s, x)
-    J = np.column_stack(
-        [(residuals(s, x + h * e)[0] - residuals(s, x - h * e)[0]) / (2 * h) for e in np.eye(len(x))]
-    )
+    J = np.column_stack([(residuals(s, x + h * e)[0] - residuals(s, x - h * e)[0]) / (2 * h) for e in np.eye(len(x))])
     H = J.T @ J
     step = -np.linalg.solve(H, J.T @ r)
     chi2 = float(np.sum((r + J @ step) ** 2))

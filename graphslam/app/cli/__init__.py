@@ -16,6 +16,7 @@ import graphslam
 # Before NumPy loads: thousands of small matrices, whose BLAS threads would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from graphslam.app.cli import calibrate as cli_calibrate
 from graphslam.app.cli import data as cli_data
 from graphslam.app.cli import join as cli_join
 from graphslam.app.cli import map as cli_map
@@ -52,6 +53,7 @@ def _options(
 
 
 cli_run.register(app)
+cli_calibrate.register(app)
 cli_join.register(app)
 cli_map.register(app)
 cli_sessions.register(app)

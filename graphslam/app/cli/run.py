@@ -60,7 +60,7 @@ def run(
     """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on how far to trust it."""
     from graphslam.app.run.pipeline import run as run_pipeline
 
-    options = _options(config, setting)
+    options = run_options(config, setting)
     result = run_pipeline(
         source,
         frontend=frontend,
@@ -84,7 +84,8 @@ def run(
     emit(value, text, as_json=as_json)
 
 
-def _options(config: Path | None, settings: list[str]) -> dict[str, Any]:
+def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
+    """Options of a TOML file, and over them those that were set one by one."""
     values: dict[str, Any] = read_toml(config) if config else {}
     values.pop("run", None)  # an effective config.toml of another run may be given as it is
     for text in settings:

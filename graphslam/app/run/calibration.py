@@ -5,17 +5,25 @@ from __future__ import annotations
 import typing
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from graphslam.calibrate.calibrate import calibrate_log
+from graphslam.app.machine import one_blas_thread
+from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.source import load_log_source
+from graphslam.calibrate.calibrate import calibrate_streams
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibrated
 from graphslam.calibrate.estimate import Calibration
-from graphslam.calibrate.sighted import QUICK, Effort
+from graphslam.calibrate.sighted import FULL, QUICK, Effort
+from graphslam.core.config import merge
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
+from graphslam.core.records import LandmarkObservations
 from graphslam.frontends.base import FrontEnd
 
+LANDMARKS, SCANS = "rbpf-ekf", "segslam"
+"""Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
 OWN = "Noise and lasting errors are those of the settings made for this very set; nothing was estimated from the log."
 
 
@@ -35,7 +43,7 @@ def prepared(
         Is there a preset for this very set?
     seed : int
     """
-    if config.given is not None:
+    if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "Noise and lasting errors are those given in calibrate.given.")]
         return calibrated(log, config.given), config, said, None
     if config.use == "none" or not looks_at(front):
@@ -50,6 +58,61 @@ def prepared(
     except GraphSlamError as error:
         said = [Finding("", "calibrated", f"Noise could not be told from the log: {error}. Its defaults are used.")]
         return log, config, said, None
+
+
+def calibrate_log(
+    source: str | Path | SensorLog,
+    *,
+    frontend: str | None = None,
+    quick: bool = False,
+    seed: int = 0,
+    config: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """What a log says of the noise and the lasting errors of its own sensors, without truth and presets' noise.
+
+    Parameters
+    ----------
+    source : card name, folder, or SensorLog
+    frontend : str, optional
+        The front end that is to read the log; by default one that reads what is in it.
+    quick : bool
+        As inside a run: a part of the log, some seconds of work.
+    seed : int
+    config : mapping, optional
+        Options over those of the source's preset, as for a run: how scans and landmarks are read.
+
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children: the log says nothing of its noise.
+
+    Examples
+    --------
+    >>> found = gs.calibrate_log("plaza1")
+    >>> gs.run("plaza1", config={"calibrate": found.config()})
+    """
+    log = load_log_source(source)
+    name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
+    options = merge(recommended(log, name), config or {})
+    front = make_front_end(name, options.get("frontend", {}))
+    with one_blas_thread():
+        return calibration(log, front, QUICK if quick else FULL, seed=seed)
+
+
+def own_noise(options: Mapping[str, Any]) -> bool:
+    """Does the noise of a preset count, or do figures that were estimated stand in its place?"""
+    asked = options.get("calibrate", {})
+    return not isinstance(asked, Mapping) or ("given" not in asked and asked.get("use", "auto") != "always")
+
+
+def without_noise(suggested: Mapping[str, Any]) -> dict[str, Any]:
+    """A preset without its noise and constants of the sensors; what says how a log is read stays."""
+    front = {k: v for k, v in suggested.get("frontend", {}).items() if k not in ("motion", "noise", "smoothing_noise")}
+    if isinstance(front.get("steps"), Mapping):
+        front["steps"] = {k: v for k, v in front["steps"].items() if k != "yaw_per_metre"}
+    back = {k: v for k, v in suggested.get("backend", {}).items() if k != "covariance_scale"}
+    kept = {"frontend": front, "backend": back}
+    return {**suggested, **{k: v for k, v in kept.items() if k in suggested}}
 
 
 def looks_at(front: FrontEnd) -> bool:
@@ -76,7 +139,7 @@ def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 
     kind = front_kind(front)
     if kind is None:
         raise DataError(f"front end {front.name} reads nothing that can be calibrated", where=log.name)
-    return calibrate_log(log, kind, effort, front.config, seed=seed)
+    return calibrate_streams(log, kind, effort, front.config, seed=seed)
 
 
 def chosen(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:

@@ -1,7 +1,7 @@
 """Configuration of a run: one frozen dataclass per part, defaults in code, a TOML file optional and partial.
 
-Order of precedence: defaults, what the log says of its own noise (:mod:`graphslam.calibrate`) where no preset was made for
-it, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
+Order of precedence: defaults, what the log says of its own noise (:mod:`graphslam.calibrate`) where no preset was made
+for it, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
 Unknown keys are refused with their full name; the effective configuration is written into the run folder.
 """
 

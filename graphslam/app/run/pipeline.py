@@ -16,8 +16,8 @@ from graphslam.app.folders.generations import consistent
 from graphslam.app.folders.lock import locked
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
-from graphslam.app.run.calibration import prepared
 from graphslam.app.run.audit import audit_association, reference_identities
+from graphslam.app.run.calibration import own_noise, prepared, without_noise
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, recommended
@@ -25,6 +25,7 @@ from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_facts, write_outputs
 from graphslam.app.run.run import Run
+from graphslam.app.run.source import load_log_source
 from graphslam.app.run.stream_use import stream_use
 from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
@@ -70,7 +71,6 @@ from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.formats import load_npz
 from graphslam.frontends.base import FrontEnd
-from graphslam.io.catalog import load
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
@@ -150,7 +150,7 @@ def _run(
     log = load_log_source(source)
     seconds = {"load": time.perf_counter() - begin}
     suggested = recommended(log, frontend)
-    options = merge(suggested, config)
+    options = merge(suggested if own_noise(config) else without_noise(suggested), config)
     settings: cfg.RunConfig = build(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
@@ -273,18 +273,6 @@ def _solved(
     seconds["backend"] = sum(back.seconds.values())
     seconds["total"] = time.perf_counter() - begin
     return _judge(taken, settings, submaps, back, solution, seconds, work, effective)
-
-
-def load_log_source(source: str | Path | SensorLog, **options: Any) -> SensorLog:
-    """A log from a card name, a folder on disk, or itself; ``options`` are for the reader."""
-    if isinstance(source, SensorLog):
-        return source
-    log = load(source, **options)
-    if not isinstance(log, SensorLog):
-        raise MissingDataError(
-            f"{source} holds no sensor log", got=type(log).__name__, wanted="a log of sensor streams"
-        )
-    return log
 
 
 def gps_stream(log: SensorLog) -> Gps | None:

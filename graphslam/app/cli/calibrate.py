@@ -1,0 +1,43 @@
+"""``graphslam calibrate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from graphslam.app.cli.run import JSON, MAX_SIZE, run_options
+from graphslam.app.cli.terminal import emit
+from graphslam.core.atomic import atomic_open
+from graphslam.core.config import dump_toml
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to the command line."""
+    app.command()(calibrate)
+
+
+def calibrate(
+    source: str = typer.Argument(..., help="Name of a data-set card, or a folder that holds a log."),
+    frontend: str | None = typer.Option(
+        None, help="Front end that is to read the log. Default: one that reads what is in it."
+    ),
+    quick: bool = typer.Option(False, "--quick", help="A part of the log, some seconds of work: as inside a run."),
+    config: Path | None = typer.Option(None, help="TOML file with options, as for a run."),
+    setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
+    seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
+    out: Path | None = typer.Option(None, help="TOML file for the result; `graphslam run --config FILE` takes it."),
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Tell noise, biases and scales of a robot's sensors from its log alone, without truth."""
+    from graphslam.app.run.calibration import calibrate_log
+
+    options = run_options(config, setting)
+    found = calibrate_log(source, frontend=frontend, quick=quick, seed=seed, config=options)
+    lines = [f"{f.level or '-':4}  {f.text}" for f in found.findings()]
+    if out is not None:
+        with atomic_open(out, "w") as file:
+            file.write(dump_toml({"calibrate": found.config()}))
+        lines.append(f"written to {out}: graphslam run {source} --config {out}")
+    emit(found.as_dict() | {"out": None if out is None else str(out)}, "\n".join(lines), as_json=as_json)
