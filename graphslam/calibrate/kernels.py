@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 
 import numba
 import numpy as np
@@ -30,6 +31,12 @@ HEAD = CONSTANTS + 1
     FLOOR_HEADING,
 ) = range(16)
 PARAMETERS = 16
+Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
+"""What is measured in a window."""
+Work = namedtuple("Work", ["L", "X", "C", "S", "chi2"])
+"""What an elimination leaves."""
+_Row = namedtuple("_Row", ["jp", "jn", "cols", "vals"])
+_Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
 _FAR = 1e-8  # information of where a landmark is before it is seen [1/m²]
 
 
@@ -40,8 +47,10 @@ def wrap(a):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _row(jp, jn, cols, vals, n, A, An, B, C, Cn, S):
+def _add(row, n, blocks):
     """Add one whitened residual row: blocks of this pose, the next one, and ``n`` border columns."""
+    jp, jn, cols, vals = row
+    A, An, B, C, Cn, S = blocks
     D = len(jp)
     for a in range(D):
         if jp[a] != 0.0:
@@ -63,22 +72,24 @@ def _row(jp, jn, cols, vals, n, A, An, B, C, Cn, S):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor, p, damping, L, X, C, S, chi2):
+def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
     """Linearise a window, and eliminate its poses, then its nuisances, onto the constants.
 
     poses : (n, D) x, y, heading, and for D = 5 the lasting errors of yaw rate [rad/s] and speed [m/s].
     nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first sighting.
     g : (CONSTANTS,)
-    steps : (n, 8) dx, dy, turn, seconds, metres into pose k, and variances along, to the side and of the heading that
-        stand in place of the model's where the first is above 0; row 0 is not read.
-    first : (n + 1,) sightings of pose k are ``first[k]:first[k + 1]``.
-    sightings : (q, 2) range and bearing; a bearing of nan is none.
-    slots : (q, 2) nuisance of the landmark, and of the visit or -1.
-    kinds : (M,) 0 landmark, 1 visit.
+    data : Data
+        steps (n, 8): dx, dy, turn, seconds, metres into pose k; variances along, to the side and of the heading that
+            stand in place of the model's where the first is above 0; row 0 is not read.
+        first : (n + 1,) sightings of pose k are ``first[k]:first[k + 1]``.
+        sightings : (q, 2) range and bearing; a bearing of nan is none.
+        slots : (q, 2) nuisance of the landmark, and of the visit or -1.
+        kinds (M,): 0 landmark, 1 visit.
     sensor : (3,) sensor in the base.
     p : (PARAMETERS,) standard deviations and times.
     damping : share added to every diagonal, Levenberg-Marquardt.
-    L (n, D, D), X (n, D, D), C (n, D, HEAD + 2 M), S (HEAD + 2 M, HEAD + 2 M), chi2 (6,) out: what
+    work : Work
+        L (n, D, D), X (n, D, D), C (n, D, HEAD + 2 M), S (HEAD + 2 M, HEAD + 2 M), chi2 (6,) out: what
     :func:`substitute` needs; S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in
     row RHS; chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
 
@@ -87,6 +98,8 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
     (float, float)
         ln det of all that was eliminated, and the sum of ln σ of all residuals.
     """
+    steps, first, sightings, slots, kinds = data
+    L, X, C, S, chi2 = work
     n, D = poses.shape
     M = len(nuisance)
     m = HEAD + 2 * M
@@ -98,6 +111,9 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
     jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
     cols, vals = np.zeros(16, np.int64), np.zeros(16)
     cols[0] = RHS
+    here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
+    alone = _Row(zero, zero, cols, vals)
+    start = _Blocks(A, An, X[0], C[0], C[0], S)
     for a in range(3):
         A[a, a] = 1e12
     if D == 5:
@@ -105,7 +121,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
             jp[:] = 0.0
             jp[a] = 1.0 / s
             vals[0] = -poses[0, a] / s
-            _row(jp, zero, cols, vals, 1, A, An, X[0], C[0], C[0], S)
+            _add(here, 1, start)
             chi2[5] += vals[0] * vals[0]
             volume += math.log(s)
     for j in range(M):
@@ -115,7 +131,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
                 s = p[VISIT_RANGE] if c == 0 else p[VISIT_BEARING]
                 volume += math.log(s)
                 cols[1], vals[0], vals[1] = HEAD + 2 * j + c, -nuisance[j, c] / s, 1.0 / s
-                _row(zero, zero, cols, vals, 2, A, An, X[0], C[0], C[0], S)
+                _add(alone, 2, start)
                 chi2[5] += vals[0] * vals[0]
             else:
                 S[HEAD + 2 * j + c, HEAD + 2 * j + c] += _FAR
@@ -123,6 +139,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
     for k in range(n):
         X[k] = 0.0
         An[:] = 0.0
+        blocks = _Blocks(A, An, X[k], C[k], C[min(k + 1, n - 1)], S)
         x, y, th = poses[k, 0], poses[k, 1], poses[k, 2]
         c, s = math.cos(th), math.sin(th)
         ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
@@ -152,7 +169,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
                 count = 6
             vals[0] = -w * e
             chi2[3] += vals[0] * vals[0]
-            _row(jp, zero, cols, vals, count, A, An, X[k], C[k], C[k], S)
+            _add(here, count, blocks)
             if sightings[q, 1] == sightings[q, 1]:
                 w = 1.0 / p[BEARING]
                 volume += math.log(p[BEARING])
@@ -172,7 +189,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
                     count = 5
                 vals[0] = -w * e
                 chi2[4] += vals[0] * vals[0]
-                _row(jp, zero, cols, vals, count, A, An, X[k], C[k], C[k], S)
+                _add(here, count, blocks)
         if k + 1 < n:
             ux, uy, turn, dt, d = steps[k + 1, 0], steps[k + 1, 1], steps[k + 1, 2], steps[k + 1, 3], steps[k + 1, 4]
             rate = poses[k, 3] if D == 5 else 0.0
@@ -221,7 +238,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
                 cols[4], vals[4] = TURN_SCALE, w * part * turn
                 vals[0] = -w * e
                 chi2[row] += vals[0] * vals[0]
-                _row(jp, jn, cols, vals, 5, A, An, X[k], C[k], C[k + 1], S)
+                _add(onward, 5, blocks)
             if D == 5:
                 for a in range(3, 5):
                     sigma = p[RATE_SIGMA] if a == 3 else p[SPEED_SIGMA]
@@ -233,7 +250,7 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
                     vals[0] = -(poses[k + 1, a] - left * poses[k, a]) / new
                     chi2[5] += vals[0] * vals[0]
                     volume += math.log(new)
-                    _row(jp, jn, cols, vals, 1, A, An, X[k], C[k], C[k + 1], S)
+                    _add(onward, 1, blocks)
         if damping > 0.0:
             for a in range(D):
                 A[a, a] *= 1.0 + damping
@@ -296,8 +313,9 @@ def eliminate(poses, nuisance, g, steps, first, sightings, slots, kinds, sensor,
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def substitute(L, X, C, S, dg, d_poses, d_nuisance):
+def substitute(work, dg, d_poses, d_nuisance):
     """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
+    L, X, C, S, _ = work
     n, D = d_poses.shape
     m = C.shape[2]
     y = np.zeros(m)

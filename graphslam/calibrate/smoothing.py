@@ -124,7 +124,7 @@ class Smoothing:
     sigmas: dict[str, float] = field(default_factory=lambda: dict(START))
     covariance: Array = field(default_factory=lambda: np.full((K.CONSTANTS, K.CONSTANTS), np.nan))
     evaluations: int = 0
-    _memory: list[tuple[Array, ...]] = field(default_factory=list)
+    _memory: list[K.Work] = field(default_factory=list)
 
     def copy(self, **changes: object) -> Smoothing:
         """The same state, to be changed on its own."""
@@ -142,26 +142,24 @@ class Smoothing:
     def _parameters(self) -> Array:
         return np.array([self.sigmas[s] for s in SIGMAS])
 
-    def _buffers(self) -> list[tuple[Array, ...]]:
+    def _buffers(self) -> list[K.Work]:
         if len(self._memory) != len(self.windows):
             self._memory = []
             for w in self.windows:
                 (n, D), m = w.poses.shape, K.HEAD + 2 * len(w.nuisance)
                 shapes = ((n, D, D), (n, D, D), (n, D, m), (m, m), (6,))
-                self._memory.append(tuple(np.zeros(s) for s in shapes))
+                self._memory.append(K.Work(*(np.zeros(s) for s in shapes)))
         return self._memory
 
     def _eliminated(self, p: Array, damping: float = 0.0) -> tuple[float, float, Array, Array]:
         """ln det, Σ ln σ, information of the constants ``(HEAD, HEAD)``, and χ² by class."""
         logdet, volume, S, chi2 = 0.0, 0.0, np.zeros((K.HEAD, K.HEAD)), np.zeros(6)
-        for w, buffers in zip(self.windows, self._buffers()):
-            a, b = K.eliminate(
-                *(w.poses, w.nuisance, self.constants, w.steps, w.first, w.sightings, w.slots, w.kinds),
-                *(self.sensor, p, damping, *buffers),
-            )
+        for w, work in zip(self.windows, self._buffers()):
+            data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            a, b = K.eliminate(w.poses, w.nuisance, self.constants, data, self.sensor, p, damping, work)
             logdet, volume = logdet + a, volume + b
-            S += buffers[3][: K.HEAD, : K.HEAD]
-            chi2 += buffers[4]
+            S += work.S[: K.HEAD, : K.HEAD]
+            chi2 += work.chi2
         self.evaluations += 1
         return logdet, volume, np.triu(S) + np.triu(S, 1).T, chi2
 
@@ -213,9 +211,9 @@ class Smoothing:
             step = np.zeros(K.CONSTANTS)
             step[i] = np.linalg.solve(H, h) if len(i) else 0.0
             kept = [(w.poses, w.nuisance) for w in self.windows], self.constants
-            for w, (L, X, C, SS, _) in zip(self.windows, self._buffers()):
+            for w, work in zip(self.windows, self._buffers()):
                 dp, dn = np.zeros_like(w.poses), np.zeros_like(w.nuisance)
-                K.substitute(L, X, C, SS, step, dp, dn)
+                K.substitute(work, step, dp, dn)
                 w.poses, w.nuisance = w.poses + dp, w.nuisance + dn
             self.constants = self.constants + step
             value = self.total()

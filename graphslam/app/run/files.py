@@ -102,6 +102,7 @@ RUN: dict[str, Any] = {
     "backend?": _PART,
     "gps?": _PART,
     "imu?": _PART,
+    "calibrate?": _PART,
     "verdict?": _PART,
     "refine?": {
         "rounds?": [

@@ -382,6 +382,7 @@ def _judge(
         "backend": effective["backend"],
         "gps": effective["gps"],
         "imu": effective["imu"],
+        "calibrate": effective.get("calibrate", {}),
         "T_world_base": base,
         "versions": versions(),
         "seconds": seconds,

@@ -1,4 +1,4 @@
-"""Robots drawn by chance whose wheels no default knows: a path, landmarks, and a log that states a quarter of its noise."""
+"""Robots drawn by chance whose wheels no default knows, and logs of them that state a quarter of their noise."""
 
 from __future__ import annotations
 
@@ -100,9 +100,9 @@ def drive(robot: DrawnRobot, seed: int, seconds: float = 120.0, *, rate: float =
 
 def _path(robot: DrawnRobot, seconds: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Times and poses of a drive that turns by chance and comes back to the middle when it is far."""
-    n = int(seconds / FINE) + 1
-    t = np.arange(n) * FINE
-    poses = np.zeros((n, 3))
+    n = int((seconds + 2.0) / FINE) + 1
+    t: Array = np.arange(n, dtype=np.float64) * FINE - 1.0  # clocks that are off ask for what was before
+    poses: Array = np.zeros((n, 3))
     turn, speed, reach = 0.0, robot.speed, 12.0 * robot.speed + 10.0
     hold = np.exp(-FINE / 4.0)
     for k in range(1, n):

@@ -1,0 +1,123 @@
+"""Calibration of logs of landmarks: what it finds in drawn robots, what it leaves alone, and how runs use it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import graphslam as gs
+from graphslam.app.cli import app
+from graphslam.app.studies.calibration_robot import draw_robot, drive
+from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.sighted import QUICK, calibrate_sightings
+from graphslam.calibrate.windows import Seen
+from graphslam.core.config import read_toml
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.io.log_store import save_log
+
+ROBOT = draw_robot(3)
+OPTIONS = {
+    "frontend": {"association": "known", "particles": 4, "stopping": {"max_distance": 40.0}},
+    "backend": {"associate": False, "merge_every": 0},
+}
+
+
+@pytest.fixture(scope="module")
+def log():
+    return drive(ROBOT, 3, 60.0)
+
+
+@pytest.fixture(scope="module")
+def found(log):
+    return calibrate_sightings(Seen.of(log, "landmarks", log["landmarks"]), QUICK)
+
+
+def test_drawn_robot_is_found_again(found) -> None:
+    c = found.corrections
+    assert c.clock == pytest.approx(ROBOT.clock, abs=0.05)  # half a record of its odometry
+    e = {e.name: e for e in found.estimates}
+    assert np.exp(e["distance_scale"].value) == pytest.approx(ROBOT.distance_scale, abs=0.02)
+    assert e["yaw_bias"].value == pytest.approx(ROBOT.yaw_bias, abs=np.deg2rad(0.5))
+    assert c.yaw_bias == 0.0  # no more than chance in a minute of these wheels
+    assert e["sensor_yaw"].value == pytest.approx(ROBOT.sensor_yaw, abs=np.deg2rad(0.8))
+    assert c.range_offset == pytest.approx(ROBOT.range_offset, abs=0.08)
+    assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.1)
+    assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.1)
+
+
+def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:
+    mended = calibrated(log, found.corrections)
+    again = calibrate_sightings(Seen.of(mended, "landmarks", mended["landmarks"]), QUICK)
+    before = {e.name: e for e in found.estimates if e.applied}
+    for e in again.estimates:
+        assert not e.applied or abs(e.value) < 0.3 * abs(before[e.name].value), e
+
+
+def test_tracks_without_identities_tell_the_same(log, found) -> None:
+    blind = dataclasses.replace(log["landmarks"], ids=None)
+    there = calibrate_sightings(Seen.of(log, "landmarks", blind), QUICK).corrections
+    assert there.distance_scale == pytest.approx(found.corrections.distance_scale, abs=0.01)
+    assert there.clock == pytest.approx(found.corrections.clock, abs=0.1)
+    assert there.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.3)
+
+
+def test_wrong_identities_are_trimmed(log, found) -> None:
+    rng = np.random.default_rng(2)
+    ids = log["landmarks"].ids.copy()
+    wrong = rng.random(len(ids)) < 0.05
+    ids[wrong] = rng.permutation(ids[wrong])
+    spoilt = dataclasses.replace(log["landmarks"], ids=ids)
+    c = calibrate_sightings(Seen.of(log, "landmarks", spoilt), QUICK).corrections
+    assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.2)
+    assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.2)
+
+
+def test_too_few_sightings_are_refused_with_a_count(log) -> None:
+    short = log.slice(0.0, 1.5)
+    with pytest.raises(DataError, match="sightings"):
+        calibrate_sightings(Seen.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
+
+
+def test_run_of_an_unknown_log_is_calibrated_and_says_so(log, tmp_path) -> None:
+    stated = gs.run(log, config={**OPTIONS, "calibrate": {"use": "none"}}, progress=False)
+    run = gs.run(log, config=OPTIONS, progress=False, out=tmp_path / "run")
+    assert run.metric("nees_aligned_poses_per_dof") < 0.1 * stated.metric("nees_aligned_poses_per_dof")
+    assert run.metric("path_rmse_aligned") < stated.metric("path_rmse_aligned")
+    said = [f.text for f in run.verdict if f.code == "calibrated"]
+    assert any("stamps of the motion" in s for s in said)
+    given = read_toml(tmp_path / "run" / "config.toml")["calibrate"]["given"]
+    assert given["clock"] == pytest.approx(ROBOT.clock, abs=0.05)
+    before = (tmp_path / "run" / "config.toml").read_bytes()
+    again = gs.run(log, config=OPTIONS, progress=False, out=tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "config.toml").read_bytes() == before
+    assert again.metric("path_rmse_aligned") == run.metric("path_rmse_aligned")
+
+
+def test_noise_set_by_hand_stands(log) -> None:
+    options = {**OPTIONS, "frontend": {**OPTIONS["frontend"], "noise": {"range_sigma": 9.0, "bearing_sigma": 1.0}}}
+    run = gs.run(log, config=options, progress=False)
+    given = run.report["calibrate"]["given"]
+    assert "range_sigma" not in given
+    assert given["along_metre"] > 0
+
+
+def test_command_line_writes_what_a_run_takes(log, tmp_path) -> None:
+    save_log(log, tmp_path / "log")
+    file = tmp_path / "noise.toml"
+    result = CliRunner().invoke(app, ["calibrate", str(tmp_path / "log"), "--quick", "--out", str(file), "--json"])
+    assert result.exit_code == 0, result.output
+    value = json.loads(result.stdout)
+    given = read_toml(file)["calibrate"]["given"]
+    assert given["clock"] == pytest.approx(value["given"]["clock"])
+    run = gs.run(log, config={**OPTIONS, **read_toml(file)}, progress=False)
+    assert run.report["calibrate"]["given"] == given
+
+
+@pytest.mark.parametrize("name", ["range_sigma", "distance_scale"])
+def test_impossible_figures_are_refused(name) -> None:
+    with pytest.raises(ConfigError, match=name):
+        Corrections(**{name: -1.0})
