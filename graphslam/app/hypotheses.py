@@ -19,8 +19,8 @@ from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
-from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.run import Run
+from graphslam.app.run.source import load_log_source
 from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions

@@ -50,22 +50,29 @@ def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
             raise ConfigError(f"unknown configuration key {name!r}; known: {', '.join(sorted(known))}")
         if key in parts:
             f, part = parts[key]
-            converted = _convert(typing.get_type_hints(hints[f.name])[part], value, name)
+            converted = convert(typing.get_type_hints(hints[f.name])[part], value, name)
             out[f.name] = dataclasses.replace(out.get(f.name, f.default), **{part: converted})
         else:
-            out[key] = _convert(hints[key], value, name)
+            out[key] = convert(hints[key], value, name)
     try:
         return kind(**out)
     except TypeError as error:
         raise ConfigError(f"{where or kind.__name__}: {error}") from None
 
 
-def _convert(hint: Any, value: Any, name: str) -> Any:
+def convert(hint: Any, value: Any, name: str) -> Any:
+    """``value`` as the type that ``hint`` asks for; ``name`` is that of the option, for messages.
+
+    Raises
+    ------
+    ConfigError
+        It is of another type.
+    """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None or (value == "none" and str not in args):
             return None
-        return _convert(next(a for a in args if a is not type(None)), value, name)
+        return convert(next(a for a in args if a is not type(None)), value, name)
     if origin is Literal:
         if value not in args:
             raise ConfigError(f"{name} = {value!r}; known: {', '.join(map(str, args))}")
@@ -78,10 +85,10 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         if not isinstance(value, (list, tuple)):
             raise ConfigError(f"{name} = {value!r}; wanted a list")
         if args[1:] == (...,):
-            return tuple(_convert(args[0], v, name) for v in value)
+            return tuple(convert(args[0], v, name) for v in value)
         if len(value) != len(args):
             raise ConfigError(f"{name} = {value!r}; wanted {len(args)} values")
-        return tuple(_convert(a, v, name) for a, v in zip(args, value, strict=True))
+        return tuple(convert(a, v, name) for a, v in zip(args, value, strict=True))
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         if not (abs(value) <= LARGEST or abs(value) == math.inf):
             raise ConfigError(f"{name} = {value}; wanted a number, at most {LARGEST:g}")

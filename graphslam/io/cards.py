@@ -88,7 +88,7 @@ class Card:
     files : tuple of CardFile
     archives : tuple of CardArchive
     reader : str or None
-        Name in :data:`graphslam.io.catalog.READERS`.
+        Name of a reader (:mod:`graphslam.io.readers`).
     options : mapping of str to float
         What the reader must be told of this set, because its files do not say it.
     """

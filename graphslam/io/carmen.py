@@ -1,7 +1,15 @@
 """Logs of the CARMEN robot toolkit: planar laser scans with the odometry pose of each.
 
-Only the lines ``FLASER n r_1 … r_n x y θ odom_x odom_y odom_θ ipc_stamp host logger_stamp`` are used: they bring laser
-and odometry in one record, which no delay between two processes can part. Lines ``ODOM`` are counted and left alone.
+Lines with scans, of one laser:
+
+* ``FLASER n r_1 … r_n x y θ odom_x odom_y odom_θ ipc_stamp host logger_stamp`` (``RLASER``: the one that looks back).
+* ``ROBOTLASER1 type start fov resolution max_range accuracy remission n r_1 … r_n k rem_1 … rem_k laser_x laser_y
+  laser_θ robot_x robot_y robot_θ tv rv forward_safety side_safety turn_axis ipc_stamp host logger_stamp``
+* ``RAWLASER1``: the same up to the remissions, then the stamps: it brings no pose.
+
+The first two bring laser and odometry in one record, which no delay between two processes can part: lines ``ODOM`` are
+then counted and left alone. Poses of scans that bring none, or always the same, are put between those of ``ODOM``.
+Scans of another number of beams than most are put on the beams of most.
 
 Stamps of such logs may fall back where a computer was busy, while the order of the lines stays right. They are mended,
 not dropped: the nearest stamps that rise (isotonic regression), if none has to move far.
@@ -10,6 +18,8 @@ not dropped: the nearest stamps that rise (isotonic regression), if none has to 
 from __future__ import annotations
 
 import os
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +29,18 @@ from scipy.optimize import isotonic_regression
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_inverse
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text
+from graphslam.core.reading import read_text, usable
 from graphslam.core.records import LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
+from graphslam.io.look import Look
+from graphslam.io.recognise import CARMEN_SCANS
 
-_TAIL = 9  # numbers after the ranges: two poses, stamp, host, stamp
+MAX_RANGE = 80.0
+"""Ranges at or above it are no return, where lines state none [m]."""
+
 _SPACING = 1e-3  # least time between mended stamps [s]
-_ENDINGS = (".clf", ".clf.bz2", ".clf.gz", ".clf.xz", ".log", ".log.gz", ".log.bz2", ".log.xz")
+_POSED = {"FLASER": 9, "RLASER": 9, "ROBOTLASER": 14, "RAWLASER": 3}  # words after ranges (and remissions)
 
 
 def bearings(n: int) -> Array:
@@ -40,7 +54,8 @@ def bearings(n: int) -> Array:
 def read_carmen(
     path: str | os.PathLike[str],
     *,
-    max_range: float = 80.0,
+    max_range: float | None = None,
+    laser: str | None = None,
     floor: tuple[float, float] = (0.01, 0.005),
     per_metre: tuple[float, float] = (0.1, 0.15),
     per_radian: float = 0.2,
@@ -55,8 +70,11 @@ def read_carmen(
     path : path
         A log, plain or compressed, or a folder that holds one, and perhaps one named ``*-corrected.log``: the poses
         that another SLAM found, matched to the scans by their ranges.
-    max_range : float
-        Ranges at or above it are "no return": 81.8 m and more for the usual scanner [m].
+    max_range : float, optional
+        Ranges at or above it are "no return" [m]. By default what the lines state, or 80 m: the usual scanner says
+        81.8 m and more.
+    laser : str, optional
+        Lines that are read, for instance ``ROBOTLASER1``; by default those of the tag that occurs most.
     floor : (float, float)
         σ that one motion of the odometry has at least: metres, radians. The logs state none; with the defaults motions
         of a metre differ from those of corrected logs about as stated (median).
@@ -72,46 +90,54 @@ def read_carmen(
     Returns
     -------
     SensorLog
-        Streams ``laser``, ``odometry`` (one motion a scan) and, with a corrected log, ``reference``: a Trajectory of
-        the base. It is the output of another SLAM, not truth.
+        Streams ``laser``, ``odometry`` (one motion a scan; none if the log tells no pose) and, with a corrected log,
+        ``reference``: a Trajectory of the base. It is the output of another SLAM, not truth.
 
     Raises
     ------
     MissingDataError, FormatError, DataError, ConfigError
     """
-    for what, values in (("max_range", [max_range]), ("floor", floor), ("most_mended", [most_mended])):
-        if not all(np.isfinite(v) and v > 0 for v in values):
+    for what, values in (("max_range", [max_range or 1.0]), ("floor", floor), ("most_mended", [most_mended])):
+        if not all(np.isfinite(v) and v > 0 for v in values) or max_range == 0:
             raise ConfigError(f"carmen: {what} is {values}; wanted positive numbers")
     if not all(np.isfinite(v) and v >= 0 for v in (*per_metre, per_radian)):
         raise ConfigError(f"carmen: per_metre {per_metre}, per_radian {per_radian}; wanted numbers ≥ 0")
     raw, corrected = _files(Path(path))
     where = str(raw)
     counter = DropCounter()
-    ranges, poses, stamps, others = _scans(raw, counter)
-    counter.drop("log", "line ODOM not used: scans bring their odometry", others)
-    times, mended = mend_stamps(stamps, most_mended, where=where)
+    scans = _scans(raw, counter, laser)
+    reach = max_range or scans.max_range or MAX_RANGE
+    ranges, poses = scans.ranges, scans.poses
+    times, mended = mend_stamps(scans.stamps, most_mended, where=where)
     counter.drop("laser", "stamp mended (kept)", mended)
-    T_base_sensor = np.median(se2_between(poses[:, 3:], poses[:, :3]), axis=0)
-    motions = np.zeros((len(poses), 3))
-    motions[1:] = se2_between(poses[:-1, 3:], poses[1:, 3:])
-    driven, turned = np.linalg.norm(motions[:, :2], axis=1), np.abs(motions[:, 2])
-    covariances = np.zeros((len(poses), 3, 3))
-    covariances[:, 0, 0] = covariances[:, 1, 1] = floor[0] ** 2 + (per_metre[0] * driven) ** 2
-    covariances[:, 2, 2] = floor[1] ** 2 + (per_metre[1] * driven) ** 2 + (per_radian * turned) ** 2
-    streams: dict[str, Stream] = {
-        "laser": LaserScans(
-            times=times,
-            ranges=ranges,
-            bearings=bearings(ranges.shape[1]),
-            max_range=max_range,
-            T_base_sensor=T_base_sensor,
-        ),
-        "odometry": Odometry(times=times, increments=motions, covariances=covariances),
-    }
+    if poses is None or _still(poses):
+        found = _between(scans.odom, times, most_mended, where)
+        if found is not None:
+            inside, robot = found
+            counter.drop("laser", "scan outside the time of lines ODOM", int((~inside).sum()))
+            times, ranges, robot = times[inside], ranges[inside], robot[inside]
+            poses = np.column_stack([robot, robot])
+    else:
+        counter.drop("log", "line ODOM not used: scans bring their odometry", len(scans.odom))
+    T_base_sensor = np.zeros(3)
+    streams: dict[str, Stream] = {}
+    if poses is not None:
+        T_base_sensor = np.median(se2_between(poses[:, 3:], poses[:, :3]), axis=0)
+        motions = np.zeros((len(poses), 3))
+        motions[1:] = se2_between(poses[:-1, 3:], poses[1:, 3:])
+        driven, turned = np.linalg.norm(motions[:, :2], axis=1), np.abs(motions[:, 2])
+        covariances = np.zeros((len(poses), 3, 3))
+        covariances[:, 0, 0] = covariances[:, 1, 1] = floor[0] ** 2 + (per_metre[0] * driven) ** 2
+        covariances[:, 2, 2] = floor[1] ** 2 + (per_metre[1] * driven) ** 2 + (per_radian * turned) ** 2
+        streams["odometry"] = Odometry(times=times, increments=motions, covariances=covariances)
+    scan_stream = LaserScans(
+        times=times, ranges=ranges, bearings=scans.bearings, max_range=reach, T_base_sensor=T_base_sensor
+    )
+    streams = {"laser": scan_stream, **streams}
     says = "none"
     if corrected is not None:
-        index, laser = _match(ranges, corrected, counter)
-        base = se2_compose(laser, np.broadcast_to(se2_inverse(T_base_sensor), laser.shape))
+        index, theirs = _match(ranges, corrected, counter)
+        base = se2_compose(theirs, np.broadcast_to(se2_inverse(T_base_sensor), theirs.shape))
         streams["reference"] = Trajectory(times[index], base)
         says = f"{corrected.name}: another SLAM's output, matched by ranges; not surveyed"
     if drops is not None:
@@ -119,7 +145,7 @@ def read_carmen(
     return SensorLog(
         name=name or raw.name.split(".")[0],
         streams=streams,
-        read={"laser": len(times), "odometry": len(times)},
+        read={k: len(times) for k in streams if k != "reference"},
         dropped=dict(counter.counts),
         meta={
             "source": raw.name,
@@ -167,60 +193,172 @@ def _files(path: Path) -> tuple[Path, Path | None]:
         return path, None
     if not path.is_dir():
         raise MissingDataError("no such file or folder", where=str(path), wanted="a CARMEN log")
-    logs = sorted(p for p in path.iterdir() if p.name.endswith(_ENDINGS))
+    look = Look(path)
+    logs = [p for p in look.texts if any(CARMEN_SCANS.match(s) or s.startswith("PARAM ") for s in look.lines(p, 4000))]
     corrected = [p for p in logs if "-corrected" in p.name]
     raw = [p for p in logs if p not in corrected]
     if len(raw) != 1 or len(corrected) > 1:
         raise MissingDataError(
             "folder does not hold one log",
             where=str(path),
-            wanted=f"one of {', '.join(_ENDINGS)}, perhaps a *-corrected one; found {', '.join(p.name for p in logs)}",
+            got=", ".join(look.relative(p) for p in logs) or str(look),
+            wanted="one CARMEN log, perhaps a *-corrected one beside it; or give the file itself",
         )
     return raw[0], corrected[0] if corrected else None
 
 
-def _scans(path: Path, drops: DropCounter) -> tuple[npt.NDArray[np.float32], Array, Array, int]:
-    """Ranges ``(k, n)``, poses of laser and robot ``(k, 6)``, stamps ``(k,)``, and the number of lines ODOM."""
-    rows: list[tuple[int, list[str]]] = []
-    others = 0
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        others += line.startswith("ODOM ")
-        if line.startswith("FLASER "):
-            rows.append((number, line.split()))
+@dataclass(frozen=True, slots=True)
+class _Scans:
+    """Scans ``(k, n)`` with stamps ``(k,)``; poses of laser and robot ``(k, 6)``, or None; lines ODOM."""
+
+    ranges: npt.NDArray[np.float32]
+    bearings: Array
+    stamps: Array
+    poses: Array | None
+    odom: list[tuple[float, float, float, float]]
+    max_range: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """One scan: directions as first, step and number; pose of laser and robot or None."""
+
+    layout: tuple[float, float, int]
+    ranges: npt.NDArray[np.float32]
+    pose: list[float] | None
+    stamp: float
+    max_range: float | None
+
+
+def _parse(words: list[str]) -> _Line | str:
+    """A line with a scan, or why it is none."""
+    tag = words[0].rstrip("0123456789")
+    at = 1 if tag in ("FLASER", "RLASER") else 8
+    try:
+        n = int(words[at])
+        if not 2 <= n <= 10_000:
+            return "number of beams is impossible"
+        end = at + 1 + n
+        if at == 8:
+            end += 1 + int(words[end])
+        if len(words) != end + _POSED[tag] or end <= at + n:
+            return "scan is truncated, or of another size"
+        ranges = np.array(words[at + 1 : at + 1 + n], dtype=np.float64)
+        rest = [float(w) for w in (*words[end:-2], words[-1])]
+        head = [float(w) for w in words[2:6]] if at == 8 else []
+    except IndexError:
+        return "scan is truncated, or of another size"
+    except ValueError:
+        return "scan holds something that is no number"
+    if not np.all(usable([*rest, *head])):
+        return "pose or stamp is not finite"
+    if at == 1:
+        return _Line((-0.5 * np.pi, 0.0, n), ranges.astype(np.float32), rest[:6], rest[6], None)
+    start, fov, step, reach = head
+    step = step if step > 0 else fov / (n - 1)
+    if not (0 < step * (n - 1) <= 2.2 * np.pi and abs(start) <= 4 * np.pi):
+        return "angles of the laser are impossible (wanted radians)"
+    pose = rest[:6] if tag == "ROBOTLASER" else None
+    stamp = rest[-2]
+    return _Line((start, step, n), ranges.astype(np.float32), pose, stamp, reach if reach > 0 else None)
+
+
+def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
+    rows: dict[str, list[tuple[int, list[str]]]] = {}
+    odom: list[tuple[float, float, float, float]] = []
+    for at, line in enumerate(read_text(path).splitlines(), start=1):
+        found = CARMEN_SCANS.match(line)
+        if found:
+            rows.setdefault(found[1], []).append((at, line.split()))
+        elif line.startswith("ODOM "):
+            words = line.split()
+            try:
+                w = [float(x) for x in (*words[-3:-2], *words[1:4])]
+            except ValueError:
+                w = [np.nan]
+            if len(w) == 4 and np.all(usable(w)):
+                odom.append((w[0], w[1], w[2], w[3]))
+            else:
+                drops.drop("odometry", "line ODOM is truncated or not finite")
     if not rows:
-        raise FormatError("holds no scan", where=str(path), wanted="lines FLASER of a CARMEN log")
-    sizes = [w[1] if len(w) > 1 else "" for _, w in rows]
-    usual = max(set(sizes), key=sizes.count)
-    if not usual.isdecimal() or not 2 <= int(usual) <= 10_000:
-        raise FormatError("number of beams is impossible", where=f"{path}, line {rows[0][0]}", got=usual)
-    n = int(usual)
-    values: list[list[float]] = []
+        raise FormatError(
+            "holds no scan", where=str(path), wanted="lines FLASER, ROBOTLASER1 or RAWLASER1 of a CARMEN log"
+        )
+    if laser is not None and laser not in rows:
+        raise ConfigError(f"carmen: no lines {laser!r} in {path}; there are {', '.join(rows)}")
+    tag = laser or max(rows, key=lambda t: (len(rows[t]), t.startswith(("FLASER", "ROBOTLASER"))))
+    for other in rows.keys() - {tag}:
+        drops.drop("laser", f"line {other} not used (choose it with option laser={other})", len(rows[other]))
+    lines: list[_Line] = []
     lost: dict[str, list[int]] = {}
-    for number, words in rows:
-        if len(words) != n + 2 + _TAIL or words[1] != usual:
-            lost.setdefault("scan is truncated, or of another size", []).append(number)
-            continue
-        try:
-            numbers = [float(w) for w in (*words[2:-2], words[-1])]
-        except ValueError:
-            lost.setdefault("scan holds something that is no number", []).append(number)
-            continue
-        if not np.all(np.isfinite(numbers[n:])):
-            lost.setdefault("pose or stamp is not finite", []).append(number)
-            continue
-        values.append(numbers)
-    bad = sum(len(v) for v in lost.values())
-    if bad > MAX_DROPPED * len(rows) or not values:
+    for number, words in rows[tag]:
+        parsed = _parse(words)
+        if isinstance(parsed, str):
+            lost.setdefault(parsed, []).append(number)
+        else:
+            lines.append(parsed)
+    bad, all_ = sum(len(v) for v in lost.values()), len(rows[tag])
+    if bad > MAX_DROPPED * all_ or not lines:
         reason = max(lost, key=lambda r: len(lost[r]))
         raise FormatError(
-            f"{bad} of {len(rows)} scans are unusable, {len(lost[reason])} of them because: {reason}",
+            f"{bad} of {all_} scans are unusable, {len(lost[reason])} of them because: {reason}",
             where=f"{path}, first in line {lost[reason][0]}",
             wanted=f"at most {MAX_DROPPED:.0%} of bad scans",
         )
     for reason, numbers_of in lost.items():
         drops.drop("laser", reason, len(numbers_of))
-    table = np.array(values)
-    return table[:, :n].astype(np.float32), table[:, n : n + 6], table[:, n + 6], others
+    layouts = Counter(x.layout for x in lines)
+    usual = max(layouts, key=lambda k: (layouts[k], k))
+    beams = _directions(usual)
+    ranges = np.stack([x.ranges if x.layout == usual else _on_beams(x, beams) for x in lines])
+    drops.drop("laser", f"scan of other beams put on the usual {usual[2]} (kept)", len(lines) - layouts[usual])
+    poses = [x.pose for x in lines if x.pose is not None]
+    reach = [x.max_range for x in lines if x.max_range is not None]
+    return _Scans(
+        ranges=ranges,
+        bearings=beams,
+        stamps=np.array([x.stamp for x in lines]),
+        poses=np.array(poses) if poses else None,
+        odom=odom,
+        max_range=float(np.median(reach)) if reach else None,
+    )
+
+
+def _directions(layout: tuple[float, float, int]) -> Array:
+    start, step, n = layout
+    return np.asarray(start + step * np.arange(n, dtype=np.float64)) if step > 0 else bearings(n)
+
+
+def _on_beams(line: _Line, beams: Array) -> npt.NDArray[np.float32]:
+    """Ranges of a scan on other beams: each takes the nearest one within a step, NaN where there is none."""
+    own = _directions(line.layout)
+    k = np.clip(np.searchsorted(own, beams), 1, len(own) - 1)
+    k = k - (beams - own[k - 1] < own[k] - beams)
+    near = np.abs(own[k] - beams) <= max(own[1] - own[0], beams[1] - beams[0])
+    return np.where(near, line.ranges[k], np.nan).astype(np.float32)
+
+
+def _still(poses: Array) -> bool:
+    return bool(np.all(np.ptp(poses[:, 3:], axis=0) == 0.0))
+
+
+def _between(
+    odom: list[tuple[float, float, float, float]], times: Array, most_mended: float, where: str
+) -> tuple[npt.NDArray[np.bool_], Array] | None:
+    """Which stamps lie inside the lines ODOM, and the robot at all of them; None without such lines."""
+    if len(odom) < 2:
+        return None
+    a = np.array(odom)
+    t, _ = mend_stamps(a[:, 0], most_mended, where=f"{where}, lines ODOM")
+    inside = (times >= t[0]) & (times <= t[-1])
+    if not inside.any():
+        raise DataError(
+            "scans and lines ODOM have no time in common",
+            where=where,
+            got=f"scans {times[0]:.1f} to {times[-1]:.1f} s, ODOM {t[0]:.1f} to {t[-1]:.1f} s",
+        )
+    heading = np.unwrap(a[:, 3])
+    return inside, np.column_stack([np.interp(times, t, c) for c in (a[:, 1], a[:, 2], heading)])
 
 
 def _match(ranges: npt.NDArray[np.float32], corrected: Path, drops: DropCounter) -> tuple[npt.NDArray[np.intp], Array]:
@@ -228,7 +366,10 @@ def _match(ranges: npt.NDArray[np.float32], corrected: Path, drops: DropCounter)
 
     A corrected log has lost digits of its stamps, but its ranges are those of the scans.
     """
-    theirs, poses, _, _ = _scans(corrected, DropCounter())
+    found = _scans(corrected, DropCounter())
+    theirs, poses = found.ranges, found.poses
+    if poses is None:
+        raise DataError("corrected log tells no poses", where=str(corrected), wanted="lines FLASER or ROBOTLASER1")
     if theirs.shape[1] != ranges.shape[1]:
         raise DataError(
             "corrected log has other beams", where=str(corrected), got=theirs.shape[1], wanted=ranges.shape[1]

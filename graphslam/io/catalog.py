@@ -7,78 +7,21 @@ Files are looked for under the folders of the environment variable ``GRAPHSLAM_D
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from graphslam.core.errors import DataError, FormatError, MissingDataError, UnknownNameError
+from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
+from graphslam.core.log import SensorLog
 from graphslam.io.cards import Card, CardFile, card, list_cards
+from graphslam.io.readers import reader as find_reader
+from graphslam.io.readers import readers, recognise
 
 DATA_VARIABLE = "GRAPHSLAM_DATA"
 CACHE_VARIABLE = "GRAPHSLAM_CACHE"
 State = Literal["ok", "missing", "differs"]
-
-
-@dataclass(frozen=True, slots=True)
-class Reader:
-    """How a kind of folder is recognised and read.
-
-    Parameters
-    ----------
-    target : str
-        ``module:function``; the function takes the folder. Imported when used.
-    markers : tuple of str
-        A folder that holds one of these files is of this kind.
-    parts : mapping of str to mapping
-        Logs inside one data set, by the name that stands after the card's (``mrclam-dataset7/robot1``), and what the
-        function is told for each.
-    named : bool
-        The function takes ``name``, which is then the card's: what presets are found by.
-    """
-
-    target: str
-    markers: tuple[str, ...] = ()
-    parts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    named: bool = False
-
-    def __call__(self, path: Path, **options: Any) -> Any:
-        module, _, function = self.target.partition(":")
-        return getattr(importlib.import_module(module), function)(path, **options)
-
-
-READERS: dict[str, Reader] = {
-    "log-store": Reader("graphslam.io.log_store:load_log", ("log.json",)),
-    "submap-store": Reader("graphslam.io.submap_store:read_submaps", ("index.json", "submaps/index.json")),
-    "victoria-park": Reader("graphslam.io.victoria_park:read_victoria_park", ("LASER.txt.gz", "LASER.txt")),
-    "slsjf-local-maps": Reader(
-        "graphslam.io.slsjf:read_slsjf_local_maps", ("localmap_1.mat", "slsjf_200_local_maps/localmap_1.mat")
-    ),
-    "ufastslam-detections": Reader(
-        "graphslam.io.victoria_park_published:read_ufastslam_detections",
-        ("ufastslam_ObservationDistance.txt.gz", "ufastslam_ObservationDistance.txt"),
-    ),
-    "mrclam": Reader(
-        "graphslam.io.mrclam:read_mrclam", ("Barcodes.dat",), {f"robot{k}": {"robot": k} for k in range(1, 6)}
-    ),
-    "plaza": Reader("graphslam.io.plaza:read_plaza", ("Plaza1_DR.txt.gz", "Plaza1_DR.txt")),
-    "tuc": Reader("graphslam.io.tuc:read_tuc", ("Lecture_Hall_Input.txt.gz", "Lecture_Hall_Input.txt")),
-    "euroc": Reader("graphslam.io.euroc:read_euroc", ("leica0_sensor.yaml",), named=True),
-    "kitti-gps": Reader("graphslam.io.kitti_gps:read_kitti_gps", ("KittiGps_converted.txt",)),
-    "smartloc": Reader(
-        "graphslam.io.smartloc:read_smartloc",
-        ("Berlin_Potsdamer_Platz_Input.txt.gz", "Berlin_Potsdamer_Platz_Input.txt"),
-    ),
-    "carmen": Reader(
-        "graphslam.io.carmen:read_carmen", ("intel.clf.bz2", "fr079.clf.bz2", "mit-csail.clf.bz2"), named=True
-    ),
-    "lidar-pack": Reader(
-        "graphslam.io.lidar_pack:read_lidar_pack", ("xyz_i16_planar.npy.xz", "xyz_i16_planar.npy"), named=True
-    ),
-}
-"""Readers of folders by name. A pose network is a file: :func:`load` gives its path."""
 
 
 def cache_folder() -> Path:
@@ -171,7 +114,7 @@ def check(data: Card | str) -> list[FileCheck]:
     return [check_file(folder, f) for f in c.files]
 
 
-def load(source: str | os.PathLike[str], **options: Any) -> Any:
+def load(source: str | os.PathLike[str], *, reader: str | None = None, **options: Any) -> Any:
     """Load recorded data by card name, or from a path.
 
     Parameters
@@ -179,25 +122,31 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
     source : str or path
         A card's name; ``card/file`` for one file of a card (the ending may be left out, as ``posegraphs/intel``);
         ``card/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
+    reader : str, optional
+        Name of the reader (:func:`graphslam.io.readers.readers`). By default the card's, or the first one that
+        recognises the path by what it holds.
     options
         For the reader.
 
     Returns
     -------
-    SensorLog, list of Submap, LandmarkObservations, TucLog or Path
-        By the card's reader, or by what the folder holds. A pose network gives the path of its file, for
-        :func:`graphslam.io.network_file.read_network`.
+    SensorLog, list of Submap, LandmarkObservations, TucLog, PoseNetwork or Path
+        By the reader. A pose network of g2o, TORO or iSAM gives the path of its file, for
+        :func:`graphslam.io.network_file.read_network`. ``meta["reader"]`` of a log says who read what, with which
+        options.
 
     Raises
     ------
     UnknownNameError
-        Neither a card nor a path.
+        Neither a card nor a path; no such reader.
     MissingDataError
-        The card's files are not on this machine.
+        The card's files are not on this machine; or something is missing in the folder, or a package.
     FormatError
-        A folder that no reader knows.
+        A file or folder that no reader knows.
     DataError
         A data set for which there is no reader.
+    ConfigError
+        An option that the reader has not.
     """
     text = os.fspath(source)
     known = {c.name for c in list_cards()}
@@ -205,32 +154,48 @@ def load(source: str | os.PathLike[str], **options: Any) -> Any:
         c = card(text)
         if c.reader == "pose-network":
             return _only_file(c)
-        if c.reader is None:
+        if c.reader is None and reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
-        called = {"name": c.name} if READERS[c.reader].named else {}
-        return READERS[c.reader](locate(c), **{**called, **c.options, **options})
+        name = reader or str(c.reader)
+        return _read(name, locate(c), f"data set {c.name}", {"name": c.name}, {**c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
         c = card(name)
-        parts = READERS[c.reader].parts if c.reader in READERS else {}
+        parts = readers()[c.reader].parts if c.reader in readers() else {}
         if not parts:
             return _named_file(c, part)
         if part not in parts:
             raise UnknownNameError(f"part of data set {name!r}", part, parts)
-        return READERS[str(c.reader)](locate(c), **{**c.options, **parts[part], **options})
+        given = {**c.options, **parts[part], **options}
+        return _read(str(c.reader), locate(c), f"data set {c.name}", {"name": c.name}, given)
     path = Path(text)
-    if path.is_file():
-        return path
-    if path.is_dir():
-        for reader in READERS.values():
-            if any((path / m).is_file() for m in reader.markers):
-                return reader(path, **options)
-        raise FormatError(
-            "no reader knows this folder",
-            where=text,
-            wanted="one of " + ", ".join(m for r in READERS.values() for m in r.markers),
-        )
-    raise UnknownNameError("data set or path", text, known)
+    if not path.exists():
+        raise UnknownNameError("data set or path", text, known)
+    if reader is not None:
+        return _read(reader, path, "as asked for", {}, options)
+    found = recognise(path)
+    return _read(found.name, path, found.found, {}, options, found.also)
+
+
+def _read(
+    name: str, path: Path, found: str, named: Mapping[str, Any], options: Mapping[str, Any], also: Sequence[str] = ()
+) -> Any:
+    """What a reader gives; a log remembers who read it."""
+    r = find_reader(name)
+    if not r.takes_name():
+        named = {}
+    value = r(path, **named, **options)
+    if not isinstance(value, SensorLog):
+        return value
+    said = {"name": name, "found": found, "options": {k: _plain(v) for k, v in options.items()}, "also": list(also)}
+    return replace(value, meta={**value.meta, "reader": said})
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it."""
+    if isinstance(value, str | bool | int | float) or value is None:
+        return value
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else str(value)
 
 
 def _only_file(c: Card) -> Path:

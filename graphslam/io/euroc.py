@@ -16,13 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
+from graphslam.core import se3
 from graphslam.core.errors import ConfigError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.reading import read_text, usable
-from graphslam.core.records import Gps
+from graphslam.core.records import Gps, Stream
+from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
+from graphslam.io.look import Look
+from graphslam.io.recognise import euroc_tables, numbers
 from graphslam.io.text_records import find_text_file, read_table
 
 GYRO_BIAS, FORCE_BIAS = 0.1, 0.3
@@ -50,8 +54,9 @@ def read_euroc(
     Parameters
     ----------
     folder : path
-        Holds ``imu0_data.csv``, ``imu0_sensor.yaml``, ``leica0_data.csv`` and ``leica0_sensor.yaml``, tables plain or
-        compressed.
+        Holds ``imu0/data.csv`` and ``imu0/sensor.yaml`` (or ``imu0_data.csv`` and ``imu0_sensor.yaml``), perhaps the
+        same of ``leica0``, and a table of poses (``state_groundtruth_estimate0``, ``vicon0``); tables plain or
+        compressed, in folders of any depth.
     sigma : float
         Of a coordinate of a position [m]; the recording states none.
     late : float
@@ -73,8 +78,11 @@ def read_euroc(
     if not (sigma > 0 and noise_scale > 0 and np.isfinite([sigma, late, noise_scale]).all()):
         raise ConfigError(f"sigma = {sigma}, late = {late}, noise_scale = {noise_scale}; wanted σ and scale above 0")
     counter = DropCounter()
-    stated = read_text(root / "imu0_sensor.yaml")
-    density = {k: _number(stated, word, root / "imu0_sensor.yaml") for k, word in _DENSITIES.items()}
+    tables = euroc_tables(Look(root))
+    a_file = tables.get("imu") or find_text_file(root, "imu0_data.csv")
+    sheet = _sheet(a_file)
+    stated = read_text(sheet)
+    density = {k: _number(stated, word, sheet) for k, word in _DENSITIES.items()}
     noise = ImuNoise(
         gyro=noise_scale * density["gyro"],
         gyro_bias=GYRO_BIAS,
@@ -83,23 +91,62 @@ def read_euroc(
         accelerometer_bias=FORCE_BIAS,
         accelerometer_walk=density["accelerometer_walk"],
     )
-    a = _table(find_text_file(root, "imu0_data.csv"), 7, "imu", counter)
-    z = _table(find_text_file(root, "leica0_data.csv"), 4, "leica", counter)
+    a = _table(a_file, 7, "imu", counter)
     start = a[0][0, 0]
-    imu = Imu(times=1e-9 * (a[0][:, 0] - start), angular_rate=a[0][:, 1:4], specific_force=a[0][:, 4:], noise=noise)
-    n = len(z[0])
-    prism = _matrix(root / "leica0_sensor.yaml")[:3, 3]
-    at = 1e-9 * (z[0][:, 0] - start) - late
-    leica = Gps(times=at, positions=z[0][:, 1:], sigma=np.full(n, sigma), lever=prism)
+    streams: dict[str, Stream] = {
+        "imu": Imu(
+            times=1e-9 * (a[0][:, 0] - start), angular_rate=a[0][:, 1:4], specific_force=a[0][:, 4:], noise=noise
+        )
+    }
+    read = {"imu": a[1]}
+    station = tables.get("leica") or _there(root, "leica0_data.csv")
+    if station is not None:
+        z = _table(station, 4, "leica", counter)
+        prism = _matrix(_sheet(station))[:3, 3]
+        at = 1e-9 * (z[0][:, 0] - start) - late
+        streams["leica"] = Gps(times=at, positions=z[0][:, 1:], sigma=np.full(len(z[0]), sigma), lever=prism)
+        read["leica"] = z[1]
+    for kind in ("truth", "vicon"):
+        if kind in tables and "reference" not in streams:
+            rows, n = _reference(tables[kind], counter)
+            quat = se3.quat_normalize(rows[:, [5, 6, 7, 4]])
+            streams["reference"] = Trajectory(1e-9 * (rows[:, 0] - start), np.column_stack([rows[:, 1:4], quat]))
+            read["reference"] = n
     if drops is not None:
         drops.counts.update(counter.counts)
     return SensorLog(
         name=name,
-        streams={"imu": imu, "leica": leica},
-        read={"imu": a[1], "leica": z[1]},
+        streams=streams,
+        read=read,
         dropped=dict(counter.counts),
         meta={"source": root.name, "sigma": sigma, "late": late, "noise_scale": noise_scale},
     )
+
+
+def _there(root: Path, name: str) -> Path | None:
+    try:
+        return find_text_file(root, name)
+    except MissingDataError:
+        return None
+
+
+def _sheet(table: Path) -> Path:
+    """The data sheet beside a table: ``imu0_data.csv`` and ``imu0_sensor.yaml``, or ``imu0/data.csv`` and its own."""
+    return table.with_name(table.name.partition("data.csv")[0] + "sensor.yaml")
+
+
+def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
+    """Rows of stamp, position and quaternion (w first), and how many there were."""
+    lines = [s for s in read_text(path).splitlines() if s.strip() and not s.startswith("#")]
+    rows = [numbers(s) or [] for s in lines]
+    table = np.array([r[:8] if len(r) >= 8 else [np.nan] * 8 for r in rows]).reshape(-1, 8)
+    norm = np.linalg.norm(np.where(usable(table[:, 4:]), table[:, 4:], 0.0), axis=1)
+    bad = {
+        "a number is not finite": np.asarray(~usable(table[:, 1:]).all(axis=1)),
+        "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.01,
+    }
+    keep = usable_records(table[:, 0], bad, stream="reference", where=str(path), drops=counter)
+    return table[keep], len(table)
 
 
 def _table(path: Path, columns: int, stream: str, counter: DropCounter) -> tuple[Array, int]:

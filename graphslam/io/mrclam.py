@@ -17,6 +17,7 @@ know, and of other robots, are dropped and counted unless asked for.
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def read_mrclam(
     bearing_sigma: float = BEARING_SIGMA,
     range_bias: float = 0.0,
     idle: float = IDLE,
-    name: str = "mrclam-dataset7",
+    name: str | None = None,
     drops: DropCounter | None = None,
 ) -> SensorLog:
     """Read the log of one robot.
@@ -68,8 +69,8 @@ def read_mrclam(
     folder : path
         Holds ``Barcodes.dat``, ``Landmark_Groundtruth.dat`` and ``Robot<k>_Odometry.dat``, ``_Measurement.dat``,
         ``_Groundtruth.dat``, plain or compressed. Landmarks and path without truth files are a log without truth.
-    robot : int
-        1 to 5.
+    robot : int, optional
+        1 to 5; needed where the folder holds several.
     robots : bool
         Keep sightings of other robots, as a stream ``robots`` of its own with ids 1 to 5.
     control_delay : float
@@ -81,8 +82,8 @@ def read_mrclam(
     idle : float
         Spacing of empty scans where nothing was read for longer [s]; ``inf`` for none. Sightings of other robots are
         scans, too, with nothing in them for the stream ``landmarks``.
-    name : str
-        The log is called ``<name>/robot<k>``.
+    name : str, optional
+        The log is called ``<name>/robot<k>``; by default ``name`` is that of the folder.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
 
@@ -93,8 +94,15 @@ def read_mrclam(
     root = Path(folder)
     if not root.is_dir():
         raise MissingDataError("no such folder", where=str(root), wanted="the folder of an MRCLAM data set")
+    name = name or re.sub(r"[^a-z0-9]+", "-", root.name.lower())
+    there = [k for k in range(1, ROBOTS + 1) if any(root.glob(f"Robot{k}_Odometry.dat*"))]
+    if robot is None and len(there) == 1:
+        robot = there[0]
     if robot is None or robot not in range(1, ROBOTS + 1):
-        raise ConfigError(f"{name} holds one log a robot: name one, {name}/robot1 … robot{ROBOTS}, got robot={robot}")
+        raise ConfigError(
+            f"{name} holds one log a robot, here of {', '.join(map(str, there)) or 'none'}: choose one, "
+            f"--reader-option robot={there[0] if there else 1}, or of a card {name}/robot1; got robot={robot}"
+        )
     if not (range_sigma > 0 and bearing_sigma > 0 and idle > 0 and np.isfinite(range_bias + control_delay)):
         raise ConfigError(
             f"σ of range {range_sigma} and bearing {bearing_sigma}, idle {idle}, bias {range_bias}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from graphslam.core.errors import FormatError
 from graphslam.core.network import PoseNetwork
@@ -57,3 +58,8 @@ def read_network(
         got="records " + ", ".join(sorted(other)[:5]) if other else "an empty file",
         wanted="g2o, TORO or iSAM records",
     )
+
+
+def network_path(path: str | os.PathLike[str]) -> Path:
+    """The file itself: networks are read by :func:`read_network`, with the options of its caller."""
+    return Path(path)

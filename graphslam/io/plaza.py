@@ -34,10 +34,10 @@ _LONGEST_STEP = 1.0  # [s]; a longer time between two records is a gap, over whi
 def read_plaza(
     folder: str | os.PathLike[str],
     *,
-    prefix: str = "Plaza1",
+    prefix: str | None = None,
     range_sigma: float = RANGE_SIGMA,
     range_bias: float = 0.0,
-    name: str = "plaza1",
+    name: str | None = None,
     drops: DropCounter | None = None,
 ) -> SensorLog:
     """Read the log.
@@ -46,13 +46,14 @@ def read_plaza(
     ----------
     folder : path
         Holds ``<prefix>_DR.txt`` and ``<prefix>_TD.txt`` (plain or compressed), and ``<prefix>_.mat`` for the truth.
-    prefix : str
+    prefix : str, optional
+        By default that of the one file ``*_DR.txt``.
     range_sigma : float
         σ put on every range [m].
     range_bias : float
         Subtracted from every range [m]; what is not positive then is dropped and counted.
-    name : str
-        Of the log.
+    name : str, optional
+        Of the log; the prefix in small letters by default.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
 
@@ -65,6 +66,14 @@ def read_plaza(
         raise MissingDataError("no such folder", where=str(root), wanted="the folder of a Plaza data set")
     if not (range_sigma > 0 and np.isfinite(range_bias)):
         raise ConfigError(f"range_sigma = {range_sigma}, range_bias = {range_bias}; wanted σ > 0 and a finite bias")
+    if prefix is None:
+        found = sorted({p.name.partition("_DR.txt")[0] for p in root.glob("*_DR.txt*")})
+        if len(found) != 1:
+            raise MissingDataError(
+                f"{len(found)} logs here", where=str(root), got=", ".join(found) or None, wanted="option prefix"
+            )
+        prefix = found[0]
+    name = name or prefix.lower()
     counter = DropCounter()
     truth = _truth(root / f"{prefix}_.mat", counter)
     controls, n_controls = _controls(find_text_file(root, f"{prefix}_DR.txt"), truth, counter)

@@ -6,15 +6,20 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 
 from graphslam.core import se3
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import FormatError
-from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.errors import ConfigError, FormatError
+from graphslam.core.geometry import Array, se2_between, wrap_angle
+from graphslam.core.log import SensorLog
 from graphslam.core.reading import read_text, usable
+from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.look import Look
+from graphslam.io.recognise import is_tum
 
 # Files in the wild print quaternions with as few as three digits.
 _NORM_TOLERANCE = 1e-2
@@ -93,3 +98,50 @@ def _refuse(bad: np.ndarray, what: str, where: str, lines: list[int], got: objec
     if np.any(bad):
         k = int(np.flatnonzero(bad)[0])
         raise FormatError(what, where=f"{where}:{lines[k]}", got=got[k])  # type: ignore[index]
+
+
+def read_tum_log(
+    path: str | os.PathLike[str],
+    *,
+    odometry_sigmas: tuple[float, float] = (0.03, 0.005),
+    name: str | None = None,
+) -> SensorLog:
+    """A trajectory as a log with one stream, ``odometry``.
+
+    Parameters
+    ----------
+    path : path
+        The table, or a folder that holds one.
+    odometry_sigmas : (float, float)
+        σ of one motion, per axis: metres, radians; the table states none.
+    name : str, optional
+
+    Raises
+    ------
+    MissingDataError, FormatError, ConfigError
+    """
+    if not all(np.isfinite(v) and v > 0 for v in odometry_sigmas):
+        raise ConfigError(f"tum: odometry_sigmas are {odometry_sigmas}; wanted positive numbers")
+    file = Path(path)
+    if file.is_dir():
+        look = Look(file)
+        file = next((p for p in look.texts if is_tum(look, p)), file / "trajectory.tum")
+    found = read_tum(file)
+    if len(found) < 2:
+        raise FormatError("holds fewer than two poses", where=str(file), got=len(found))
+    metres, radians = odometry_sigmas
+    if found.dim == 2:
+        steps = np.zeros_like(found.poses)
+        steps[1:] = se2_between(found.poses[:-1], found.poses[1:])
+        variance = np.diag([metres**2, metres**2, radians**2])
+    else:
+        steps = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
+        steps[1:] = se3.se3_between(found.poses[:-1], found.poses[1:])
+        variance = np.diag(np.repeat([radians**2, metres**2], 3))
+    odometry = Odometry(times=found.times, increments=steps, covariances=np.tile(variance, (len(found), 1, 1)))
+    return SensorLog(
+        name=name or file.stem,
+        streams={"odometry": odometry},
+        read={"odometry": len(found)},
+        meta={"source": file.name},
+    )

@@ -495,8 +495,17 @@ def plaza(root: Path) -> None:
 def euroc(root: Path) -> None:
     t = (1.4e9 + 0.005 * np.arange(40)) * 1e9
     unit = np.column_stack([t, np.tile([0.1, 0, 0, 9.1, 0.1, -3.3], (40, 1))])
-    np.savetxt(root / "imu0_data.csv", unit, delimiter=",", fmt=["%d", *["%.6g"] * 6], header="stamp,w,a")
-    np.savetxt(root / "leica0_data.csv", np.column_stack([t[::10], rng().normal(size=(4, 3))]), "%.17g", ",")
+    np.savetxt(
+        root / "imu0_data.csv",
+        unit,
+        delimiter=",",
+        fmt=["%d", *["%.6g"] * 6],
+        header="timestamp [ns],w_RS_S_x [rad s^-1],y,z,a,b,c",
+        comments="#",
+    )
+    prism = np.column_stack([t[::10], rng().normal(size=(4, 3))])
+    head = "timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]"
+    np.savetxt(root / "leica0_data.csv", prism, "%.17g", ",", header=head, comments="#")
     densities = "gyroscope_noise_density: 1.7e-4", "gyroscope_random_walk: 2e-5 # [rad]"
     densities += "accelerometer_noise_density: 2e-3", "accelerometer_random_walk: 3e-3"
     (root / "imu0_sensor.yaml").write_text("\n".join(densities) + "\n")

@@ -10,7 +10,8 @@ import pytest
 
 from graphslam.core.errors import FormatError, UnknownNameError
 from graphslam.io.cards import Card, card, cards_folder, list_cards, read_card
-from graphslam.io.catalog import READERS, check_file
+from graphslam.io.catalog import check_file
+from graphslam.io.readers import readers
 
 CARDS = list_cards()
 
@@ -26,7 +27,7 @@ def test_card_says_what_a_user_must_know(c: Card) -> None:
         assert len(text) > 3
     assert c.caveats
     assert re.match(r"https?://", c.source)
-    assert c.reader is None or c.reader in READERS or c.reader == "pose-network"
+    assert c.reader is None or c.reader in readers() or c.reader == "pose-network"
     for f in c.files:
         assert f.url is None or f.url.startswith("https://")
         if f.path.endswith((".gz", ".bz2", ".xz")):

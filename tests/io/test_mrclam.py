@@ -40,7 +40,7 @@ def read(folder: Path, **options):
 
 def test_lines_become_controls_scans_and_truth(folder):
     log = read(folder, control_delay=0.25, range_bias=0.5, idle=np.inf)
-    assert log.name == "mrclam-dataset7/robot2"
+    assert log.name.endswith("/robot2")
     c, o = log["controls"], log["landmarks"]
     assert c.times[3] == pytest.approx(100.55)
     assert (c.speed[3], c.yaw_rate[3]) == (0.1, 0.03)
@@ -130,7 +130,9 @@ def test_bad_files_are_refused_with_file_and_line(folder, name, old, new, what):
 
 
 def test_what_is_asked_for_must_be_there(folder, tmp_path):
-    with pytest.raises(ConfigError, match="one log a robot"):
+    assert read_mrclam(folder).name.endswith("/robot2")  # the only one there
+    (folder / "Robot1_Odometry.dat").write_text("0 0 0\n")
+    with pytest.raises(ConfigError, match=r"one log a robot, here of 1, 2: choose one, --reader-option robot=1"):
         read_mrclam(folder)
     with pytest.raises(ConfigError, match="one log a robot"):
         read_mrclam(folder, robot=6)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from graphslam.app.cli.run import JSON, MAX_SIZE, run_options
+from graphslam.app.cli.run import JSON, MAX_SIZE, PRESET, READER, READER_OPTION, reader_options, run_options
 from graphslam.app.cli.terminal import emit
 from graphslam.core.atomic import atomic_open
 from graphslam.core.config import dump_toml
@@ -18,11 +18,14 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate(
-    source: str = typer.Argument(..., help="Name of a data-set card, or a folder that holds a log."),
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
     frontend: str | None = typer.Option(
         None, help="Front end that is to read the log. Default: one that reads what is in it."
     ),
     quick: bool = typer.Option(False, "--quick", help="A part of the log, some seconds of work: as inside a run."),
+    reader: str | None = READER,
+    reader_option: list[str] = READER_OPTION,
+    preset: str | None = PRESET,
     config: Path | None = typer.Option(None, help="TOML file with options, as for a run."),
     setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
@@ -34,7 +37,17 @@ def calibrate(
     from graphslam.app.run.calibration import calibrate_log
 
     options = run_options(config, setting)
-    found = calibrate_log(source, frontend=frontend, quick=quick, seed=seed, config=options)
+    given = reader_options(reader_option)
+    found = calibrate_log(
+        source,
+        frontend=frontend,
+        quick=quick,
+        seed=seed,
+        config=options,
+        reader=reader,
+        reader_options=given,
+        preset=preset,
+    )
     lines = [f"{f.level or '-':4}  {f.text}" for f in found.findings()]
     if out is not None:
         with atomic_open(out, "w") as file:

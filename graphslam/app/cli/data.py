@@ -67,6 +67,26 @@ def info(name: str, as_json: bool = JSON) -> None:
     emit(value, "\n".join(lines), as_json=as_json)
 
 
+@app.command("readers")
+def list_readers(
+    name: str | None = typer.Argument(None, help="Name of one reader, for its options."), as_json: bool = JSON
+) -> None:
+    """List what can be read, or the options of one reader."""
+    from graphslam.io.readers import reader, readers
+
+    if name is None:
+        rows = [{"name": n, "reads": r.says} for n, r in readers().items()]
+        emit({"readers": rows}, table(rows), as_json=as_json)
+        return
+    r = reader(name)
+    options = [
+        {"option": o.name, "type": str(o.annotation), "default": None if o.default is None else str(o.default)}
+        for o in r.options().values()
+    ]
+    value = {"name": name, "reads": r.says, "options": options}
+    emit(value, f"{name}: {r.says}\n{table(options, ['option', 'type', 'default'])}", as_json=as_json)
+
+
 @app.command()
 def fetch(name: str, as_json: bool = JSON) -> None:
     """Find a data set on this machine, or download it and check its checksums."""

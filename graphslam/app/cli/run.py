@@ -30,6 +30,23 @@ MAX_SIZE = typer.Option(
     callback=_limit,
     help="Largest decompressed size of one input file, for example 8G. Default: 2G.",
 )
+READER = typer.Option(None, help="Name of the reader (`graphslam data readers`). Default: what recognises the source.")
+READER_OPTION = typer.Option(
+    [], "--reader-option", help="Option of the reader, as name=value (`graphslam data readers NAME`). May be repeated."
+)
+PRESET = typer.Option(
+    None, help="Name of the source whose preset is taken, or none. Default: that of the log, or of its kind."
+)
+
+
+def reader_options(settings: list[str]) -> dict[str, Any]:
+    """Options of a reader by name."""
+    values: dict[str, Any] = {}
+    for text in settings:
+        values |= parse_setting(text)
+    return values
+
+
 JSON = typer.Option(False, "--json", help="Print one JSON object on stdout, and nothing else.")
 
 
@@ -41,9 +58,14 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    source: str = typer.Argument(..., help="Name of a data-set card, or a folder that holds a log."),
-    frontend: str = typer.Option("rbpf-ekf", help="Name of the front end that turns the log into submaps."),
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
+    frontend: str | None = typer.Option(
+        None, help="Name of the front end that turns the log into submaps. Default: by what the log holds."
+    ),
     solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
+    reader: str | None = READER,
+    reader_option: list[str] = READER_OPTION,
+    preset: str | None = PRESET,
     config: Path | None = typer.Option(
         None, help="TOML file with options; they replace those of the preset of the source."
     ),
@@ -70,6 +92,9 @@ def run(
         config=options,
         resume=resume,
         progress=not as_json,
+        reader=reader,
+        reader_options=reader_options(reader_option),
+        preset=preset,
     )
     rows = result.metrics.to_dict("records")
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}

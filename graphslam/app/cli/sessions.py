@@ -7,7 +7,7 @@ from typing import cast
 
 import typer
 
-from graphslam.app.cli.run import JSON, MAX_SIZE
+from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
 from graphslam.app.cli.terminal import emit, table
 
 
@@ -53,6 +53,8 @@ def localise(
     submap: list[int] = typer.Option([], help="Localise only the submap with this key. May be repeated."),
     begin: float | None = typer.Option(None, help="Use a log from this time on [s]."),
     end: float | None = typer.Option(None, help="Use a log up to this time [s]."),
+    reader: str | None = READER,
+    reader_option: list[str] = READER_OPTION,
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
@@ -60,7 +62,8 @@ def localise(
     from graphslam.app.sessions.localise import localise as find
     from graphslam.app.sessions.localise import source_of
 
-    found = find(run, source_of(source, submap, begin, end), progress=not as_json)
+    taken = source_of(source, submap, begin, end, reader=reader, reader_options=reader_options(reader_option))
+    found = find(run, taken, progress=not as_json)
     rows = found.rows()
     columns = ["submap_map", "submap_here", "score", "accepted", "why"]
     text = f"{table(rows, columns)}\n{found!r}"

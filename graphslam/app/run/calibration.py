@@ -67,6 +67,9 @@ def calibrate_log(
     quick: bool = False,
     seed: int = 0,
     config: Mapping[str, Any] | None = None,
+    reader: str | None = None,
+    reader_options: Mapping[str, Any] | None = None,
+    preset: str | None = None,
 ) -> Calibration:
     """What a log says of the noise and the lasting errors of its own sensors, without truth and presets' noise.
 
@@ -80,6 +83,8 @@ def calibrate_log(
     seed : int
     config : mapping, optional
         Options over those of the source's preset, as for a run: how scans and landmarks are read.
+    reader, reader_options, preset
+        As for a run.
 
     Raises
     ------
@@ -91,9 +96,9 @@ def calibrate_log(
     >>> found = gs.calibrate_log("plaza1")
     >>> gs.run("plaza1", config={"calibrate": found.config()})
     """
-    log = load_log_source(source)
+    log = load_log_source(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
-    options = merge(recommended(log, name), config or {})
+    options = merge(recommended(log, name, preset), config or {})
     front = make_front_end(name, options.get("frontend", {}))
     with one_blas_thread():
         return calibration(log, front, QUICK if quick else FULL, seed=seed)

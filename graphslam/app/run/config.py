@@ -47,3 +47,10 @@ def preset(name: str) -> dict[str, Any]:
     """Recommended settings of a source, or nothing where there are none."""
     file = resources.files("graphslam.app") / "presets" / f"{name}.toml"
     return tomllib.loads(file.read_text()) if file.is_file() else {}
+
+
+def preset_names(frontend: str) -> list[str]:
+    """Sources that have recommended settings for a front end."""
+    end = f".{frontend}.toml"
+    files = (resources.files("graphslam.app") / "presets").iterdir()
+    return sorted(f.name[: -len(end)] for f in files if f.name.endswith(end))

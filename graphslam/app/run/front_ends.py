@@ -8,10 +8,12 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from graphslam.app.run import config as cfg
+from graphslam.app.run.choice import kind_preset
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.frontends.base import FrontEnd
+from graphslam.io.readers import readers
 
 GROUP = "graphslam.frontends"
 
@@ -49,14 +51,32 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
     return made
 
 
-def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
+def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
 
     Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
-    (``garage-A``) that of the world.
+    (``garage-A``) that of the world. A recorded log without one has that of its reader, or else of its kind.
+
+    Parameters
+    ----------
+    log : SensorLog
+    frontend : str
+    preset : str, optional
+        Name of a preset instead; ``none``: defaults.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such preset for the front end.
     """
-    name = log.name.partition("/")[0]
-    values = cfg.preset(f"{name}.{frontend}") or cfg.preset(f"{name.rpartition('-')[0]}.{frontend}")
+    if preset == "none":
+        return {}
+    if preset is not None:
+        known = cfg.preset_names(frontend)
+        if preset not in known:
+            raise UnknownNameError(f"preset for front end {frontend!r}", preset, [*known, "none"])
+        return cfg.preset(f"{preset}.{frontend}")
+    values = cfg.preset(f"{preset_of(log, frontend)[0]}.{frontend}")
     noise = log.meta.get("noise", {})
     simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
     if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):
@@ -64,3 +84,17 @@ def recommended(log: SensorLog, frontend: str) -> dict[str, Any]:
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
         values = merge({"frontend": {"motion": motion}}, values)
     return values
+
+
+def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:
+    """Name of the preset that :func:`recommended` takes, empty where there is none; and is it made for this very set?
+
+    That of a reader or of a kind of log says how it is read; its noise is that of other robots.
+    """
+    name = log.name.partition("/")[0]
+    read: Any = log.meta.get("reader")
+    known = readers().get(read.get("name", "")) if isinstance(read, Mapping) else None
+    there = cfg.preset_names(frontend)
+    own = next((n for n in (name, name.rpartition("-")[0]) if n in there), "")
+    kind = next((n for n in ("" if known is None else known.preset, kind_preset(log)) if n in there), "")
+    return own or kind, bool(own) or not kind

@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.run.pipeline import load_log_source
+from graphslam.app.run.source import load_log_source
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog

@@ -18,9 +18,10 @@ from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.calibration import own_noise, prepared, without_noise
+from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, preset_of, recommended
 from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_back
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_facts, write_outputs
@@ -86,7 +87,7 @@ logger = logging.getLogger(__name__)
 def run(
     source: str | Path | SensorLog,
     *,
-    frontend: str = "rbpf-ekf",
+    frontend: str | None = None,
     solver: str = "isam2",
     seed: int = 0,
     out: str | Path | None = None,
@@ -95,14 +96,19 @@ def run(
     progress: bool = True,
     undo: Sequence[int | Decision] | None = None,
     observers: Sequence[Observer] = (),
+    reader: str | None = None,
+    reader_options: Mapping[str, Any] | None = None,
+    preset: str | None = None,
 ) -> Run:
     """Run a front end over a log, join its submaps in a graph, and score what can be scored.
 
     Parameters
     ----------
-    source : card name, folder, or SensorLog
-    frontend, solver : str
-        Registered names.
+    source : card name, file, folder, or SensorLog
+    frontend : str, optional
+        Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`).
+    solver : str
+        Registered name.
     seed : int
         Root of the seed tree.
     out : path, optional
@@ -119,6 +125,13 @@ def run(
     observers : sequence of Observer
         Told what goes on while it does: steps of a front end that can be watched, submaps, loops, the solution
         (`graphslam.backend.back_end.Observer`).
+    reader : str, optional
+        Name of the reader of the source; by default the one that recognises it.
+    reader_options : mapping, optional
+        For the reader.
+    preset : str, optional
+        Name of the source whose recommended settings are taken, ``"none"`` for defaults; by default those of the log,
+        its reader, or its kind.
 
     Raises
     ------
@@ -131,31 +144,54 @@ def run(
     >>> run.metric("gps_withheld_rmse")
     """
     with one_blas_thread():
-        return _run(source, frontend, solver, seed, out, config or {}, resume, progress, undo, observers)
+        begin = time.perf_counter()
+        log = load_log_source(source, reader=reader, **(reader_options or {}))
+        loading = time.perf_counter() - begin
+        frontend, suggested, own = _chosen(log, frontend, preset)
+        asked = config or {}
+        return _run(log, loading, frontend, solver, seed, out, suggested, own, asked, resume, progress, undo, observers)
+
+
+def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[str, dict[str, Any], bool]:
+    """Front end, preset, and whether it was made for this very set; what was read and chosen is told in a line each."""
+    read = reading_line(log)
+    if read:
+        logger.warning(read)
+    why = "as asked for"
+    if frontend is None:
+        choice = choose_front_end(log)
+        frontend, why = choice.frontend, choice.why
+    options = recommended(log, frontend, preset)
+    if read:
+        taken = preset or preset_of(log, frontend)[0] or "none"
+        logger.warning("front end: %s (%s); preset: %s", frontend, why, taken)
+    own = bool(options) and (preset is not None or preset_of(log, frontend)[1])
+    return frontend, options, own
 
 
 def _run(
-    source: str | Path | SensorLog,
+    log: SensorLog,
+    loading: float,
     frontend: str,
     solver: str,
     seed: int,
     out: str | Path | None,
+    suggested: Mapping[str, Any],
+    own: bool,
     config: Mapping[str, Any],
     resume: bool,
     progress: bool,
     undo: Sequence[int | Decision] | None,
     observers: Sequence[Observer],
 ) -> Run:
-    begin = time.perf_counter()
-    log = load_log_source(source)
-    seconds = {"load": time.perf_counter() - begin}
-    suggested = recommended(log, frontend)
-    options = merge(suggested if own_noise(config) else without_noise(suggested), config)
+    begin = time.perf_counter() - loading
+    seconds = {"load": loading}
+    options = merge(suggested if own and own_noise(config) else without_noise(suggested), config)
     settings: cfg.RunConfig = build(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
-    log, applied, said, _ = prepared(log, front, settings.calibrate, config, own=bool(suggested), seed=seed)
+    log, applied, said, _ = prepared(log, front, settings.calibrate, config, own=own, seed=seed)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]

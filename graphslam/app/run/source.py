@@ -10,13 +10,14 @@ from graphslam.core.log import SensorLog
 from graphslam.io.catalog import load
 
 
-def load_log_source(source: str | Path | SensorLog, **options: Any) -> SensorLog:
-    """A log from a card name, a folder on disk, or itself; ``options`` are for the reader."""
+def load_log_source(source: str | Path | SensorLog, *, reader: str | None = None, **options: Any) -> SensorLog:
+    """A log from a card name, a file or folder on disk, or itself; ``options`` are for the reader."""
     if isinstance(source, SensorLog):
         return source
-    log = load(source, **options)
+    log = load(source, reader=reader, **options)
     if not isinstance(log, SensorLog):
-        raise MissingDataError(
-            f"{source} holds no sensor log", got=type(log).__name__, wanted="a log of sensor streams"
-        )
+        verb = "solve" if isinstance(log, Path) else "join" if isinstance(log, list) else ""
+        kind = {"solve": "a pose network", "join": "submaps"}.get(verb, type(log).__name__)
+        wanted = "a log of sensor streams" + (f"; this is for `graphslam {verb} {source}`" if verb else "")
+        raise MissingDataError(f"{source} holds no sensor log", got=kind, wanted=wanted)
     return log

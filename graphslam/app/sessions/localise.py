@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,8 +15,8 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import open_run
-from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.run.run import Run
+from graphslam.app.run.source import load_log_source
 from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_maps
 from graphslam.backend.sessions import DenseSession, attach, put
 from graphslam.core.errors import DataError, MissingDataError, SolverError
@@ -120,7 +120,13 @@ def localise(
 
 
 def source_of(
-    source: str | Path, keys: Sequence[int] = (), begin: float | None = None, end: float | None = None
+    source: str | Path,
+    keys: Sequence[int] = (),
+    begin: float | None = None,
+    end: float | None = None,
+    *,
+    reader: str | None = None,
+    reader_options: Mapping[str, Any] | None = None,
 ) -> Sequence[Submap] | SensorLog:
     """What is to be found: submaps of a run folder, or a stretch of a log.
 
@@ -131,6 +137,8 @@ def source_of(
         Of a run folder, only these submaps, which must follow one another.
     begin, end : float, optional
         Of a log [s].
+    reader : str, optional
+    reader_options : mapping, optional
 
     Raises
     ------
@@ -148,7 +156,7 @@ def source_of(
             )
         submaps = with_maps(run)
         return submaps if not rows else [submaps[k] for k in rows]
-    log = load_log_source(source)
+    log = load_log_source(source, reader=reader, **(reader_options or {}))
     a, b = log.interval
     part = log.slice(a if begin is None else begin, b if end is None else end)
     if not any(len(s.times) for s in part.streams.values()):

@@ -1,0 +1,97 @@
+"""What fits a log: the front end that its streams allow, and the preset that its kind has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from graphslam.core.errors import MissingDataError
+from graphslam.core.gnss import Pseudoranges
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import (
+    Gps,
+    LandmarkObservations,
+    LaserScans,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A front end, and why.
+
+    Parameters
+    ----------
+    frontend : str
+    why : str
+        What of the log it is for.
+    """
+
+    frontend: str
+    why: str
+
+
+def choose_front_end(log: SensorLog) -> Choice:
+    """The front end for what a log holds.
+
+    Raises
+    ------
+    MissingDataError
+        There is none: says what the log holds, what is missing, and what works.
+    """
+
+    def has(*kinds: type) -> bool:
+        return any(isinstance(s, kinds) and len(s.times) for s in log.streams.values())
+
+    moves = has(SteeringControls, VelocityControls, Odometry)
+    if has(LandmarkObservations) and moves:
+        return Choice("rbpf-ekf", "sightings of landmarks with odometry")
+    if has(SteeringControls) and has(LaserScans):
+        return Choice("rbpf-ekf", "planar laser of a steered car, in whose scans it looks for trunks")
+    if has(RangeScans) and (moves or has(Imu)):
+        return Choice("segslam", "spinning scanners with motion")
+    if has(PointClouds):
+        return Choice("kiss-icp", "clouds of a 3-D lidar, which it follows without other sensors")
+    if has(LaserScans) and moves:
+        return Choice("segslam", "planar laser with odometry")
+    held = ", ".join(f"{n} ({type(s).__name__}, {len(s.times)} records)" for n, s in log.streams.items()) or "nothing"
+    raise MissingDataError("no front end makes a map of this log", where=log.name, got=held, wanted=_wanted(log))
+
+
+def _wanted(log: SensorLog) -> str:
+    kinds = {type(s) for s in log.streams.values()}
+    if LaserScans in kinds:
+        return "odometry beside the laser scans (wheels, or poses of the robot)"
+    if LandmarkObservations in kinds:
+        return "odometry or velocities beside the sightings"
+    if Pseudoranges in kinds:
+        return "scans or sightings of landmarks; pseudoranges alone are solved by `graphslam study smartloc`"
+    if Gps in kinds and Imu in kinds:
+        return "scans, clouds or sightings; IMU and fixes alone are solved by `graphslam study withheld-fixes`"
+    return "laser scans with odometry, clouds, or sightings of landmarks with odometry"
+
+
+def kind_preset(log: SensorLog) -> str:
+    """Name of the preset for recorded logs of that kind; empty where there is none, and for simulated logs."""
+    if "reader" not in log.meta or log.meta.get("source") == "simulation":
+        return ""
+    kinds: set[object] = {type(s) for s in log.streams.values()}
+    if PointClouds in kinds:
+        return "clouds"
+    return "planar-laser" if LaserScans in kinds and (Odometry in kinds or VelocityControls in kinds) else ""
+
+
+def reading_line(log: SensorLog) -> str:
+    """What was read by whom, in one line; empty for a log that was not read."""
+    read: Any = log.meta.get("reader")
+    if not isinstance(read, dict):
+        return ""
+    streams = ", ".join(f"{n} {len(s.times)}" for n, s in log.streams.items())
+    also = f"; could also be read as {', '.join(read['also'])} (--reader)" if read.get("also") else ""
+    notes = "".join(f"; {n}" for n in log.meta.get("notes", []))
+    return f"read: {read.get('found')} by reader {read.get('name')!r}: {streams}{notes}{also}"

@@ -1,0 +1,326 @@
+"""One cloud from one file: BIN (KITTI), PLY, PCD, LAS, LAZ. Points, and their times where the file tells them.
+
+Headers are read strictly and sizes are checked against the file before anything is allocated. Points that are not
+finite are left out, and so are those at the origin, which drivers write for a missing return.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.reading import check_size, read_bytes, usable
+from graphslam.io.look import ending
+
+TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestampoffset", "time_offset", "gps_time")
+"""Names of fields with times of points, in small letters and without ``scalar_`` before them."""
+_PLY_TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
+}
+_HEADER = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Points of one file.
+
+    Parameters
+    ----------
+    points : (m, 3)
+        Finite [m].
+    times : (m,) or None
+        As the file has them, in its own unit.
+    field : str
+        Name of the field they are of.
+    not_finite, at_origin : int
+        Points that were left out.
+    """
+
+    points: Array
+    times: Array | None = None
+    field: str = ""
+    not_finite: int = 0
+    at_origin: int = 0
+
+
+def clean(points: Array, times: Array | None = None, field: str = "") -> Cloud:
+    """A cloud of what is usable of ``points`` ``(m, 3)``."""
+    finite = np.asarray(usable(points).all(axis=1))
+    if times is not None:
+        finite &= np.asarray(usable(times))
+    with np.errstate(invalid="ignore"):
+        zero = finite & (points == 0.0).all(axis=1)
+    keep = finite & ~zero
+    return Cloud(
+        np.ascontiguousarray(points[keep], dtype=np.float64),
+        None if times is None else np.ascontiguousarray(times[keep], dtype=np.float64),
+        field,
+        int((~finite).sum()),
+        int(zero.sum()),
+    )
+
+
+def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
+    """Read one cloud; the format is told by the first bytes, that of BIN by its ending.
+
+    Parameters
+    ----------
+    path : path
+    columns : int
+        Of float32 in a BIN file, x, y and z first: 4 in KITTI, 5 in nuScenes.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        No such file, truncated, or without x, y and z; a package for LAS is missing.
+    """
+    p = Path(path)
+    raw = read_bytes(p)
+    if raw.startswith(b"ply"):
+        return _ply(raw, str(p))
+    if raw[:4] == b"LASF":
+        return _las(raw, str(p))
+    if re.match(rb"(#.*\n)*\s*VERSION\s", raw[:2000]):
+        return _pcd(raw, str(p))
+    if ending(p) == ".bin":
+        return _bin(raw, str(p), columns)
+    raise FormatError(
+        "no cloud of a known format", where=str(p), got=repr(raw[:12]), wanted="BIN, PLY, PCD, LAS or LAZ"
+    )
+
+
+def _bin(raw: bytes, where: str, columns: int) -> Cloud:
+    if not 3 <= columns <= 32:
+        raise FormatError("number of columns is impossible", where=where, got=columns, wanted="3 to 32")
+    if len(raw) % (4 * columns):
+        fits = [c for c in (3, 4, 5, 6) if len(raw) % (4 * c) == 0]
+        raise FormatError(
+            f"size is no multiple of {columns} float32",
+            where=where,
+            got=f"{len(raw)} bytes",
+            wanted=f"whole points, or option columns ({' or '.join(map(str, fits)) or 'no usual number'} would fit)",
+        )
+    return clean(np.frombuffer(raw, "<f4").reshape(-1, columns)[:, :3].astype(np.float64))
+
+
+def _table(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
+    """A cloud of columns by name."""
+    lower = {k.lower().removeprefix("scalar_"): k for k in fields}
+    if not {"x", "y", "z"} <= lower.keys():
+        raise FormatError("points have no x, y, z", where=where, got=", ".join(fields)[:200], wanted="x, y, z")
+    xyz = np.column_stack([fields[lower[c]].astype(np.float64) for c in "xyz"])
+    name = next((lower[n] for n in TIME_FIELDS if n in lower), "")
+    times = fields[name].astype(np.float64) if name else None
+    return clean(xyz, times, name)
+
+
+def _ply(raw: bytes, where: str) -> Cloud:
+    end = re.search(rb"end_header[ \t]*\r?\n", raw[:_HEADER])
+    if end is None:
+        raise FormatError("PLY header has no end", where=where, wanted="end_header in the first 64 kB")
+    form, elements = "", list[tuple[str, int, list[tuple[str, str]]]]()
+    for line in raw[: end.start()].decode("latin-1").splitlines():
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                form = words[1]
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                kind = "list" if words[1] == "list" else _PLY_TYPES[words[1]]
+                elements[-1][2].append((words[-1], kind))
+        except (IndexError, ValueError, KeyError) as error:
+            raise FormatError(f"PLY header is damaged ({error})", where=where, got=line[:80]) from None
+    names = [e[0] for e in elements]
+    if "vertex" not in names:
+        raise FormatError("PLY file holds no vertices", where=where, got=", ".join(names) or None, wanted="vertex")
+    at = names.index("vertex")
+    _, n, properties = elements[at]
+    labels = [p for p, _ in properties]
+    if n < 0 or any(k == "list" for _, k in properties) or len(set(labels)) != len(labels) or not labels:
+        raise FormatError("vertices of this PLY file are not read", where=where, got=labels, wanted="plain numbers")
+    body = raw[end.end() :]
+    if form == "ascii":
+        skip = sum(e[1] for e in elements[:at])
+        rows = body.splitlines()[skip : skip + n]
+        return _table(_ascii(rows, n, labels, where), where)
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form)
+    if order is None:
+        raise FormatError("unknown form of PLY", where=where, got=form, wanted="ascii or binary")
+    first = 0
+    for _, count, inner in elements[:at]:
+        if any(k == "list" for _, k in inner):
+            raise FormatError("lists before the vertices are not read", where=where, wanted="vertices first")
+        first += count * sum(np.dtype(k).itemsize for _, k in inner)
+    dtype = np.dtype([(p, order + k) for p, k in properties])
+    return _table(_records(body[first:], n, dtype, where), where)
+
+
+def _ascii(rows: list[bytes], n: int, labels: list[str], where: str) -> dict[str, npt.NDArray[Any]]:
+    if len(rows) < n:
+        raise FormatError("file is truncated", where=where, got=f"{len(rows)} points", wanted=n)
+    words = [r.split() for r in rows]
+    bad = next((k for k, w in enumerate(words) if len(w) != len(labels)), None)
+    if bad is not None:
+        raise FormatError(
+            f"point {bad} has another number of values", where=where, got=len(words[bad]), wanted=len(labels)
+        )
+    try:
+        a = np.array(words, dtype=np.float64).reshape(-1, len(labels))
+    except ValueError as error:
+        raise FormatError(f"point holds no number ({error})", where=where) from None
+    return {c: a[:, k] for k, c in enumerate(labels)}
+
+
+def _records(body: bytes, n: int, dtype: np.dtype[Any], where: str) -> dict[str, npt.NDArray[Any]]:
+    if n * dtype.itemsize > len(body):
+        raise FormatError(
+            "file is truncated", where=where, got=f"{len(body) // dtype.itemsize} points", wanted=f"{n} of the header"
+        )
+    a = np.frombuffer(body, dtype, count=n)
+    assert dtype.names is not None
+    return {c: a[c] for c in dtype.names if a[c].ndim == 1}
+
+
+def _pcd(raw: bytes, where: str) -> Cloud:
+    end = re.search(rb"\bDATA\s+(\w+)[ \t]*\r?\n", raw[:_HEADER])
+    if end is None:
+        raise FormatError("PCD header has no end", where=where, wanted="DATA in the first 64 kB")
+    said: dict[str, list[str]] = {}
+    for line in raw[: end.start()].decode("latin-1").splitlines():
+        words = line.split("#")[0].split()
+        if words:
+            said[words[0].upper()] = words[1:]
+    try:
+        fields = said["FIELDS"] if "FIELDS" in said else said["COLUMNS"]
+        sizes, kinds = [int(s) for s in said["SIZE"]], said["TYPE"]
+        counts = [int(c) for c in said.get("COUNT", ["1"] * len(fields))]
+        n = int(said["POINTS"][0]) if "POINTS" in said else int(said["WIDTH"][0]) * int(said["HEIGHT"][0])
+    except (KeyError, IndexError, ValueError) as error:
+        raise FormatError(f"PCD header is damaged ({error})", where=where) from None
+    codes = {"F": "f", "I": "i", "U": "u"}
+    ok = len(fields) == len(sizes) == len(kinds) == len(counts) and n >= 0 and 0 < len(fields) <= 100
+    if not ok or any(
+        k not in codes or s not in (1, 2, 4, 8) or (k == "F" and s < 4) or not 1 <= c <= 1000
+        for k, s, c in zip(kinds, sizes, counts)
+    ):
+        raise FormatError(
+            "PCD header is damaged", where=where, got={k: said.get(k) for k in ("FIELDS", "SIZE", "TYPE", "COUNT")}
+        )
+    columns = [  # fields named "_" are padding and stand several times
+        (f"{f}#{i}" if f == "_" else f, f"<{codes[k]}{s}", c)
+        for i, (f, k, s, c) in enumerate(zip(fields, kinds, sizes, counts))
+    ]
+    if len({c[0] for c in columns}) != len(columns):
+        raise FormatError("a field stands twice", where=where, got=fields)
+    dtype = np.dtype([(f, d) if c == 1 else (f, d, (c,)) for f, d, c in columns])
+    body, form = raw[end.end() :], end[1].decode().lower()
+    if form == "ascii":
+        labels = [f if c == 1 else f"{f}#{j}" for f, _, c in columns for j in range(c)]
+        return _table(_ascii([r for r in body.splitlines() if r.strip()][:n], n, labels, where), where)
+    if form == "binary":
+        return _table(_records(body, n, dtype, where), where)
+    if form != "binary_compressed":
+        raise FormatError("unknown form of PCD", where=where, got=form, wanted="ascii, binary or binary_compressed")
+    packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
+    check_size(plain, where)
+    if plain != n * dtype.itemsize or packed > len(body) - 8:
+        raise FormatError("file is truncated", where=where, got=f"{len(body) - 8} bytes", wanted=f"{packed} packed")
+    data = lzf(body[8 : 8 + packed], plain, where)
+    out, at = {}, 0
+    for f, d, c in columns:  # field after field, not point after point
+        size = np.dtype(d).itemsize * c * n
+        if c == 1:
+            out[f] = np.frombuffer(data, d, count=n, offset=at)
+        at += size
+    return _table(out, where)
+
+
+def lzf(data: bytes, size: int, where: str) -> bytes:
+    """Unpack LZF (as liblzf of PCL packs) to ``size`` bytes.
+
+    Raises
+    ------
+    FormatError
+    """
+    out = bytearray()
+    at, end = 0, len(data)
+    try:
+        while at < end:
+            control = data[at]
+            at += 1
+            if control < 32:  # so many bytes as they are
+                if at + control + 1 > end:
+                    raise IndexError
+                out += data[at : at + control + 1]
+                at += control + 1
+            else:  # a copy of what is there already
+                length = control >> 5
+                if length == 7:
+                    length += data[at]
+                    at += 1
+                begin = len(out) - ((control & 31) << 8) - data[at] - 1
+                at += 1
+                length += 2
+                if begin < 0:
+                    raise IndexError
+                if begin + length <= len(out):
+                    out += out[begin : begin + length]
+                else:
+                    for k in range(length):
+                        out.append(out[begin + k])
+            if len(out) > size:
+                raise IndexError
+    except IndexError:
+        raise FormatError("compressed points are damaged", where=where) from None
+    if len(out) != size:
+        raise FormatError("compressed points are truncated", where=where, got=f"{len(out)} bytes", wanted=size)
+    return bytes(out)
+
+
+def _las(raw: bytes, where: str) -> Cloud:
+    try:
+        import laspy
+    except ImportError as error:
+        raise MissingDataError(
+            f"LAS needs a package that is not installed ({error})",
+            where=where,
+            wanted="pip install 'graphslam-submaps[las]'",
+        ) from None
+    if len(raw) < 227:
+        raise FormatError("LAS header is truncated", where=where, got=f"{len(raw)} bytes", wanted="227 or more")
+    n = max(int(np.frombuffer(raw[107:111], "<u4")[0]), _count_14(raw))
+    size = int(np.frombuffer(raw[105:107], "<u2")[0])
+    if not raw[104] & 0x80 and n * size > len(raw):  # before laspy allocates
+        raise FormatError("file is truncated", where=where, got=f"{len(raw)} bytes", wanted=f"{n} points of {size}")
+    check_size(n * 24, where)
+    if raw[104] & 0x80 and n > 40 * len(raw):
+        raise FormatError("LAZ header claims too many points", where=where, got=n, wanted=f"in {len(raw)} bytes")
+    try:
+        las = laspy.read(io.BytesIO(raw))
+        xyz = np.column_stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)]).astype(np.float64)
+        times = np.asarray(las.gps_time, np.float64) if "gps_time" in set(las.point_format.dimension_names) else None
+    except (MemoryError, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # laspy and lazrs raise kinds of their own, panics of Rust among them
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise FormatError(f"LAS is damaged ({type(error).__name__}: {error})", where=where) from None
+    if times is not None and (not len(times) or np.ptp(times) == 0.0):
+        times = None
+    return clean(xyz, times, "" if times is None else "gps_time")
+
+
+def _count_14(raw: bytes) -> int:
+    return int(np.frombuffer(raw[247:255], "<u8")[0]) if raw[25] >= 4 and len(raw) >= 255 else 0

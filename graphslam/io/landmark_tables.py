@@ -1,0 +1,372 @@
+"""Odometry and sightings of landmarks as two tables with headers: ``odometry.csv`` and ``sightings.csv``.
+
+Columns are found by their names, in any order and case; units in brackets behind a name are minded.
+
+* odometry: ``t`` and either ``v``, ``w`` (speed along x of the robot, yaw rate; held until the next record) or ``x``,
+  ``y``, ``theta`` (pose in any frame that stays).
+* sightings: ``t``, ``range``, and ``bearing`` (positive to the left, zero ahead), ``id`` (a whole number), or one of
+  the two. Rows of one stamp are one scan.
+
+Values are separated by commas, semicolons, tabs or blanks; lines that begin with ``#`` or ``%`` are comments.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.core.geometry import Array, se2_between
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.reading import read_text, usable
+from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
+from graphslam.io.clock import usable_records
+from graphslam.io.look import Claim, Look
+
+NAMES = {
+    "t": ("t", "time", "stamp", "timestamp", "secs", "seconds"),
+    "v": ("v", "vx", "speed", "velocity", "forward_velocity", "linear", "linear_velocity"),
+    "w": ("w", "omega", "wz", "yaw_rate", "yawrate", "turn_rate", "angular", "angular_velocity", "ω"),
+    "x": ("x", "px", "pos_x", "position_x"),
+    "y": ("y", "py", "pos_y", "position_y"),
+    "theta": ("theta", "th", "yaw", "heading", "phi", "θ"),
+    "id": ("id", "landmark", "landmark_id", "tag", "tag_id", "marker", "beacon", "subject"),
+    "range": ("range", "r", "dist", "distance"),
+    "bearing": ("bearing", "b", "beta", "angle", "azimuth"),
+}
+UNITS = {
+    "t": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
+    "v": {"m/s": 1.0, "ms-1": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6},
+    "angle": {"rad": 1.0, "deg": np.pi / 180.0, "°": np.pi / 180.0, "mrad": 1e-3},
+    "w": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "°/s": np.pi / 180.0},
+}
+_UNIT_OF = {"t": "t", "v": "v", "w": "w", "x": "length", "y": "length", "range": "length", "theta": "angle"}
+_UNIT_OF["bearing"] = "angle"
+ODOMETRY_HEADER = "t, v, w or t, x, y, theta"
+SIGHTINGS_HEADER = "t, range, and bearing or id or both"
+RANGE_SIGMA, BEARING_SIGMA = 0.3, float(np.deg2rad(3.0))
+"""Stated σ of a range [m] and of a bearing [rad]; the tables state none."""
+TABLE_ENDINGS = (".csv", ".txt", ".tsv", ".dat")
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Names of the columns of a table.
+
+    Parameters
+    ----------
+    columns : dict of str to (int, float)
+        Column and factor to SI units, by our name.
+    separator : str or None
+    width : int
+        Columns in all.
+    line : int
+        Of the header, counted from 1.
+    said : str
+        As it stands there.
+    """
+
+    columns: dict[str, tuple[int, float]]
+    separator: str | None
+    width: int
+    line: int
+    said: str
+
+    @property
+    def odometry(self) -> str:
+        """``velocity``, ``pose`` or nothing."""
+        if {"t", "v", "w"} <= self.columns.keys():
+            return "velocity"
+        return "pose" if {"t", "x", "y", "theta"} <= self.columns.keys() else ""
+
+    @property
+    def sightings(self) -> bool:
+        """Are they those of sightings?"""
+        return {"t", "range"} <= self.columns.keys() and bool({"bearing", "id"} & self.columns.keys())
+
+
+def separator_of(line: str) -> str | None:
+    """What separates words of a line; None: white space."""
+    return next((s for s in (";", "\t", ",") if s in line), None)
+
+
+def header_of(line: str, number: int = 1) -> Header:
+    """Columns by their names; a unit that is not known counts as a name that is not known."""
+    said = line.lstrip("\ufeff#% ").rstrip()
+    bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", said))  # "v [m/s]" and "v (m/s)" are one word
+    sep = separator_of(bare)
+    words = [w.strip().strip('"').lower() for w in (bare.split(sep) if sep else bare.split())]
+    columns: dict[str, tuple[int, float]] = {}
+    for k, word in enumerate(words):
+        found = re.fullmatch(r"([^\[]+?)\s*(?:\[\s*([^\]]*?)\s*\])?", word)
+        if found is None:
+            continue
+        name, unit = found[1].replace(" ", "_"), (found[2] or "").replace(" ", "")
+        tail = re.fullmatch(r"(.+)_(s|ms|us|ns|m|cm|mm|rad|deg|m/s|rad/s|deg/s)", name)
+        if not any(name in a for a in NAMES.values()) and tail and not unit:
+            name, unit = tail[1], tail[2]
+        ours = next((n for n, a in NAMES.items() if name in a), None)
+        factors = UNITS.get(_UNIT_OF.get(ours or "", ""), {})
+        if ours is None or ours in columns or (unit and factors and unit not in factors):
+            continue
+        columns[ours] = k, factors.get(unit, 1.0)
+    return Header(columns, sep, len(words), number, said[:120])
+
+
+def _header_in(lines: list[str]) -> Header | None:
+    """Header of a table: the first line that is one; a comment may be one, too."""
+    for number, line in enumerate(lines[:20], start=1):
+        found = header_of(line, number)
+        if found.odometry or found.sightings:
+            return found
+        if line.strip() and not line.lstrip("\ufeff ").startswith(("#", "%")):
+            return None
+    return None
+
+
+def claim_tables(look: Look) -> Claim | None:
+    """See :mod:`graphslam.io.recognise`."""
+    motion, seen = _tables(look)
+    guess = [p for p in look.files if re.match(r"(odom|sighting|landmark_obs|observation)", p.name.lower())]
+    guess = [p for p in guess if p.suffix.lower() in TABLE_ENDINGS and look.lines(p, 1)]
+    if motion and seen:
+        return Claim(f"odometry ({look.relative(motion[0])}) and sightings of landmarks ({look.relative(seen[0])})")
+    if motion or seen:
+        have, lack = (motion[0], "sightings") if motion else (seen[0], "odometry")
+        header = SIGHTINGS_HEADER if motion else ODOMETRY_HEADER
+        bad = [p for p in guess if p != have]
+        there = f"; the first line of {look.relative(bad[0])} is {look.lines(bad[0], 1)[0][:80]!r}" if bad else ""
+        return Claim(
+            f"a table of {'odometry' if motion else 'sightings'}, {look.relative(have)}{there}",
+            f"{lack}.csv beside it, with the header {header}",
+        )
+    if len(guess) >= 2 and {g.name.lower()[0] for g in guess} >= {"o", "s"}:
+        heads = "; ".join(f"{look.relative(p)} begins {look.lines(p, 1)[0][:60]!r}" for p in guess[:2])
+        return Claim(
+            heads, f"a first line with names: odometry.csv {ODOMETRY_HEADER}; sightings.csv {SIGHTINGS_HEADER}"
+        )
+    return None
+
+
+def _tables(look: Look) -> tuple[list[Path], list[Path]]:
+    """Tables of odometry, and of sightings; those whose name says it first."""
+    motion: list[Path] = []
+    seen: list[Path] = []
+    for e in TABLE_ENDINGS:
+        for p in [q for q in look.by_ending.get(e, []) if q in look.texts]:
+            header = _header_in(look.lines(p, 20))
+            if header is not None:
+                (seen if header.sightings else motion).append(p)
+    motion.sort(key=lambda p: ("odom" not in p.name.lower(), len(p.parts), p))
+    seen.sort(key=lambda p: ("sight" not in p.name.lower(), len(p.parts), p))
+    return motion, seen
+
+
+def read_landmark_tables(
+    path: str | os.PathLike[str],
+    *,
+    range_sigma: float = RANGE_SIGMA,
+    bearing_sigma: float = BEARING_SIGMA,
+    max_range: float | None = None,
+    floor: tuple[float, float] = (0.01, 0.005),
+    per_metre: tuple[float, float] = (0.05, 0.02),
+    per_radian: float = 0.05,
+    name: str | None = None,
+    drops: DropCounter | None = None,
+) -> SensorLog:
+    """Read the two tables.
+
+    Parameters
+    ----------
+    path : path
+        The folder that holds them.
+    range_sigma, bearing_sigma : float
+        σ of a range [m] and of a bearing [rad].
+    max_range : float, optional
+        Of the sensor [m]; by default the longest range that there is.
+    floor, per_metre, per_radian : float
+        σ of one motion between poses: at least metres, radians; per metre driven; of the heading per radian turned.
+        Velocities carry none, it is an option of the front end.
+    name : str, optional
+    drops : DropCounter, optional
+
+    Raises
+    ------
+    MissingDataError, FormatError, DataError, ConfigError
+    """
+    root = Path(path)
+    if not root.exists():
+        raise MissingDataError("no such folder", where=str(root), wanted="a folder with odometry.csv and sightings.csv")
+    numbers = [range_sigma, bearing_sigma, *floor, 1.0 if max_range is None else max_range]
+    if not (all(np.isfinite(v) and v > 0 for v in numbers) and min(*per_metre, per_radian) >= 0):
+        raise ConfigError(f"landmark tables: σ {numbers}, {per_metre}, {per_radian}; wanted positive numbers")
+    look = Look(root if root.is_dir() else root.parent)
+    motion, seen = _tables(look)
+    if not (motion and seen):
+        claim = claim_tables(look)
+        raise MissingDataError(
+            "no table of odometry beside one of sightings",
+            where=str(root),
+            got=claim.found if claim else str(look),
+            wanted=f"odometry.csv with the header {ODOMETRY_HEADER}, sightings.csv with {SIGHTINGS_HEADER}",
+        )
+    counter = DropCounter()
+    controls, n_controls = _motion(motion[0], floor, per_metre, per_radian, counter)
+    landmarks, n_seen = _sightings(
+        seen[0], (float(controls.times[0]), float(controls.times[-1])), range_sigma, bearing_sigma, max_range, counter
+    )
+    if drops is not None:
+        drops.counts.update(counter.counts)
+    stream = "controls" if isinstance(controls, VelocityControls) else "odometry"
+    return SensorLog(
+        name=name or root.name,
+        streams={stream: controls, "landmarks": landmarks},
+        read={stream: n_controls, "landmarks": n_seen},
+        dropped=dict(counter.counts),
+        meta={"source": root.name, "range_sigma": range_sigma, "bearing_sigma": bearing_sigma},
+    )
+
+
+def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Array], Header]:
+    """Columns by our names, in SI units; NaN where a value is missing."""
+    lines = read_text(path).lstrip("\ufeff").splitlines()
+    header = _header_in(lines)
+    if header is None:
+        raise FormatError("has no header that is known", where=str(path), got=(lines or [""])[0][:80])
+    rows: list[list[str]] = []
+    short = 0
+    for line in lines[header.line :]:
+        bare = line.strip()
+        if not bare or bare.startswith(("#", "%")):
+            continue
+        sep = header.separator if header.separator is None or header.separator in bare else separator_of(bare)
+        words = [w.strip() for w in (bare.split(sep) if sep else bare.split())]
+        if len(words) > header.width and not any(words[header.width :]):
+            words = words[: header.width]
+        if len(words) != header.width:
+            short += 1
+            continue
+        rows.append(words)
+    counter.drop(stream, "row with another number of values than the header", short)
+    if short > 0.05 * (short + len(rows)):
+        raise FormatError(
+            f"{short} of {short + len(rows)} rows have not the {header.width} values of the header",
+            where=str(path),
+            got=header.said,
+            wanted="one value a column",
+        )
+    out = {}
+    for name, (k, factor) in header.columns.items():
+        out[name] = np.array([_number(r[k]) for r in rows]) * factor
+    return out, header
+
+
+def _number(word: str) -> float:
+    try:
+        value = float(word.strip('"'))
+    except ValueError:
+        return float("nan")
+    return value if abs(value) <= 1e30 else float("nan")
+
+
+def _in_order(a: dict[str, Array], stream: str, counter: DropCounter) -> dict[str, Array]:
+    """Rows in order of time, where a table is not sorted at all; a few stamps out of order are left to be dropped."""
+    t = a["t"]
+    back = int(np.sum(np.diff(t) < 0))
+    if back <= 0.02 * len(t):
+        return a
+    counter.drop(stream, "rows were not in order of time: sorted (kept)", back)
+    order = np.argsort(np.where(np.isfinite(t), t, -np.inf), kind="stable")
+    return {k: v[order] for k, v in a.items()}
+
+
+def _motion(
+    path: Path, floor: tuple[float, float], per_metre: tuple[float, float], per_radian: float, counter: DropCounter
+) -> tuple[VelocityControls | Odometry, int]:
+    a, header = _read(path, "odometry", counter)
+    n = len(a["t"])
+    kind = header.odometry
+    a = _in_order(a, "odometry", counter)
+    names = ("v", "w") if kind == "velocity" else ("x", "y", "theta")
+    bad = {"a number is missing or not finite": np.asarray(~usable(np.column_stack([a[k] for k in names])).all(axis=1))}
+    keep = usable_records(a["t"], bad, stream="odometry", where=str(path), drops=counter)
+    if keep.sum() < 2:
+        raise DataError("holds too few records", where=str(path), got=int(keep.sum()), wanted="2 or more")
+    t = a["t"][keep]
+    if kind == "velocity":
+        return VelocityControls(times=t, speed=a["v"][keep], yaw_rate=a["w"][keep]), n
+    poses = np.column_stack([a[k][keep] for k in names])
+    motion = np.zeros_like(poses)
+    motion[1:] = se2_between(poses[:-1], poses[1:])
+    driven, turned = np.linalg.norm(motion[:, :2], axis=1), np.abs(motion[:, 2])
+    P = np.zeros((len(t), 3, 3))
+    P[:, 0, 0] = P[:, 1, 1] = floor[0] ** 2 + (per_metre[0] * driven) ** 2
+    P[:, 2, 2] = floor[1] ** 2 + (per_metre[1] * driven) ** 2 + (per_radian * turned) ** 2
+    return Odometry(times=t, increments=motion, covariances=P), n
+
+
+def _sightings(
+    path: Path,
+    span: tuple[float, float],
+    range_sigma: float,
+    bearing_sigma: float,
+    max_range: float | None,
+    counter: DropCounter,
+) -> tuple[LandmarkObservations, int]:
+    a, header = _read(path, "landmarks", counter)
+    n = len(a["t"])
+    if n == 0:
+        raise DataError("holds no sighting", where=str(path), wanted="at least one row below the header")
+    t, r, b = a["t"], a["range"], a.get("bearing", np.zeros(n))
+    ids = a.get("id")
+    good = np.ones(n, dtype=np.bool_)
+    for reason, wrong in (
+        ("stamp, range or bearing is missing or not finite", ~(usable(t) & usable(r) & usable(b))),
+        ("range is not positive", ~(r > 0)),
+        ("stamp outside the time of the odometry", ~((span[0] <= t) & (t <= span[1]))),
+    ):
+        counter.drop("landmarks", reason, int((good & wrong).sum()))
+        good &= ~wrong
+    if good.sum() < 0.5 * n:
+        usual = t[np.isfinite(t)]
+        raise DataError(
+            f"{int((~good).sum())} of {n} sightings are unusable",
+            where=str(path),
+            got=f"{dict(counter.counts)}; stamps {usual.min() if len(usual) else np.nan:.3f} to "
+            f"{usual.max() if len(usual) else np.nan:.3f} s, odometry {span[0]:.3f} to {span[1]:.3f} s",
+            wanted="finite numbers on one clock, in seconds",
+        )
+    rows = np.flatnonzero(good)
+    rows = rows[np.argsort(t[rows], kind="stable")]
+    stamps, start = np.unique(t[rows], return_index=True)
+    named: Ints | None = None
+    if ids is not None:
+        whole = np.isfinite(ids) & (ids == np.round(ids)) & (np.abs(ids) < 2**53)
+        named = np.where(whole & (ids >= 0), np.where(whole, ids, 0), -1).astype(np.int64)[rows]
+    offsets = np.append(start, len(rows)).astype(np.int64)
+    reach = max_range or float(r[rows].max())
+    if "bearing" not in header.columns:
+        seen = LandmarkObservations.range_only(
+            times=stamps, offsets=offsets, ranges=r[rows], range_sigma=range_sigma, ids=named, max_range=reach
+        )
+        return seen, n
+    b = b[rows]
+    if np.abs(b).max() <= 2 * np.pi + 1e-6:  # beyond it they are probably degrees, and `data check` says so
+        b = np.arctan2(np.sin(b), np.cos(b))
+    return LandmarkObservations(
+        times=stamps,
+        offsets=offsets,
+        ranges=r[rows],
+        bearings=b,
+        sigmas=np.tile([range_sigma, bearing_sigma], (len(rows), 1)),
+        ids=named,
+        max_range=reach,
+        field_of_view=(float(min(b.min(), -1e-3)), float(max(b.max(), 1e-3))),
+    ), n

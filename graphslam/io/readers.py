@@ -1,0 +1,131 @@
+"""The registry of readers: who can read a source, told by what the source holds.
+
+A reader is registered under the entry point ``graphslam.readers``; its value is a :class:`~graphslam.io.reader.Reader`:
+
+.. code-block:: toml
+
+    [project.entry-points."graphslam.readers"]
+    my-format = "my_package:READER"
+
+Those of this package stand in :data:`graphslam.io.recognise.BUILT_IN`. Options of a reader are the keyword arguments of
+its function, checked against their annotations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError, UnknownNameError
+from graphslam.io.look import Claim, Look
+from graphslam.io.reader import Reader
+from graphslam.io.recognise import BUILT_IN
+
+GROUP = "graphslam.readers"
+
+
+@cache
+def readers() -> dict[str, Reader]:
+    """All readers by name: those of other packages first, then our own, in the order in which they are asked.
+
+    Raises
+    ------
+    GraphSlamError
+        An entry point that cannot be imported, or is no reader.
+    """
+    out: dict[str, Reader] = {}
+    for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
+        try:
+            found = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise GraphSlamError(f"reader {entry.name!r} cannot be imported ({error})") from error
+        if not isinstance(found, Reader):
+            raise GraphSlamError(f"entry point {entry.name!r} of {GROUP} is no Reader; got {type(found).__name__}")
+        out[entry.name] = found
+    return {**out, **{k: v for k, v in BUILT_IN.items() if k not in out}}
+
+
+def reader(name: str) -> Reader:
+    """The reader of that name.
+
+    Raises
+    ------
+    UnknownNameError
+    """
+    try:
+        return readers()[name]
+    except KeyError:
+        raise UnknownNameError("reader", name, readers()) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """Who reads a source.
+
+    Parameters
+    ----------
+    name, found : str
+        Of the reader, and what it sees in the source.
+    also : tuple of str
+        ``name: found`` of other readers that could read the source, too.
+    """
+
+    name: str
+    found: str
+    also: tuple[str, ...] = ()
+
+
+def recognise(path: Path) -> Recognised:
+    """The first reader that can read a source.
+
+    Raises
+    ------
+    MissingDataError
+        A reader knows it, but something is missing: what was found, what is missing, what would work.
+    FormatError
+        No reader knows it: what was found, and what is read.
+    """
+    look = Look(path)
+    whole: list[tuple[str, Claim]] = []
+    nearly: list[tuple[str, Claim]] = []
+    for name, r in readers().items():
+        claim = r.recognise(look)
+        if claim is not None:
+            (nearly if claim.missing else whole).append((name, claim))
+    if whole:
+        name, claim = whole[0]
+        return Recognised(name, claim.found, tuple(f"{n}: {c.found}" for n, c in whole[1:]))
+    if nearly:
+        name, claim = nearly[0]
+        raise MissingDataError(
+            f"nothing here is complete; nearest is reader {name!r}",
+            where=str(path),
+            got=claim.found,
+            wanted=claim.missing,
+        )
+    raise FormatError(
+        f"no reader knows this {'file' if path.is_file() else 'folder'}",
+        where=str(path),
+        got=f"{look}{_advice(look)}",
+        wanted="one of the sources that `graphslam data readers` lists, or --reader NAME",
+    )
+
+
+_ADVICE = {
+    ".pcap": "packets of a lidar: convert them to clouds (PCD, LAS) or a bag with the maker's tool",
+    ".png": "images: no camera is read",
+    ".jpg": "images: no camera is read",
+    ".npy": "arrays without a header that says what they are: build a SensorLog in Python and save_log it",
+    ".npz": "arrays without a header that says what they are: build a SensorLog in Python and save_log it",
+    ".e57": "E57: export it as LAS or PLY",
+    ".zip": "an archive: unpack it first",
+    ".tar": "an archive: unpack it first",
+    ".7z": "an archive: unpack it first",
+}
+
+
+def _advice(look: Look) -> str:
+    said = next((text for end, text in _ADVICE.items() if end in look.by_ending), "")
+    return f"; {said}" if said else ""
