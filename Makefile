@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.ready
 EXTRAS ?= dev,notebooks,lidar
-# Processes that run tests at one time; the tests of a file stay together.
+# Processes that run tests, or quick benchmarks, at one time; the tests of a file stay together.
 WORKERS ?= 2
 
 # Kernels are small and many; two threads that spin cost more than they give (see docs/how-to.md).
@@ -38,7 +38,9 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 bench: $(STAMP)
-	@for b in tests/benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python -m tests.benchmarks.$$(basename $$b .py) --quick || exit 1; done
+	@ls tests/benchmarks/bench_*.py | xargs -P $(WORKERS) -I{} sh -c 'b={}; \
+	  out=$$($(BIN)/python -m tests.benchmarks.$$(basename $$b .py) --quick 2>&1); code=$$?; \
+	  printf "== %s\n%s\n" "$$b" "$$out"; exit $$code'
 
 clean:
 	rm -rf $(VENV) build demo-run .pytest_cache .mypy_cache .ruff_cache
