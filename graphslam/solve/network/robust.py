@@ -50,6 +50,12 @@ CONFIRMED = 0.001
 # Steps of a solve between two choices of inliers; the last solve goes to the end.
 TRIM_STEPS = 6
 FINAL_STEPS = 200
+# Where neighbours bear out fewer of the loops than this, they are no guess: least squares of everything under a kernel
+# makes another start, and noise is taken as stated. A scale estimated from the few loops that happen to suit the
+# odometry is too small, and with it rejecting all others is cheap.
+BORNE_OUT = 0.2
+# Cauchy's width in standard deviations (95 % efficient), rounds of reweighting, and descent steps in each.
+CAUCHY, KERNEL_ROUNDS, KERNEL_STEPS = 2.385, 15, 2
 # Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
 START_STEPS = 40
 
@@ -102,6 +108,10 @@ def truncated_least_squares(
     if trust_odometry:
         trusted[:m] = odometry_edges(network)
     starts: dict[str, tuple[gtsam.Values, Mask]] = {}
+    loops = int(np.count_nonzero(~trusted[:m]))
+    guessed = np.count_nonzero(consensus.likely) >= BORNE_OUT * loops
+    if noise_scale is None and not guessed:
+        noise_scale = 1.0
     scale = 1.0 if noise_scale is None else noise_scale
     for name, believed in (("consensus", consensus.likely), ("core", consensus.core)):
         if believed.any() and not (name == "core" and (believed == consensus.likely).all()):
@@ -120,6 +130,11 @@ def truncated_least_squares(
         begun = _least_squares(problem, used, chordal=False)
         if begun is not None:
             starts["odometry"] = (begun, used)
+    if not guessed and loops:
+        begun = _least_squares(problem, np.ones_like(trusted), chordal=True)
+        if begun is not None:
+            used = np.ones_like(trusted)
+            starts["cauchy"] = (_under_kernel(problem, begun, trusted), used)
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
     found: list[tuple[str, Robust]] = []
@@ -171,6 +186,21 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
+
+
+def _under_kernel(problem: BatchProblem, values: gtsam.Values, trusted: Mask) -> gtsam.Values:
+    """Iteratively reweighted least squares of everything, loops under Cauchy's kernel."""
+    network, m = problem.network, len(problem.network.edges)
+    for _ in range(KERNEL_ROUNDS):
+        costs = problem.flat.squared(problem.unpack(values))
+        weights = np.where(trusted, 1.0, 1.0 / (1.0 + costs / CAUCHY**2))
+        weighted = replace(
+            network,
+            information=weights[:m, None, None] * network.information,
+            observation_information=weights[m:, None, None] * network.observation_information,
+        )
+        values = polish(BatchProblem(weighted), values, max_iterations=KERNEL_STEPS).values
+    return values
 
 
 def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> float:

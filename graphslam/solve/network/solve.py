@@ -64,7 +64,8 @@ class NetworkSolution:
     seconds : float
     converged : bool
         At a stationary point (the decrement is negligible) *and* not above the best objective that any start
-        reached. For gnc: at a stationary point of the inliers' objective.
+        reached. For gnc: at a stationary point of the inliers' objective, and not where the odometry alone is best
+        and contradicts most loops (``details["doubt"]``).
     decrement : float
         Predicted further fall of the objective (gnc: of the inliers' objective).
     gap : float
@@ -242,7 +243,8 @@ def solve_network(
         objective_initial=flat.objective(initial),
         iterations=answer.iterations,
         seconds=time.perf_counter() - begin,
-        converged=bool(stationary and (at_optimum or answer.minimised is not None)),
+        converged=bool(stationary and (at_optimum or answer.minimised is not None))
+        and not str(answer.details.get("doubt", "")).startswith("not solved"),
         decrement=decrement,
         gap=max(gap, 0.0) if best.converged or answer.minimised is not None else float("nan"),
         start=answer.start,
@@ -342,7 +344,17 @@ def _gnc(task: _Task) -> _Answer:
     optimum = asked or _from_robust(network, problem, robust)
     out = np.flatnonzero(~robust.inliers)
     m = len(network.edges)
-    details = {
+    loops = ~odometry_edges(network)
+    kept = int(np.count_nonzero(robust.inliers[:m] & loops))
+    doubt = ""
+    if robust.start == "odometry" and 2 * kept < np.count_nonzero(loops):
+        doubt = (
+            f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with the odometry as its noise is "
+            "stated, and no start without it was better; either most loops are wrong, or the odometry is worse than "
+            "stated"
+        )
+    details: dict[str, Any] = {
+        "doubt": doubt,
         "outliers": len(out),
         "outlier_names": [
             network.edge_name(int(k)) if k < m else network.observation_name(int(k) - m) for k in out[:20]

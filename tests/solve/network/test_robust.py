@@ -11,10 +11,13 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import align_se2, se2_transform
+from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import problem_of_network, values_of
+from graphslam.io.catalog import load
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import loop_consensus, odometry_edges
@@ -169,6 +172,61 @@ def test_options_are_checked() -> None:
         with pytest.raises(ConfigError, match="noise_scale"):
             solve_network(net, "gnc", noise_scale=bad)
     assert BatchProblem(net).objective(BatchProblem(net).pack(values_of(net, net.poses))) > 0.0
+
+
+def drifting(network: PoseNetwork, degrees: float) -> PoseNetwork:
+    """Odometry that turns too far by so much over the way; its stated noise knows nothing of it."""
+    chain = odometry_edges(network)
+    z = network.measurements.copy()
+    z[chain, 2] += np.deg2rad(degrees) / np.count_nonzero(chain)
+    return replace(network, measurements=z)
+
+
+@pytest.mark.parametrize("degrees", [-30.0, 30.0])
+def test_odometry_that_drifts_beyond_its_noise_does_not_win_against_loops(degrees: float) -> None:
+    net = ring_drive(2)
+    clean = solve_network(net, starts=("chordal",))
+    mixed = add_wrong_loops(drifting(net, degrees), 0.1, SeedTree(6).generator(), reference=clean.poses)
+    answer = solve_network(mixed.network, "gnc")
+    assert answer.inliers is not None
+    loops = ~odometry_edges(mixed.network)
+    assert answer.inliers[loops & ~mixed.wrong].mean() > 0.9
+    assert (answer.inliers & mixed.wrong).sum() <= 0.2 * mixed.wrong.sum()
+    off = align_se2(answer.poses[:, :2], clean.poses[:, :2])
+    apart = np.linalg.norm(se2_transform(off, answer.poses[:, :2]) - clean.poses[:, :2], axis=1)
+    assert np.sqrt(np.mean(apart**2)) < 1.0
+
+
+def test_odometry_that_loops_cannot_outweigh_is_not_solved() -> None:
+    """The odometry of this drive is stated so exactly that hundreds of degrees weigh more than all loops."""
+    net = ring_drive(2)
+    answer = solve_network(drifting(net, 250.0), "gnc")
+    assert not answer.converged
+    assert "not solved" in str(answer.details["doubt"])
+
+
+def test_nothing_but_wrong_loops_is_not_solved() -> None:
+    net = ring_drive(2)
+    clean = solve_network(net, starts=("chordal",))
+    mixed = add_wrong_loops(net, 0.9, SeedTree(7).generator(), reference=clean.poses)
+    chain = odometry_edges(mixed.network)
+    answer = solve_network(mixed.network.only(chain | mixed.wrong), "gnc")
+    assert not answer.converged
+    assert "not solved" in str(answer.details["doubt"])
+    assert "NOT converged" in repr(answer)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("degrees", [0.0, -250.0])
+def test_lecture_hall_with_a_drift_that_nobody_stated(data_dir: Path, degrees: float) -> None:
+    log = load("tuc-slam-lecture-hall")
+    velocities = log.velocities.copy()
+    velocities[:, 2] += np.deg2rad(degrees) / (log.times[-1] - log.times[0])
+    net, times = replace(log, velocities=velocities).to_network(min_similarity=0.5)
+    answer, truth = solve_network(net, "gnc"), log.truth_at(times)
+    there = se2_transform(align_se2(answer.poses[:, :2], truth), answer.poses[:, :2])
+    assert np.sqrt(np.mean(np.sum((there - truth) ** 2, axis=1))) < 0.45
+    assert answer.converged
 
 
 @pytest.mark.data
