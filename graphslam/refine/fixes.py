@@ -53,7 +53,7 @@ class FixReport:
     alike : float
         Autocorrelation of the residuals from one fix to the next; above 0.3 and chance their errors last.
     rms : float
-        Of the distances from the fixes [m].
+        Of the distances from the fixes that are not wild [m].
     T_gps_world : (7,) or (3,)
         From the refined path to the frame of the stream.
     """
@@ -240,15 +240,17 @@ class FixModel:
         w = np.einsum("kij,kj->ki", self.whiteners, e)
         d2 = np.sum(w**2, axis=1)
         # a wild fix says nothing of how the others follow each other
-        w = w / np.sqrt(np.maximum(d2 / chi2.ppf(RARE, self.group.dim), 1.0))[:, None]
+        limit = chi2.ppf(RARE, self.group.dim)
+        w = w / np.sqrt(np.maximum(d2 / limit, 1.0))[:, None]
+        near = d2 <= limit if np.any(d2 <= limit) else np.ones(len(d2), bool)
         T = np.array(states[-2], dtype=np.float64)
         T[: self.group.dim] += self.origin
         return FixReport(
             len(self.k),
             self.left,
             float(np.median(d2) / chi2.ppf(0.5, self.group.dim)),
-            int(np.count_nonzero(d2 > chi2.ppf(RARE, self.group.dim))),
+            int(np.count_nonzero(d2 > limit)),
             float(np.sum(w[1:] * w[:-1]) / max(np.sum(w**2), 1e-12)),
-            float(np.sqrt(np.mean(np.sum(e**2, axis=1)))),
+            float(np.sqrt(np.mean(np.sum(e[near] ** 2, axis=1)))),
             T,
         )

@@ -42,6 +42,8 @@ INLIER_PROBABILITY = 0.9999
 BATCH_STEPS = 10
 # … unless more than this share of everything is left out.
 FEW = 0.05
+# Of fewer loops nobody can say that most contradict the rest.
+FEWEST_LOOPS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +66,8 @@ class NetworkSolution:
     seconds : float
     converged : bool
         At a stationary point (the decrement is negligible) *and* not above the best objective that any start
-        reached. For gnc: at a stationary point of the inliers' objective, and not where the odometry alone is best
-        and contradicts most loops (``details["doubt"]``).
+        reached. For gnc: at a stationary point of the inliers' objective, and not where most loops contradict each
+        other and the odometry (``details["doubt"]``).
     decrement : float
         Predicted further fall of the objective (gnc: of the inliers' objective).
     gap : float
@@ -318,7 +320,7 @@ def _isam2(task: _Task) -> _Answer:
 
 def _gnc(task: _Task) -> _Answer:
     from graphslam.solve.network.consensus import odometry_edges  # scipy's statistics take a second to load
-    from graphslam.solve.network.robust import truncated_cost, truncated_least_squares
+    from graphslam.solve.network.robust import BORNE_OUT, truncated_cost, truncated_least_squares
 
     network, flat, starts, options, progress = task
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
@@ -347,11 +349,12 @@ def _gnc(task: _Task) -> _Answer:
     loops = ~odometry_edges(network)
     kept = int(np.count_nonzero(robust.inliers[:m] & loops))
     doubt = ""
-    if robust.start == "odometry" and 2 * kept < np.count_nonzero(loops):
+    # loops that their neighbours bear out may be fewer than those that contradict everything
+    enough = 0.5 if robust.start in ("odometry", "cauchy") else BORNE_OUT
+    if kept < enough * np.count_nonzero(loops) and np.count_nonzero(loops) >= FEWEST_LOOPS:
         doubt = (
-            f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with the odometry as its noise is "
-            "stated, and no start without it was better; either most loops are wrong, or the odometry is worse than "
-            "stated"
+            f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with each other and with the odometry "
+            "as its noise is stated; either most loops are wrong, or the odometry is worse than stated"
         )
     details: dict[str, Any] = {
         "doubt": doubt,
