@@ -124,7 +124,7 @@ def refine_run(
                 "The path was not refined by its scans: they agree less at the refined path "
                 f"({found.agreement[1]:.0%}) than at the graph's ({found.agreement[0]:.0%}), so the graph's stays."
             )
-            return None, [Finding("look", "refine-refused", text)]
+            return None, [Finding("look", "refine-refused", text), *_input(found)]
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
@@ -134,6 +134,17 @@ def refine_run(
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
     wrong = None if graph is None else wrong_loops(graph, refined)
     return Refined(found, refined, drawn, path), [*findings_of(found, wrong), *moved]
+
+
+def _input(r: Refinement) -> list[Finding]:
+    """Is the odometry that came in better than what came out?"""
+    if not r.input_better:
+        return []
+    text = (
+        f"The odometry of the log is better than this result: scans agree in {r.reckoned:.1%} of the points along it, "
+        f"here in {max(r.agreement):.1%}. Use its path, or state its noise as small as it is."
+    )
+    return [Finding("bad", "input-better", text)]
 
 
 def _standing(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
@@ -222,6 +233,7 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
         f"(before: {r.agreement[0]:.0%})."
     )
     out = [Finding("good", "refined", text)]
+    out += _input(r)
     if (f := r.fixes) is not None:
         text = (
             f"{f.used} fixes hold the refined path; they lie {f.rms:.2f} m from it (RMS), with a median χ² of "

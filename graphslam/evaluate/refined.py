@@ -90,6 +90,7 @@ def refinement_metrics(out: Metrics, r: Refinement) -> None:
     out.add("refine_spread", last.spread, "m", "lower")
     out.add("refine_agreement", r.agreement[1], "", "higher")
     out.add("refine_agreement_graph", r.agreement[0])
+    out.add("refine_agreement_odometry", r.reckoned)
     out.add("refine_left_apart", len(r.refused))
     out.add("refine_motion_chi2_per_dof", r.motion, "", "one")
     if r.fixes is not None:
@@ -108,6 +109,7 @@ def refinement_facts(r: Refinement) -> dict[str, Any]:
     return {
         "rounds": [asdict(x) for x in r.rounds],
         "agreement": list(r.agreement),
+        "agreement_odometry": r.reckoned,
         "constants": {name: {"value": v, "sigma": s} for name, (v, s) in r.constants.items()},
         "yaw_bias": r.yaw_bias.tolist(),
         "motion_chi2_per_dof": r.motion,

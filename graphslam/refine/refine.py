@@ -121,8 +121,10 @@ class Refinement:
         Steps that the start drew together although the scans between contradict it.
     agreement : (start, refined)
         Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
+    reckoned : float
+        The same share at the path of the odometry alone.
     other : Other or None
-        The second attempt, from the odometry, where the start contradicts the scans.
+        The second attempt, from the odometry, where the start contradicts the scans or the odometry agrees better.
     scales : (c,)
         By which the σ of the odometry's components were widened, since the scans show more.
     walk : float
@@ -150,6 +152,7 @@ class Refinement:
     parts: dict[str, float]
     refused: Index
     agreement: tuple[float, float]
+    reckoned: float
     other: Other | None
     scales: Array
     walk: float
@@ -163,6 +166,11 @@ class Refinement:
     def better(self) -> bool:
         """Do the scans agree with each other at the refined path at least as well as at the start?"""
         return self.agreement[1] >= self.agreement[0]
+
+    @property
+    def input_better(self) -> bool:
+        """Do they agree better at the path of the odometry than at the start and at the refined path?"""
+        return self.reckoned > max(self.agreement)
 
     def joint(self, steps: npt.ArrayLike) -> Array:
         """Joint covariance of some steps ``(k·d, k·d)``."""
@@ -301,8 +309,14 @@ class _Work:
         guides, taken = self.follow_guides()
         self.all_passes(self.config.distances)
         other = None
-        if np.any(~taken & guides.far(self.poses)):
-            self.tell("the start contradicts the scans between: once more from the odometry")
+        assert self.surfaces is not None
+        odometry = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        at_odometry = find_surfaces(self.raw, odometry, self.config.surface)
+        self.reckoned = self.agreement(self.raw, at_odometry, odometry, self.noise)
+        contradicted = np.any(~taken & guides.far(self.poses))
+        if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
+            why = "the start contradicts the scans between" if contradicted else "the odometry alone agrees better"
+            self.tell(f"{why}: once more from the odometry")
             other = self.from_odometry()
             taken = taken & (not other.taken)
         return self.result(guides.steps[~taken & guides.far(self.poses)], other)
@@ -477,6 +491,7 @@ class _Work:
             rounds=tuple(self.rounds),
             parts=solved.parts,
             refused=refused,
+            reckoned=self.reckoned,
             agreement=(before, self.agreement(self.cloud, self.surfaces, self.poses, self.noise)),
             other=other,
             scales=self.motion.scales,

@@ -194,3 +194,17 @@ def test_what_cannot_be_refined_is_refused(drives):
         refine(scans, np.where(np.arange(len(start))[:, None] == 3, np.nan, start))
     with pytest.raises(DataError, match="no beam"):
         refine(replace(scans, returns=np.zeros(len(scans.returns), bool)), start)
+
+
+def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
+    """A start bent by metres, and an odometry that is nearly true: the result is no worse than what came in."""
+    scans, start, truth = court_scans(41)
+    u = SE3.between(truth[:-1], truth[1:])
+    good = replace(scans.odometry, increments=np.concatenate([scans.odometry.increments[:1], u]))
+    found = refine(replace(scans, odometry=good), start)
+    assert found.reckoned > found.agreement[0]
+    assert found.agreement[1] >= found.reckoned - 0.005
+    assert error(scans.times, found.poses, truth) < 0.02
+    assert "input-better" not in {f.code for f in findings_of(found)}
+    worse = replace(found, reckoned=found.agreement[1] + 0.1)
+    assert {f.code: f.level for f in findings_of(worse)}["input-better"] == "bad"
