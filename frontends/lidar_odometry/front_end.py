@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,6 +30,8 @@ from graphslam.frontends.lidar_odometry.odometry import MAPPED, LidarOdometry, S
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.exits import relative_covariance
 
+BENT = 0.1
+"""Way of points in the time from scan to scan from which it matters that they have no times [m]."""
 MANY = 0.05
 """Share of lost scans of a submap from which a line of the verdict says so."""
 
@@ -108,6 +111,8 @@ class Follow:
     spread: Array
     points: Array
     seen: Seen
+    timed: bool
+    """Points have times of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +142,7 @@ class LidarFrontEnd(FrontEnd):
         name, clouds = self._clouds(log)
         self._made[:] = [log, []]
         config, origin = self.config.submap, se3.se3_transform(clouds.T_base_sensor, clouds.origin)
-        odometry, kept, key, way = LidarOdometry(self.config.odometry), [], 0, 0.0
+        odometry, kept, key, way, told = LidarOdometry(self.config.odometry), [], 0, 0.0, False
         for k in range(len(clouds)):
             seen = self._follow(odometry, clouds, k)
             if k == 0:
@@ -147,8 +152,11 @@ class LidarFrontEnd(FrontEnd):
             n = len(kept) - 1
             full = odometry.way - way >= config.length and n >= config.scans
             if k == len(clouds) - 1 or full or n >= config.most_scans:
+                bent = [] if told else _bent(key, kept)
+                told = told or bool(bent)
                 if n and key >= first:
-                    yield _submap(name, kept, origin, config, key, "end-of-log" if k == len(clouds) - 1 else "length")
+                    ended = "end-of-log" if k == len(clouds) - 1 else "length"
+                    yield _submap(name, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
                 kept, key, way = [replace(seen, joint=odometry.errors.joint)], key + 1, odometry.way
         if key == 0:
@@ -187,10 +195,31 @@ class LidarFrontEnd(FrontEnd):
             odometry.spread,
             odometry.points[evenly(len(odometry.points), self.config.submap.points)],
             seen,
+            ages is not None,
         )
 
 
-def _submap(name: str, kept: list[Follow], origin: Array, config: LidarSubmapConfig, key: int, ended: str) -> Submap:
+def _bent(key: int, kept: list[Follow]) -> list[Finding]:
+    """Do points without times lie on a scan that its motion has bent?"""
+    worst = 0.0
+    for a, b in pairwise(kept):
+        if not b.timed and len(b.points):
+            far = float(np.median(np.linalg.norm(b.points, axis=1)))
+            move = np.asarray(se3.se3_log(se3.se3_between(a.pose, b.pose)))
+            worst = max(worst, float(np.linalg.norm(move[3:]) + far * np.linalg.norm(move[:3])))
+    if worst <= BENT:
+        return []
+    text = (
+        f"Points of the scans have no times, and in submap {key} they move by up to {worst:.2f} m from scan to scan. "
+        "If the scans were not straightened before, they are bent by as much as a scan takes of that time, and neither "
+        "path nor covariance knows of it. Give the points their times, as a field t, time or offset_time."
+    )
+    return [Finding("look", "points-without-times", text)]
+
+
+def _submap(
+    name: str, kept: list[Follow], origin: Array, config: LidarSubmapConfig, key: int, ended: str, bent: list[Finding]
+) -> Submap:
     poses = np.array([f.pose for f in kept])
     path = se3.se3_between(np.broadcast_to(poses[0], poses.shape), poses)
     C = np.array([relative_covariance((poses[0], f.pose), (poses[0], f.pose), f.joint) for f in kept])
@@ -221,7 +250,7 @@ def _submap(name: str, kept: list[Follow], origin: Array, config: LidarSubmapCon
         "beams_dropped": int(dropped),
         "exit_covariance": "window",
     }
-    findings = _findings(key, kept, report)
+    findings = [*bent, *_findings(key, kept, report)]
     if findings:
         report["findings"] = [f.as_row() for f in findings]
     cloud = None

@@ -104,3 +104,20 @@ def test_lost_scans_are_a_line_of_the_verdict(log):
     assert sum(a.report["scan_states"].get("empty", 0) for a in submaps) == 6
     wide = max(np.sqrt(a.trajectory.covariances[:, 3, 3].max()) for a in submaps)
     assert wide > 10.0 * min(np.sqrt(a.exit_covariance[3, 3]) for a in submaps)
+
+
+def codes(log, rows):
+    """Findings of scans without times of points."""
+    clouds = log["clouds"]
+    offsets = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
+    plain = type(clouds).from_arrays(clouds.times[: len(rows)], np.concatenate(rows), offsets)
+    submaps = FRONT.submaps(replace(log, streams={"clouds": plain}), seed=SeedTree(0))
+    return [f["code"] for s in submaps for f in s.report.get("findings", ())]
+
+
+def test_points_without_times_are_told_once_where_the_motion_bends_scans(log, submaps):
+    """The same scans without their times, and with; and of a lidar that stands there is nothing to tell."""
+    clouds = log["clouds"]
+    assert codes(log, [clouds.cloud(k) for k in range(len(clouds))]).count("points-without-times") == 1
+    assert "points-without-times" not in [f["code"] for s in submaps for f in s.report.get("findings", ())]
+    assert "points-without-times" not in codes(log, [clouds.cloud(0)] * 20)
