@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from graphslam.calibrate.estimate import Calibration
+from graphslam.calibrate.scans import POINTS, calibrate_scans
 from graphslam.calibrate.sighted import QUICK, Effort, calibrate_sightings
 from graphslam.calibrate.windows import Seen
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
+from graphslam.core.records import LaserScans
 from graphslam.frontends.landmarks.prepare import landmark_stream
+from graphslam.frontends.odometry.recorded import RecordedErrors
+from graphslam.frontends.odometry.steps import make_steps
 
 
 def calibrate_streams(
@@ -34,4 +39,10 @@ def calibrate_streams(
     """
     if kind == "sightings":
         return calibrate_sightings(Seen.of(log, *landmark_stream(log, config.detector)), effort, seed=seed)
-    raise DataError("scans are not calibrated", where=log.name)
+    wanted = replace(config.steps, match_scans=False, yaw_per_metre=0.0)
+    if log.of_type(LaserScans) is None:
+        wanted = replace(wanted, most_points=max(wanted.most_points, POINTS))
+    steps = make_steps(log, wanted)
+    if not isinstance(steps.errors, RecordedErrors):
+        raise DataError("an IMU with wheels is not calibrated: its front end estimates their errors", where=log.name)
+    return calibrate_scans(steps, effort)

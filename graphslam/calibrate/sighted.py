@@ -297,6 +297,18 @@ def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
 def _made(
     kind: str, seen: Seen, estimates: list[Estimate], noise: dict[str, float], notes: list[Finding], data: str
 ) -> Calibration:
+    return Calibration(
+        kind=kind,
+        corrections=corrections_of(estimates, noise),
+        estimates=tuple(estimates),
+        noise={k: float(v) for k, v in noise.items()},
+        notes=tuple(notes),
+        data=data,
+    )
+
+
+def corrections_of(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
+    """What is applied: constants that passed the gates, and the noise."""
     applied = {e.name: e.value for e in estimates if e.applied}
     values: dict[str, float] = {}
     for name, value in applied.items():
@@ -308,11 +320,4 @@ def _made(
             values[name] = rounded(value)
     names = Corrections.__dataclass_fields__
     values |= {k: rounded(v) for k, v in noise.items() if k in names}
-    return Calibration(
-        kind=kind,
-        corrections=Corrections(**values),
-        estimates=tuple(estimates),
-        noise={k: float(v) for k, v in noise.items()},
-        notes=tuple(notes),
-        data=data,
-    )
+    return Corrections(**values)

@@ -147,6 +147,20 @@ def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 
     return calibrate_streams(log, kind, effort, front.config, seed=seed)
 
 
+def suited(front: FrontEnd, found: Calibration | None, options: Mapping[str, Any]) -> FrontEnd:
+    """The front end with settings that go with noise which was estimated, where the user has not set them.
+
+    The walks of a grid filter stand for errors of poor odometry that last. In space they would shake odometry by
+    lidar and IMU, which is better than they are; what scans say of it at several distances holds what lasts.
+    """
+    if found is None or found.kind != "clouds" or found.corrections.along_metre is None:
+        return front
+    own = options.get("frontend", {})
+    if "filter" not in typing.get_type_hints(type(front.config)) or "walk_scale" in own.get("filter", {}):
+        return front
+    return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
+
+
 def chosen(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:
     """What of a calibration is used where the user has set noise by hand."""
     own = options.get("frontend", {})

@@ -17,7 +17,7 @@ from graphslam.app.folders.lock import locked
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
-from graphslam.app.run.calibration import own_noise, prepared, without_noise
+from graphslam.app.run.calibration import own_noise, prepared, suited, without_noise
 from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
@@ -191,7 +191,8 @@ def _run(
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
-    log, applied, said, _ = prepared(log, front, settings.calibrate, config, own=own, seed=seed)
+    log, applied, said, found = prepared(log, front, settings.calibrate, config, own=own, seed=seed)
+    front = suited(front, found, config)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]

@@ -1,0 +1,325 @@
+"""Calibration of logs with scans: what odometry says between key scans, less what matches of the scans say.
+
+Each key scan is matched with the next and with the third next (in space also with the eighth). The noise of a match
+does not depend on how far apart they are, that of the odometry grows: so one regression tells them apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.special import gammaln
+
+from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate
+from graphslam.calibrate.sighted import Effort, corrections_of
+from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.frontends.odometry.steps import Steps
+from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.register import register
+from graphslam.registration.target import Target
+
+KEY = (0.4, 0.3)
+"""A scan so far from the last key scan, or turned so far, is a key scan [m, rad]."""
+APART = {2: (1, 3), 3: (1, 3, 8)}
+"""Key scans between those of a pair."""
+HELD = (0.06, 0.03)
+"""A match that holds its weakest direction, or its heading, worse than this is left out [m, rad]: corridors."""
+FREEDOM = 4.0
+"""Of Student's distribution of the errors."""
+ALIKE = 0.9
+"""Constants whose errors are correlated more than this are one."""
+LEAST = 30
+MATCHING = {
+    2: RegistrationConfig(radii=(1.0, 0.3), near=0.15),
+    3: RegistrationConfig(radii=(1.0, 0.5), near=0.4),
+}
+FITNESS = 0.6
+VOXEL = {2: None, 3: 0.3}
+POINTS = 20000
+"""Points of a scan in space that are looked at: sparse clouds have no normals."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pairs:
+    """Matched pairs of scans.
+
+    Parameters
+    ----------
+    apart : (n,)
+        Key scans from one to the other.
+    seconds, metres, turn : (n,)
+        In motion, driven, and turned (with its sign), by the odometry between them; ``turned`` without sign.
+    chord : (n,)
+        Distance between them by the odometry [m].
+    heading, along, side : (n,)
+        Odometry less match [rad, m, m].
+    """
+
+    apart: Array
+    seconds: Array
+    metres: Array
+    turn: Array
+    turned: Array
+    chord: Array
+    heading: Array
+    along: Array
+    side: Array
+
+    def take(self, keep: Array) -> Pairs:
+        """Some of them."""
+        return Pairs(**{k: getattr(self, k)[keep] for k in self.__dataclass_fields__})
+
+    def __len__(self) -> int:
+        return len(self.apart)
+
+
+def matched_pairs(steps: Steps, most: int) -> Pairs:
+    """Pairs of key scans spread over the log, at most ``most`` of each distance."""
+    o = steps.odometry
+    g = group_of(o.increments)
+    d = np.linalg.norm(g.log(o.increments)[:, g.position], axis=1)
+    xi = g.log(o.increments)
+    turns = xi[:, g.heading]
+    seen = np.diff(steps.offsets) >= MATCHING[steps.dim].least_points
+    keys, way, turned = [], np.inf, np.inf
+    for k in range(len(steps)):
+        way, turned = way + d[k], turned + abs(turns[k])
+        if seen[k] and (way > KEY[0] or turned > KEY[1]):
+            keys.append(k)
+            way = turned = 0.0
+    dt = np.concatenate([[0.0], np.diff(steps.times)])[: len(steps)]
+    moving = (d > 0.005 * np.maximum(dt, 1e-9)) | (np.abs(turns) > 0.005 * np.maximum(dt, 1e-9))
+    sums = {k: np.cumsum(v) for k, v in (("t", dt * moving), ("d", d), ("s", turns), ("a", np.abs(turns)))}
+    targets: dict[int, Target] = {}
+    rows = []
+    config = MATCHING[steps.dim]
+    for apart in APART[steps.dim]:
+        count = len(keys) - apart
+        for i in np.unique(np.linspace(0, count - 1, min(most, max(count, 0))).astype(int)) if count > 0 else ():
+            a, b = keys[i], keys[i + apart]
+            T = g.identity
+            for u in o.increments[a + 1 : b + 1]:
+                T = g.compose(T, u)
+            for k in (a, b):
+                if k not in targets:
+                    points, _, returns = steps.scan(k)
+                    targets[k] = Target(points[returns], voxel=VOXEL[steps.dim])
+            if min(len(targets[a]), len(targets[b])) < config.least_points:
+                continue
+            found = register(targets[b], targets[a], T, config)
+            if not found.converged or found.fitness < FITNESS:
+                continue
+            sure = math.sqrt(float(found.covariance[g.heading, g.heading]))
+            if found.weakest_sigma > HELD[0] or sure > HELD[1]:
+                continue
+            e = g.log(g.between(found.T_target_source, T))
+            direction = np.asarray(T[: steps.dim]) / max(float(np.linalg.norm(T[: steps.dim])), 1e-9)
+            start = g.log(T)[g.position]
+            start = start / max(float(np.linalg.norm(start)), 1e-9)
+            shift = e[g.position]
+            along = float(shift @ start)
+            side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
+            chord = float(np.asarray(T[: steps.dim]) @ direction)
+            gone = [float(s[b] - s[a]) for s in sums.values()]
+            rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
+    if len(rows) < LEAST:
+        raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
+    return Pairs(**dict(zip(Pairs.__dataclass_fields__, np.array(rows).T)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Regression:
+    """Errors as a linear function of constants, with noise that grows in several ways.
+
+    Parameters
+    ----------
+    value : (p,)
+    covariance : (p, p)
+    sigmas : (1 + s,)
+        Noise of a match, then of each way in which it grows.
+    score : float
+        Negative log likelihood [nats].
+    keep : (n,) bool
+        Not trimmed.
+    """
+
+    value: Array
+    covariance: Array
+    sigmas: Array
+    score: float
+    keep: npt.NDArray[np.bool_]
+
+
+def regress(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regression:
+    """Greatest Student likelihood of errors ``(n,)`` with design ``(n, p)`` and variances ``c² + grows · s²``.
+
+    Parameters
+    ----------
+    e : (n,)
+    A : (n, p)
+    grows : (n, s)
+        What each further variance is multiplied by.
+    trim : float
+        Errors of more σ are left out, and the rest fitted again; 0: none.
+    """
+    spread = max(1.4826 * float(np.median(np.abs(e - np.median(e)))), 1e-5)
+    start = np.concatenate([[spread**2], spread**2 / np.maximum(2.0 * grows.mean(axis=0), 1e-9)])
+    keep = np.ones(len(e), dtype=np.bool_)
+    x = 0.5 * np.log(start)
+    x0 = x.copy()
+
+    def at(x: Array) -> tuple[float, Array, Array]:
+        v = np.exp(2.0 * x[0]) + grows[keep] @ np.exp(2.0 * x[1:])
+        w, c = 1.0 / v, np.zeros(A.shape[1])
+        H = np.eye(A.shape[1])
+        for _ in range(6 if A.shape[1] else 1):
+            if A.shape[1]:
+                H = (A[keep] * w[:, None]).T @ A[keep]
+                c = np.linalg.lstsq(H, (A[keep] * w[:, None]).T @ e[keep], rcond=None)[0]
+            r2 = (e[keep] - A[keep] @ c) ** 2 / v
+            w = (FREEDOM + 1.0) / (FREEDOM + r2) / v
+        n = float(keep.sum())
+        constant = gammaln(0.5 * FREEDOM) - gammaln(0.5 * (FREEDOM + 1.0)) + 0.5 * math.log(FREEDOM * math.pi)
+        score = 0.5 * (FREEDOM + 1.0) * float(np.log1p(r2 / FREEDOM).sum()) + 0.5 * float(np.log(v).sum())
+        return score + n * constant, c, H
+
+    for _ in range(2 if trim else 1):
+        found = minimize(
+            lambda x: at(x)[0] + 0.5 * float(np.sum(((x - x0) / 2.0) ** 2)),
+            x,
+            method="L-BFGS-B",
+            options={"ftol": 1e-8, "maxfun": 600},
+        )
+        x = found.x
+        score, c, H = at(x)
+        v = np.exp(2.0 * x[0]) + grows @ np.exp(2.0 * x[1:])
+        inside = np.abs(e - A @ c) < trim * np.sqrt(v) * math.sqrt(FREEDOM / (FREEDOM - 2.0)) if trim else keep
+        if not trim or np.array_equal(inside, keep):
+            break
+        keep = inside
+    covariance = np.asarray(np.linalg.pinv(H) if A.shape[1] else np.zeros((0, 0)), dtype=np.float64)
+    # a Student variable of scale 1 varies by more than 1
+    return Regression(
+        value=c, covariance=covariance, sigmas=np.exp(x) * math.sqrt(FREEDOM / (FREEDOM - 2.0)), score=score, keep=keep
+    )
+
+
+HEADING = ("yaw_bias", "turn_per_metre", "turn_scale")
+
+
+def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
+    """What the scans of a log say of its odometry.
+
+    Parameters
+    ----------
+    steps : Steps
+        With the odometry as it was recorded.
+    effort : Effort
+
+    Raises
+    ------
+    DataError
+        Too few scans match.
+    """
+    most = 200 if effort.windows is not None and effort.windows <= 20 else 1000
+    most = max(int(most * effort.poses / 2000) if most == 200 else most, 40)
+    if steps.dim == 3:
+        most = min(most, 60 if most <= 200 else 300)
+    p = matched_pairs(steps, most)
+    estimates, notes, noise = _heading(p)
+    scale, moved = _distance(p)
+    estimates.append(scale)
+    noise |= moved
+    data = f"{len(p)} matches of scans"
+    if steps.dim == 3:
+        text = (
+            f"Scan matching cannot measure odometry better than this; it is an upper limit: {noise['along_metre']:.3g}"
+        )
+        text += f" m/√m and {math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m."
+        notes.append(Finding("", "calibrated", text))
+    values = corrections_of(estimates, noise)
+    kind = "scans" if steps.dim == 2 else "clouds"
+    return Calibration(
+        kind=kind, corrections=values, estimates=tuple(estimates), noise=noise, notes=tuple(notes), data=data
+    )
+
+
+def _turning(p: Pairs, noise: dict[str, float]) -> float:
+    """Noise of the heading after one metre of this log [rad/√m]."""
+    grows = np.array([x.sum() for x in (p.metres, p.turned, p.seconds)]) / max(float(p.metres.sum()), 1e-9)
+    return float(np.sqrt(grows @ np.square([noise[f"heading_{k}"] for k in ("metre", "radian", "second")])))
+
+
+def _heading(p: Pairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]:
+    columns = {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn}
+    names, notes = list(HEADING), list[Finding]()
+    grows = np.column_stack([p.metres, p.turned, p.seconds])
+    full = regress(p.heading, np.column_stack([columns[n] for n in names]), grows)
+    for pair in (("yaw_bias", "turn_per_metre"), ("turn_scale", "turn_per_metre"), ("yaw_bias", "turn_scale")):
+        if not set(pair) <= set(names):
+            continue
+        i, j = (names.index(n) for n in pair)
+        C = full.covariance
+        rho = float(C[i, j] / math.sqrt(C[i, i] * C[j, j]))
+        if abs(rho) > ALIKE:
+            rest = [[n for n in names if n != drop] for drop in pair]
+            tried = [regress(p.heading, np.column_stack([columns[n] for n in r]), grows, trim=0) for r in rest]
+            names = rest[int(tried[1].score < tried[0].score)]
+            full = regress(p.heading, np.column_stack([columns[n] for n in names]), grows)
+            kept = next(n for n in pair if n in names)
+            text = f"{NAMES[pair[0]].capitalize()} and {NAMES[pair[1]]} cannot be told apart in this log (correlation "
+            text += f"{rho:.2f}): what they do together is taken for an error of {NAMES[kept]}."
+            notes.append(Finding("", "calibrated", text))
+    out = []
+    groups = [p.apart == a for a in np.unique(p.apart)]
+    parts = []
+    for mine in (groups[0], groups[-1]):
+        A = np.column_stack([columns[n][mine] for n in names])
+        parts.append(regress(p.heading[mine], A, grows[mine][:, :1]))
+    for k, name in enumerate(names):
+        sd = math.sqrt(full.covariance[k, k])
+        gain = math.nan
+        if abs(full.value[k]) > SURE * sd:
+            others = np.column_stack([columns[n] for n in names if n != name] or [p.metres[:, None][:, :0]])
+            gain = regress(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
+        out.append(_gated(name, full, parts, k, gain))
+    s = full.sigmas
+    return out, notes, {"heading_metre": float(s[1]), "heading_radian": float(s[2]), "heading_second": float(s[3])}
+
+
+def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: float) -> Estimate:
+    """Near and far pairs must agree with each other; the estimate is that of all."""
+    near, far = ((float(r.value[k]), math.sqrt(r.covariance[k, k])) for r in parts)
+    value, sd = float(full.value[k]), math.sqrt(full.covariance[k, k])
+    agree = abs(near[0] - far[0]) <= max(AGREE * math.hypot(near[1], far[1]), 0.15 * abs(value))
+    other = (value, sd) if agree else far if abs(far[0] - value) > abs(near[0] - value) else near
+    return Estimate(name=name, value=value, sigma=sd, gain=gain, other=other[0], other_sigma=other[1]).gated()
+
+
+def _distance(p: Pairs) -> tuple[Estimate, dict[str, float]]:
+    """Scale of the distances, and the noise along and to the side."""
+    grows = p.metres[:, None]
+    A = p.chord[:, None]
+    full = regress(p.along, A, grows)
+    parts = [regress(p.along[m], A[m], grows[m]) for m in (p.apart == p.apart.min(), p.apart == p.apart.max())]
+    gain = math.nan
+    if abs(full.value[0]) > SURE * math.sqrt(full.covariance[0, 0]):
+        keep = full.keep
+        gain = regress(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
+    raw = _gated("distance_scale", full, parts, 0, gain)
+    # odometry less match over odometry is 1 - 1 / factor
+    value = -math.log1p(-min(raw.value, 0.9))
+    scale = Estimate(
+        **{k: getattr(raw, k) for k in raw.__dataclass_fields__ if k not in ("value", "other")},
+        value=value,
+        other=-math.log1p(-min(raw.other, 0.9)),
+    )
+    side = regress(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
+    return scale, {"along_metre": float(full.sigmas[1]), "lateral_metre": float(side.sigmas[1])}
