@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, se2_exp, se2_log
@@ -17,6 +18,8 @@ from graphslam.frontends.odometry.motion import MotionNoise, motion_stream, stee
 
 _LEAST = (1e-9, 1e-10)
 _MOVING = 1e-9
+VISIT = 5.0
+"""A landmark that was out of sight for longer is visited anew [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +63,13 @@ class Corrections:
     bearing_sigma: float | None = None
     """σ of a bearing [rad]; None: the log's own."""
 
+    range_visit: float = 0.0
+    """σ of an error that all ranges of one visit of a landmark share [m]."""
+    bearing_visit: float = 0.0
+    """The same of bearings [rad]."""
+    visit_sightings: float = 1.0
+    """Sightings of a usual visit, where a log has no identities to count them by."""
+
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
@@ -69,7 +79,7 @@ class Corrections:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"calibration: {name} = {value}; wanted > 0")
-        for name in (*NOISE, "along_metre"):
+        for name in (*NOISE, "along_metre", "range_visit", "bearing_visit"):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise ConfigError(f"calibration: {name} = {value}; wanted ≥ 0")
@@ -85,7 +95,7 @@ class Corrections:
 
     def without_sensor_noise(self) -> Corrections:
         """The same with the σ of the sightings left as they are."""
-        return replace(self, range_sigma=None, bearing_sigma=None)
+        return replace(self, range_sigma=None, bearing_sigma=None, range_visit=0.0, bearing_visit=0.0)
 
 
 NOISE = ("along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
@@ -134,11 +144,32 @@ def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObse
         return s
     ranges = (s.ranges - c.range_offset) / c.range_scale
     sigmas = s.sigmas.copy()
+    # n sightings that share an error of σ_v tell no more than σ² / n + σ_v²: white ones with this σ tell as much
+    n = visit_counts(s) if s.ids is not None else np.full(len(ranges), c.visit_sightings)
     if c.range_sigma is not None:
-        sigmas[:, 0] = c.range_sigma / c.range_scale
+        sigmas[:, 0] = np.sqrt(c.range_sigma**2 + n * c.range_visit**2) / c.range_scale
     if c.bearing_sigma is not None:
-        sigmas[s.has_bearing, 1] = c.bearing_sigma
+        sigmas[s.has_bearing, 1] = np.sqrt(c.bearing_sigma**2 + n * c.bearing_visit**2)[s.has_bearing]
     return replace(s, ranges=ranges, sigmas=sigmas, T_base_sensor=s.T_base_sensor + np.array([0.0, 0.0, c.sensor_yaw]))
+
+
+def visit_counts(s: LandmarkObservations) -> Array:
+    """Sightings ``(q,)`` of the visit that each sighting belongs to, by the log's identities."""
+    assert s.ids is not None
+    visit = visits_of(s.ids, np.repeat(s.times, np.diff(s.offsets)))
+    return np.where(s.ids >= 0, np.bincount(visit)[visit] if len(visit) else 1, 1).astype(np.float64)
+
+
+def visits_of(landmark: npt.NDArray[np.int64], times: Array) -> npt.NDArray[np.int64]:
+    """Number of the visit of each sighting ``(q,)``, in order of time: out of sight for long is visited anew."""
+    out = np.full(len(landmark), -1, dtype=np.int64)
+    count = 0
+    for l in np.unique(landmark):
+        mine = np.flatnonzero(landmark == l)
+        step = np.concatenate([[0], np.cumsum(np.diff(times[mine]) > VISIT)])
+        out[mine] = count + step
+        count += int(step[-1]) + 1
+    return out
 
 
 def corrected_motion(motion: Any, c: Corrections) -> Any:

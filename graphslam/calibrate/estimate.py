@@ -184,6 +184,8 @@ def noise_in_words(noise: dict[str, float]) -> str:
         "heading_second": ("heading", "rad/√s"),
         "range_sigma": ("ranges", "m"),
         "bearing_sigma": ("bearings", "rad"),
+        "range_visit": ("ranges of one visit", "m"),
+        "bearing_visit": ("bearings of one visit", "rad"),
     }
     found = [f"{units[k][0]} {v:.3g} {units[k][1]}" for k, v in noise.items() if k in units]
     return ", ".join(found)

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.corrections import Corrections, calibrated
-from graphslam.calibrate.estimate import ALIKE, LASTS, SURE, Calibration, Estimate, rounded
+from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, rounded
 from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window
 from graphslam.calibrate.windows import Seen
 from graphslam.core.errors import DataError
@@ -22,6 +22,12 @@ from graphslam.frontends.odometry.motion import motion_stream
 
 SHORT, LONG = 15.0, 60.0
 """Lengths of the windows [s]."""
+VISITS = 240.0
+"""… and of those that hold several visits of a landmark."""
+FEW = 40
+"""Landmarks of a log that is looked at for errors of visits in any case: it costs little."""
+PERHAPS = 0.15
+"""Residuals that are so alike from one to the next are looked at for errors that last as long as a visit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +82,12 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
         estimates.append(clock)
     noise, lasts = chosen_noise(short, long)
     alike = alike_residuals(long)
-    if lasts or alike > ALIKE:
-        two, _ = two_levels(seen, long, count)
+    few = len(np.unique(seen.sightings.ids)) <= FEW if seen.sightings.ids is not None else False
+    if lasts or alike > PERHAPS or few:
+        two, estimates = two_levels(seen, long, effort, estimates)
         noise |= two
-        notes.append(_lasting_note(short, long, alike))
+        if two or lasts or alike > ALIKE:
+            notes.append(_lasting_note(short, long, alike))
     return _made("sightings", seen, estimates, noise, notes, _data(short))
 
 
@@ -197,24 +205,49 @@ def alike_residuals(s: Smoothing) -> float:
     return float(np.max(products / np.maximum(squares, 1e-12)))
 
 
-def two_levels(seen: Seen, long: Smoothing, count: int | None) -> tuple[dict[str, float], Smoothing]:
-    """σ of a sighting that, taken for white, is as sure of a visit as one with a constant for each visit.
+def two_levels(
+    seen: Seen, long: Smoothing, effort: Effort, estimates: list[Estimate]
+) -> tuple[dict[str, float], list[Estimate]]:
+    """Noise of sightings with a constant for each landmark and visit; nothing where the log is no likelier with it.
 
-    A visit of n sightings whose common error has σ_v tells its landmark's range to σ² / n + σ_v². A front end that
-    knows white noise alone is told the root of n times that.
+    The windows hold several visits of a landmark, or its place could not be told from the constant. Constants that
+    passed the gates must pass them again: errors of visits may have feigned them.
     """
-    s = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), long.free, visits=True)
-    for k in long.fitted:
-        s.sigmas[k] = long.sigmas[k]
-    s.constants = long.constants.copy()
-    s, _ = L.fitted(s, trims=L.TRIMS[1:], budget=300)
-    n = sightings_of_a_visit(s.windows)
-    out = {}
-    for k in ("range", "bearing"):
-        if f"visit_{k}" in s.fitted:
-            out[f"{k}_sigma"] = math.sqrt(s.sigmas[k] ** 2 + n * s.sigmas[f"visit_{k}"] ** 2)
-            out[f"{k}_white"], out[f"{k}_visit"] = s.sigmas[k], s.sigmas[f"visit_{k}"]
-    return out, s
+    rate = len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
+    count = max(int(effort.poses / max(rate * VISITS, 1.0)), 1)
+    values, fits = [], []
+    for visits in (False, True):
+        s = L.sighted(seen, VISITS, count, long.free, visits=visits)
+        for k in long.fitted:
+            s.sigmas[k] = long.sigmas[k]
+        s.constants = long.constants.copy()
+        s, value = L.fitted(s, trims=(), budget=200)
+        values.append(value)
+        fits.append(s)
+    if not values[0] - values[1] > GAIN:
+        return {}, estimates
+    s, value = fits[1], values[1]
+    again = []
+    for e in estimates:
+        if e.applied and e.name in s.free:
+            gain = float(L.without(s, e.name)[1] - value)
+            e = replace(e, **_values(e.name, s, s), gain=min(gain, e.gain)).gated()
+        again.append(e)
+    if any(e.name in s.free and not e.applied for e in again):
+        s = s.copy(free=tuple(e.name for e in again if e.applied and e.name in s.free))
+        for e in again:
+            if not e.applied and e.name in CONSTANTS:
+                s.constants[CONSTANTS.index(e.name)] = 0.0
+        s.fit(budget=200, rounds=2)
+    out = {f"{k}_sigma": s.sigmas[k] for k in ("range", "bearing") if k in s.fitted}
+    out |= {k: s.sigmas[k] for k in ("visit_range", "visit_bearing") if k in s.fitted}
+    out = {{"visit_range": "range_visit", "visit_bearing": "bearing_visit"}.get(k, k): v for k, v in out.items()}
+    return out | {"visit_sightings": sightings_of_a_visit(s.windows)} | motion_noise(s), again
+
+
+def motion_noise(s: Smoothing) -> dict[str, float]:
+    """Noise of the motion of one smoothing."""
+    return {k: s.sigmas[k] for k in L.WHEELS}
 
 
 def sightings_of_a_visit(windows: Sequence[Window]) -> float:

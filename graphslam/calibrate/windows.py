@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.calibrate import kernels as K
+from graphslam.calibrate.corrections import visits_of
 from graphslam.calibrate.smoothing import Ints, Window, numbered, rebuilt
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
@@ -16,8 +17,6 @@ from graphslam.frontends.odometry.motion import Motion, MotionNoise, dead_reckon
 
 LONGEST = 1.0
 """A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
-VISIT = 5.0
-"""A landmark that was out of sight for longer is visited anew [s]."""
 _HOLD = 0.5
 
 
@@ -187,18 +186,6 @@ def points_of(z: Array, sensor: Array) -> Array:
     """Where sightings ``(q, 2)`` put their landmarks, from sensors ``(q, 3)``; NaN without a bearing."""
     local = np.column_stack([z[:, 0] * np.cos(z[:, 1]), z[:, 0] * np.sin(z[:, 1])])
     return np.asarray(se2_transform(sensor, local))
-
-
-def visits_of(landmark: Ints, times: Array) -> Ints:
-    """Number of the visit of each sighting ``(q,)``, sightings in order of time."""
-    out = np.full(len(landmark), -1, dtype=np.int64)
-    count = 0
-    for l in np.unique(landmark):
-        mine = np.flatnonzero(landmark == l)
-        step = np.concatenate([[0], np.cumsum(np.diff(times[mine]) > VISIT)])
-        out[mine] = count + step
-        count += int(step[-1]) + 1
-    return out
 
 
 def follow(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, lost: int = 10) -> Ints:
