@@ -8,6 +8,7 @@ import typer
 
 from graphslam.app.cli.run import JSON
 from graphslam.app.cli.terminal import emit, table
+from graphslam.app.studies import STUDIES
 from graphslam.core.errors import GraphSlamError
 
 
@@ -19,7 +20,7 @@ def register(app: typer.Typer) -> None:
 def study(
     name: str = typer.Argument(
         ...,
-        help="combined-slam, association-ambiguity, segslam-garage (-mine, -building), or your own as module:object.",
+        help=", ".join(STUDIES) + ", or your own as module:object.",
     ),
     trials: int | None = typer.Option(None, help="Number of trials in each world. Default: that of the study."),
     workers: int | None = typer.Option(None, help="Number of processes. Default: the trials run in this process."),
