@@ -16,6 +16,7 @@ from graphslam.frontends.landmarks.config import RbpfEkfConfig
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
     "association-ambiguity.md",
+    "calibration.md",
     "campus.md",
     "combined-slam.md",
     "concepts.md",

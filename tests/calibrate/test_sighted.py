@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import graphslam as gs
 from graphslam.app.cli import app
+from graphslam.app.cli.run import join_note
 from graphslam.app.studies.calibration_robot import draw_robot, drive
 from graphslam.calibrate.corrections import Corrections, calibrated
 from graphslam.calibrate.sighted import QUICK, calibrate_sightings
@@ -121,3 +122,12 @@ def test_command_line_writes_what_a_run_takes(log, tmp_path) -> None:
 def test_impossible_figures_are_refused(name) -> None:
     with pytest.raises(ConfigError, match=name):
         Corrections(**{name: -1.0})
+
+
+def test_advice_names_the_cause_and_no_scale_on_covariances(log) -> None:
+    run = gs.run(log, config={**OPTIONS, "calibrate": {"use": "none"}}, progress=False)
+    causes = [f.text for f in run.verdict if f.code == "calibration" and "A cause of the disagreement" in f.text]
+    assert any("stamps of the motion" in c for c in causes)
+    (note,) = join_note(run)
+    assert "calibration" in note
+    assert "covariance_scale=" not in note

@@ -13,17 +13,21 @@ from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import calibrate_streams
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibrated
-from graphslam.calibrate.estimate import Calibration
-from graphslam.calibrate.sighted import FULL, QUICK, Effort
+from graphslam.calibrate.estimate import Calibration, in_words
+from graphslam.calibrate.sighted import FULL, QUICK, Effort, calibrate_sightings
+from graphslam.calibrate.windows import Seen
 from graphslam.core.config import merge
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
+from graphslam.evaluate.without_truth import two_sided
 from graphslam.frontends.base import FrontEnd
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
 """Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
+CERTAIN, DISAGREE = 0.999, 1.5
+"""Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
 OWN = "Noise and lasting errors are those of the settings made for this very set; nothing was estimated from the log."
 
 
@@ -159,6 +163,39 @@ def suited(front: FrontEnd, found: Calibration | None, options: Mapping[str, Any
     if "filter" not in typing.get_type_hints(type(front.config)) or "walk_scale" in own.get("filter", {}):
         return front
     return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
+
+
+def named_causes(
+    log: SensorLog, config: CalibrateConfig, chi2_per_dof: float | None, dof: float, *, ranges_corrected: bool
+) -> list[Finding]:
+    """Errors of the sensors that last, in a log that was mapped without calibration and whose submaps disagree.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : CalibrateConfig
+    chi2_per_dof, dof : float
+        Of the join of the submaps.
+    ranges_corrected : bool
+        The settings correct the ranges themselves.
+    """
+    name = log.of_type(LandmarkObservations)
+    if config.given is not None or name is None or chi2_per_dof is None or not dof > 0:
+        return []
+    if not chi2_per_dof > max(two_sided(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
+        return []
+    try:
+        found = calibrate_sightings(Seen.of(log, name, log[name]), QUICK)
+    except GraphSlamError:
+        return []
+    own = ("range_scale", "range_offset") if ranges_corrected else ()
+    out = []
+    for e in found.estimates:
+        if e.applied and e.name not in own:
+            text = f"A cause of the disagreement: {in_words(e.name, e.value, e.sigma)} (gain {e.gain:.0f} nats). "
+            text += "To do: --set calibrate.use=always, or `graphslam calibrate`; a scale on covariances is no cure."
+            out.append(Finding("bad", "calibration", text))
+    return out
 
 
 def chosen(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:

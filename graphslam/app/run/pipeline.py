@@ -17,7 +17,7 @@ from graphslam.app.folders.lock import locked
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
-from graphslam.app.run.calibration import own_noise, prepared, suited, without_noise
+from graphslam.app.run.calibration import named_causes, own_noise, prepared, suited, without_noise
 from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
@@ -444,7 +444,10 @@ def _judge(
     metrics = out.table()
     figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
     reports = [s.report for s in submaps]
-    seen = [*sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
+    join = figures.metrics.get("join_chi2_per_dof"), figures.metrics.get("join_dof", 0.0)
+    corrected = "noise" in effective.get("frontend", {})
+    causes = named_causes(log, settings.calibrate, *join, ranges_corrected=corrected)
+    seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
     report["verdict"] = verdict_json(
         [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
     )

@@ -11,6 +11,7 @@ STUDIES: dict[str, str] = {
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
     "campus": "graphslam.app.studies.campus:STUDY",
     "refinement": "graphslam.app.studies.refinement:STUDY",
+    "calibration": "graphslam.app.studies.calibration:STUDY",
     "scale": "graphslam.app.studies.scale:STUDY",
     "smartloc": "graphslam.app.studies.smartloc:STUDY",
     "withheld-fixes": "graphslam.app.studies.withheld_fixes:STUDY",
