@@ -1,8 +1,9 @@
 """One run over the campus: what fixes outside are worth inside.
 
-``odometry``: scan-to-window odometry, its submaps one behind the other. ``alone``: the same with loops between them.
-``joint-white`` and ``joint``: the same graph, the same loops, and fixes: every one as if its error was a new one; or
-as :attr:`CampusTrialConfig.gps` has it, which says how long errors last. So the pair differs in the fixes alone.
+``odometry``: scan-to-window odometry, its submaps one behind the other; ``odometry-fixes``: with fixes besides.
+``alone``: odometry with loops; ``joint-white`` and ``joint``: the same graph, the same loops, and fixes: every one as
+if its error was a new one; or, as in ``odometry-fixes``, as :attr:`CampusTrialConfig.gps` has it, which says how long
+errors last. So the graphs of a pair (:data:`PAIRS`) differ in the fixes alone.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.scan_window.front_end import ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.factors.gps import GpsRecord
+from graphslam.graph.factors.gps import GpsRecord, level_datum_pose
 from graphslam.sim.campus import simulate_campus
 from graphslam.sim.campus_config import CampusConfig
 from graphslam.solve.solution import Solution
 
-KINDS = ("odometry", "alone", "joint-white", "joint")
+KINDS = ("odometry", "odometry-fixes", "alone", "joint-white", "joint")
+PAIRS = {"odometry-fixes": "odometry", "joint-white": "alone", "joint": "alone"}
+"""The same graph with fixes, and without."""
 BLOCKS = {"position": slice(3, 6), "plan": slice(3, 5), "heading": slice(2, 3), "level": slice(0, 2)}
 
 
@@ -80,11 +83,13 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
         end.append(s)
     end.solver.solve_to_optimum()
     yield from judge.figures("odometry", end.solver.solution())
+    gps: Gps = log["gps"]
+    yield from judge.figures("odometry-fixes", *with_fixes(end, gps, config.gps))
+    without_fixes(end)
     yield from judge.figures("alone", end.finish())
     joined = process_time()
-    gps: Gps = log["gps"]
     for kind, how in (("joint-white", GpsOptions(use="all")), ("joint", config.gps)):
-        yield from judge.figures(kind, with_fixes(end, gps, how))
+        yield from judge.figures(kind, *with_fixes(end, gps, how))
     lost = sum(int(s.report.get("scans_lost", 0)) for s in submaps)
     steps = sum(int(s.report.get("steps", 0)) for s in submaps)
     tied = [r for r in end.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
@@ -96,15 +101,26 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
         yield Measurement("odometry", f"seconds_{name}", seconds, timing=True)
 
 
-def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> Solution:
-    """The graph as it is, with these fixes and no others."""
+def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> tuple[Solution, Array]:
+    """The graph as it is, with these fixes and no others; and its frame in that of the fixes."""
+    without_fixes(end)
+    end.add_gps(split(gps, how)[0], how)
+    end.graph.finish_gps()
+    end.solver.solve_to_optimum()
+    values, origin = end.graph.values, end.graph.gps_origin
+    assert values.datum is not None
+    assert origin is not None
+    frame = level_datum_pose(values.datum, values.tilt)
+    frame[:3] += origin
+    return end.solver.solution(), frame
+
+
+def without_fixes(end: BackEnd) -> None:
+    """Take all fixes out of the graph, and solve."""
     graph = end.graph
     for fid in [k for k, r in graph.records.items() if isinstance(r, GpsRecord)]:
-        graph.remove(fid, reason="other fixes come in their place")
-    end.add_gps(split(gps, how)[0], how)
-    graph.finish_gps()
+        graph.remove(fid, reason="the graph is solved without fixes")
     end.solver.solve_to_optimum()
-    return end.solver.solution()
 
 
 def submap_lift(config: WindowSubmapConfig) -> float:
@@ -132,6 +148,8 @@ class Judge:
         base = level(self.truth.interpolate(np.array([begin]))[0])
         base[2] -= lift
         self.base = base
+        self.T_world_base = SE3.compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)
+        """The frame of the map in the campus."""
 
     def true_at(self, times: Array) -> Array:
         """True poses in the frame of the map ``(n, 7)``."""
@@ -145,8 +163,8 @@ class Judge:
             out |= (times >= a) & (times <= b)
         return out
 
-    def figures(self, kind: str, solution: Solution) -> Iterator[Measurement]:
-        """Errors and honesty of one graph."""
+    def figures(self, kind: str, solution: Solution, T_world_map: Array | None = None) -> Iterator[Measurement]:
+        """Errors and honesty of one graph, and where in the campus fixes have its map, if any do."""
         path = solution.trajectory()
         true = self.true_at(path.times)
         inside = self.inside(path.times)
@@ -158,6 +176,10 @@ class Judge:
         raw = np.linalg.norm(path.poses[:, :3] - true[:, :3], axis=1)
         yield Measurement(kind, "ate_indoor_anchored", rms(raw[inside]))
         yield Measurement(kind, "end_error", float(raw[-1]))
+        if T_world_map is not None:
+            there = SE3.compose(np.broadcast_to(T_world_map, path.poses.shape), path.poses)[:, :3]
+            where = SE3.compose(np.broadcast_to(self.T_world_base, true.shape), true)[:, :3]
+            yield Measurement(kind, "ate_indoor_world", rms(np.linalg.norm(there - where, axis=1)[inside]))
         angles = [a for c in self.meta["corridors"] for a in angle_errors(c["legs"], path, true)]
         if angles:
             yield Measurement(kind, "angle_error", float(np.rad2deg(np.mean(np.abs(angles)))))

@@ -11,7 +11,7 @@ import pytest
 
 from graphslam.app.studies.campus import QUICK_WORLDS, SESSIONS, STUDY, nees_table, pair_table, session_table
 from graphslam.app.studies.campus_sessions import seam, start_of
-from graphslam.app.studies.campus_trial import BLOCKS, KINDS, angle_errors, campus_figures, submap_lift
+from graphslam.app.studies.campus_trial import BLOCKS, KINDS, PAIRS, angle_errors, campus_figures, submap_lift
 from graphslam.app.studies.definition import find_study
 from graphslam.backend.config import GpsOptions
 from graphslam.core.log import SensorLog
@@ -39,6 +39,10 @@ def test_sharp_fixes_outside_straighten_the_inside(run: dict[tuple[str, str], fl
         assert run["joint-white", quantity] < 0.7 * run["alone", quantity]
     assert run["joint-white", "ate"] < run["joint", "ate"] < run["alone", "ate"]
     assert 0 < run["joint-white", "ate"] < 0.2
+    assert run["odometry-fixes", "ate"] < run["odometry", "ate"]
+    for kind in PAIRS:  # sharp fixes say where in the campus that is, without any alignment
+        assert 0.5 * run[kind, "ate_indoor"] < run[kind, "ate_indoor_world"] < 0.2
+    assert ("alone", "ate_indoor_world") not in run
     for kind in KINDS:
         assert run[kind, "angle_error"] < 1.0
         assert run[kind, "failed"] == 0.0
