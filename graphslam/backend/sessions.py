@@ -211,7 +211,8 @@ def attach(
     DataError
         The two do not overlap as far as can be seen. The graph is as it was.
     SolverError
-        The graph contradicts what ties them; it holds the session all the same, and is of no use any more.
+        The graph, or places that are near each other by the ties, contradict them; it holds the session all the same,
+        and is of no use any more.
     """
     c = TieConfig() if config is None else config
     if found is None:
@@ -232,7 +233,13 @@ def attach(
             f"{new.name}: of {len(here)} ties to {known.name} that agree with each other the graph bears "
             f"{len(factors)}, wanted half of them"
         )
-    for x in _near(graph, two, known_node, node, here, progress):
+    near, tried = _near(graph, two, known_node, node, here, progress)
+    if tried >= c.heard and len(near) < c.borne * tried:
+        raise SolverError(
+            f"{new.name}: {len(here)} ties to {known.name} agree with each other, but of {tried} more places that "
+            f"they bring together {len(near)} match, wanted {c.borne:.0%}: another place looks alike"
+        )
+    for x in near:
         factors[_add(graph, x, known, new)] = x
     solver.solve_to_optimum()
     dropped += _winnow(graph, solver, factors)
@@ -275,7 +282,7 @@ def attach_by_gps(
     dropped = 0
     if places:
         two = TwoSessions(known.map, new.map)
-        factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], progress)}
+        factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], progress)[0]}
         solver.solve_to_optimum()
         dropped = _winnow(graph, solver, factors)
     logger.info("%s hangs on %s by GPS and %d ties", new.name, known.name, len(factors))
@@ -312,8 +319,11 @@ def _winnow(graph: PoseGraph, solver: Solver, factors: dict[int, Loop]) -> int:
 
 def _near(
     graph: PoseGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
-) -> list[Loop]:
-    """More ties, where places of the two sessions are near each other by now; nodes of the graph."""
+) -> tuple[list[Loop], int]:
+    """More ties, where places of the two sessions are near each other by now, and how many were tried.
+
+    Nodes are those of the graph.
+    """
     shift = np.where(np.arange(len(two.places)) < len(two.known.places), known_node, node - two.offset)
     places = replace(two.places, node=(two.places.node + shift).astype(np.int64))
     row: dict[int, int] = {int(n): k for k, n in enumerate(places.node)}
@@ -322,4 +332,4 @@ def _near(
     found = proximity_candidates(places, GraphRelative(graph), config, exclude=two.within, tried=before)
     measured = [x for x in two.measurer.measure(found, progress=progress) if not x.why]
     nodes: Ints = places.node
-    return [replace(x, i=int(nodes[x.i]), j=int(nodes[x.j])) for x in measured]
+    return [replace(x, i=int(nodes[x.i]), j=int(nodes[x.j])) for x in measured], len(found)

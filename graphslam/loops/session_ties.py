@@ -58,11 +58,15 @@ class TieConfig:
     """… over so much of the way of the session that is tied [m]."""
     rival: float = 0.5
     """A second set, of ties that the first has not, may have at most this share of its number."""
+    heard: int = 10
+    """Other places that ties bring near each other have a say where there are so many, at least …"""
+    borne: float = 0.1
+    """… of which such a share must match: blocks of houses look alike in part."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not math.isfinite(value) or value < 0 or (f.name in ("top", "keep", "least") and value < 1):
+            if not math.isfinite(value) or value < 0 or (f.name in ("top", "keep", "least", "heard") and value < 1):
                 raise ConfigError(f"ties of sessions: {f.name} = {value}; wanted a positive number")
         if not 0 < self.level < 1:
             raise ConfigError(f"ties of sessions: level = {self.level}; wanted a probability in (0, 1)")

@@ -16,10 +16,12 @@ import graphslam
 from graphslam.app.cli import app
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import open_run
+from graphslam.app.sessions.dense import session_of
 from graphslam.app.sessions.localise import localise
+from graphslam.backend.sessions import attach, put
 from graphslam.core import se3
 from graphslam.core.atomic import read_npz
-from graphslam.core.errors import ConfigError, DataError, RunFolderError
+from graphslam.core.errors import ConfigError, DataError, RunFolderError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import Gps
@@ -27,6 +29,9 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.session_ties import TieConfig, TwoSessions
+from graphslam.solve.registry import make_solver
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
 from tests.reference.hall_sessions import HallDrive, hall_drive
@@ -203,6 +208,25 @@ def test_what_cannot_be_merged_is_refused(runs: list[Any], tmp_path: Path) -> No
     no_grids = replace(runs[1], folder=None, submaps=[replace(s, grid=None) for s in runs[1].submaps])
     with pytest.raises(DataError, match="have no map"):
         graphslam.merge([runs[0], no_grids])
+
+
+def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> None:
+    """Ties that agree, all of them 9 m off: what is brought near each other by them does not match."""
+    known, new = (session_of(r, name, first_key=10 * k, after=1e4 * k) for k, (r, name) in enumerate(zip(runs, "ab")))
+    two = TwoSessions(known.map, new.map)
+    found = two.find(TieConfig())
+    shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
+    wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
+    for ties, named in ((wrong, r"b: \d+ ties to a agree .* looks alike"), (found, "")):
+        graph = PoseGraph(3)
+        solver = make_solver("batch", graph)
+        put(graph, known)
+        solver.solve_to_optimum()
+        if named:
+            with pytest.raises(SolverError, match=named):
+                attach(graph, solver, known, 0, new, found=(two, ties), config=TieConfig(heard=1))
+        else:
+            assert len(attach(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
 
 
 def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
