@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,11 +24,13 @@ from graphslam.frontends.odometry.scan_use import scan_findings
 from graphslam.frontends.odometry.step_config import StepConfig
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
+from graphslam.frontends.scan_window.encoder import encoder_findings
 from graphslam.frontends.scan_window.exits import relative_covariance
 from graphslam.frontends.scan_window.followed import once
 from graphslam.frontends.scan_window.tracker import Found, Tracker
 from graphslam.frontends.stepwise import StepwiseFrontEnd
 
+LAST = "end-of-log"
 MANY = 0.2
 """Share of lost scans from which a line of the verdict says so."""
 
@@ -108,7 +110,13 @@ class ScanWindow(StepwiseFrontEnd):
     ) -> Iterator[Submap]:
         """See :class:`~graphslam.frontends.base.FrontEnd`."""
         first = 0 if after is None else after.key + 1
-        yield from window_submaps(self.steps(log, drops=drops), self.config.window, self.config.submap, first_key=first)
+        c = self.config
+        for s in window_submaps(self.steps(log, drops=drops), c.window, c.submap, first_key=first):
+            if s.report["ended"] == LAST:
+                found = encoder_findings(log, c.steps, c.window, s.report["askew"], s.report["askew_sigma"])
+                rows = [*s.report.get("findings", []), *(f.as_row() for f in found)]
+                s = replace(s, report={**s.report, **({"findings": rows} if rows else {})})
+            yield s
 
 
 def window_submaps(
@@ -142,9 +150,8 @@ def window_submaps(
         full = way[k] - way[start] >= config.length and steps.times[k] - steps.times[start] >= config.seconds - 1e-6
         if k == n - 1 or full:
             if key >= first_key:
-                ended = "end-of-log" if k == n - 1 else "length"
-                submap = _submap(steps, (start, k), states, config, key, ended, tracker.lasting)
-                yield submap
+                ended = LAST if k == n - 1 else "length"
+                yield _submap(steps, (start, k), states, config, key, ended, tracker)
             tracker.begin()
             # the scan of a step between two submaps is in the map of the one that ends there
             start, key, states = k, key + 1, [(tracker.pose, tracker.joint, found)]
@@ -157,7 +164,7 @@ def _submap(
     config: WindowSubmapConfig,
     key: int,
     ended: str,
-    lasting: Array,
+    tracker: Tracker,
 ) -> Submap:
     start, end = interval
     gravity = steps.tilt is not None
@@ -175,7 +182,8 @@ def _submap(
             dropped += grid.insert_scan(points, origins, pose=T, max_range=steps.max_range, returns=returns).dropped
     report = {"ended": ended, "steps": end - start, "length": round(float(np.ptp(steps.path_length[[start, end]])), 3)}
     report |= {"beams_dropped": int(dropped), **_summary([s[2] for s in states[int(start > 0) :]])}
-    report["yaw_bias"] = float(lasting[0])
+    report["yaw_bias"], report["askew"] = float(tracker.lasting[0]), float(tracker.lasting[2])
+    report["askew_sigma"] = float(np.sqrt(tracker.P[tracker.w + 2, tracker.w + 2]))
     findings = [*steps.findings, *scan_findings(steps)] if key == 0 else []
     findings += _lost(key, end - start, report)
     if findings:

@@ -4,11 +4,15 @@ A car leaves points in every scan that saw it, at another place each time. Where
 through. A point is on something that moved where at least two neighbours know its place as free, with nothing occupied
 beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
 by beams to farther ground look the same. What moves away and never lets its place be seen stays.
+
+Without clouds, :func:`outvoted` asks moments instead of submaps: evidence adds up beam by beam, so a person who stands
+for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them. Where every
+moment has one vote, they do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -116,6 +120,38 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
                 drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
         out.append(replace(s, cloud=left, grid=drawn, report={**s.report, "points_moved": int(gone.sum())}))
     return out
+
+
+def outvoted(
+    grid: EvidenceGrid, moments: Iterable[EvidenceGrid], config: MovingConfig | None = None
+) -> tuple[Array, Mask]:
+    """Occupied voxels of a map that more moments saw through than were stopped by.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        In space, z up.
+    moments : iterable of EvidenceGrid
+        Of single moments (one to a few seconds of scans each), in the lattice of the map.
+    config : MovingConfig, optional
+        ``free``, ``least_free``, ``above_ground`` and ``ground_cell`` count; a moment needs only half of ``free``,
+        since few beams pass a voxel in it.
+
+    Returns
+    -------
+    centres : (n, 3)
+        Of the occupied voxels [m].
+    moved : (n,) bool
+    """
+    c = config or MovingConfig()
+    occupied = np.asarray(grid.occupied_cloud())
+    free, stopped = np.zeros(len(occupied), np.int64), np.zeros(len(occupied), np.int64)
+    for moment in moments:
+        says = _says(moment, occupied, 0.5 * c.free)
+        free += says < 0
+        rows = np.flatnonzero(says > 0)
+        stopped[rows[moment.occupied_at(occupied[rows])]] += 1
+    return occupied, (free >= c.least_free) & (free > stopped) & ~_ground(occupied, occupied, c)
 
 
 def _world(T: Array, points: Array) -> Array:

@@ -27,6 +27,7 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.app.studies import segslam_report as tables
+from graphslam.app.studies.campus_moving import run_moving_trial
 from graphslam.app.studies.campus_sessions import run_sessions_trial
 from graphslam.app.studies.campus_trial import BLOCKS, KINDS, PAIRS, CampusTrialConfig, run_campus_trial
 from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
@@ -52,6 +53,8 @@ SESSIONS = {
     )
 }
 """Three blocks one behind the other: two sessions round the first, one round the last."""
+MOVING = {"moving": CampusTrialConfig(campus=campus_preset("quick", movers=8, **_THIN))}
+"""One small block with eight cars and people: what is left of them in the map."""
 ERRORS = ("ate_indoor", "ate_indoor_own", "ate_indoor_anchored", "ate_outdoor", "ate", "end_error", "angle_error")
 DRAWN = {"ate_indoor": "ATE inside, path aligned as a whole [m]", "angle_error": "corridor's angle off [°]"}
 PLACES = ("middle", "indoor", "end")
@@ -63,19 +66,22 @@ class CampusStudy(WorldsStudy[CampusTrialConfig]):
     run_one = staticmethod(run_campus_trial)
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """The paired runs, and the sessions."""
-        return super().worlds(quick) + (() if quick else tuple(SESSIONS))
+        """The paired runs, the sessions, and what moves."""
+        return super().worlds(quick) + (() if quick else (*SESSIONS, *MOVING))
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
         """See the base."""
-        return partial(run_sessions_trial, SESSIONS[world]) if world in SESSIONS else super().trial(world, quick)
+        if world in SESSIONS:
+            return partial(run_sessions_trial, SESSIONS[world])
+        return partial(run_moving_trial, MOVING[world]) if world in MOVING else super().trial(world, quick)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
         """``errors`` of every kind, ``pairs`` of each with fixes and without, with a sign test, ``nees``, ``cpu``."""
-        pairs = table[~table["world"].isin(SESSIONS)]
+        pairs = table[~table["world"].isin((*SESSIONS, *MOVING))]
         out = {"errors": error_table(pairs), "pairs": pair_table(pairs), "nees": nees_table(pairs)}
-        if len(pairs) < len(table):
-            out["sessions"] = session_table(table)
+        for name, worlds in (("sessions", SESSIONS), ("moving", MOVING)):
+            if table["world"].isin(worlds).any():
+                out[name] = mean_table(table, worlds)
         if not timings.empty:
             out["cpu"] = tables.seconds_table(timings)
         return out
@@ -148,9 +154,9 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def session_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean over the runs of everything said of sessions that were merged; of those refused, the share."""
-    rows = table[table["world"].isin(SESSIONS) & (table["quantity"] != "failed")]
+def mean_table(table: pd.DataFrame, worlds: Iterable[str]) -> pd.DataFrame:
+    """Mean over the runs of everything said of some worlds; of what is yes or no, the share."""
+    rows = table[table["world"].isin(list(worlds)) & (table["quantity"] != "failed")]
     wide = rows.pivot_table(index="algorithm", columns="quantity", values="value", aggfunc="mean", sort=False)
     wide.insert(0, "runs", rows.groupby("algorithm")["run"].nunique())
     return wide.reset_index()

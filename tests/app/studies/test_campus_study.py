@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.campus import QUICK_WORLDS, SESSIONS, STUDY, nees_table, pair_table, session_table
+from graphslam.app.studies.campus import MOVING, QUICK_WORLDS, SESSIONS, STUDY, mean_table, nees_table, pair_table
+from graphslam.app.studies.campus_moving import moving_figures
 from graphslam.app.studies.campus_sessions import seam, start_of
 from graphslam.app.studies.campus_trial import BLOCKS, KINDS, PAIRS, angle_errors, campus_figures, submap_lift
 from graphslam.app.studies.definition import find_study
@@ -101,7 +102,7 @@ def test_nees_has_bounds_on_both_sides() -> None:
 def test_it_is_found_by_its_name() -> None:
     assert find_study("campus") is STUDY
     assert STUDY.worlds(quick=True) == ("quick",)
-    assert STUDY.worlds(quick=False) == ("blocks", "block", "whole", "sessions")
+    assert STUDY.worlds(quick=False) == ("blocks", "block", "whole", "sessions", "moving")
     assert STUDY.trial("sessions", False).args == (SESSIONS["sessions"],)
     assert STUDY.default_trials(quick=False) == 20
 
@@ -124,7 +125,9 @@ def test_a_seam_is_held_against_the_covariance_that_is_stated() -> None:
     assert (near["seam_within_3_sigma"], far["seam_within_3_sigma"]) == (1.0, 0.0)
     assert (near["ties"], near["ties_dropped"]) == (2.0, 1.0)
     rows = [("sessions", run, "overlap", -1, q, v) for run, d in enumerate((near, far)) for q, v in d.items()]
-    table = session_table(pd.DataFrame(rows, columns=["world", "run", "algorithm", "submap", "quantity", "value"]))
+    table = mean_table(
+        pd.DataFrame(rows, columns=["world", "run", "algorithm", "submap", "quantity", "value"]), SESSIONS
+    )
     assert table["runs"].tolist() == [2]
     assert table["seam_within_3_sigma"].tolist() == [0.5]
 
@@ -140,6 +143,14 @@ def test_the_true_start_of_a_session_is_where_its_first_submap_begins(sessions: 
         np.testing.assert_allclose(start[:2], world[:2], atol=1e-9)
         assert start[2] == pytest.approx(world[2] - submap_lift(config.front_end.submap))
         np.testing.assert_allclose(start[3:5], 0.0, atol=1e-9)
+
+
+def test_what_moves_leaves_the_map_and_the_rest_stays() -> None:
+    rows = {(m.algorithm, m.quantity): m.value for m in moving_figures(MOVING["moving"], 1)}
+    assert rows["evidence", "voxels_moving"] > 500
+    assert rows["outvoted", "gone"] > max(rows["evidence", "gone"], 0.93)
+    assert rows["outvoted", "lost"] < 0.012
+    assert rows["evidence", "lost"] <= rows["outvoted", "lost"]
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,138 @@
+"""The encoder of a scanner that turns about an upright axis: what it reads too much, from the log alone.
+
+Wheels roll straight on. A head whose encoder reads too much sees the world turned the other way about the robot, so
+that scans put on each other say that the robot moves askew, by that angle, all along. The tracker solves for this
+direction (:mod:`~graphslam.frontends.scan_window.tracker`); here it is found with the scans of the one head, taken off
+its angles, and looked for again until nothing is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.errors import DataError, MissingDataError
+from graphslam.core.findings import Finding
+from graphslam.core.log import SensorLog
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.se3 import quat_to_matrix
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import make_steps
+from graphslam.frontends.scan_window.config import ScanWindowConfig
+from graphslam.frontends.scan_window.tracker import Tracker
+
+UPRIGHT = 0.9
+"""Cosine of the tilt up to which the axis of a head counts as upright."""
+NAMED = 0.006
+"""Offset from which a run says so [rad]: brackets are no better."""
+SECONDS = 150.0
+"""Of the log, at most, that an estimate reads: enough for a hundredth of a degree."""
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderOffset:
+    """What an encoder reads too much.
+
+    Parameters
+    ----------
+    stream : str
+    offset, sigma : float
+        About the x axis of the mount [rad].
+    """
+
+    stream: str
+    offset: float
+    sigma: float
+
+
+def turning_heads(log: SensorLog) -> dict[str, float]:
+    """Streams of scanners that turn about an upright axis: 1.0 where it points up, -1.0 where down."""
+    out = {}
+    for name, s in log.streams.items():
+        if isinstance(s, RangeScans) and s.spin is not None and np.any(s.spin_rate):
+            up = float(quat_to_matrix(s.T_base_mount[3:])[2, 0])
+            if abs(up) > UPRIGHT:
+                out[name] = float(np.sign(up))
+    return out
+
+
+def encoder_offset(
+    log: SensorLog,
+    steps: StepConfig | None = None,
+    window: ScanWindowConfig | None = None,
+    *,
+    stream: str | None = None,
+) -> EncoderOffset:
+    """Estimate what the encoder of a turning head reads too much.
+
+    Parameters
+    ----------
+    log : SensorLog
+        With the head's scans, and motion that says which way the robot goes: wheels that do not slip to the side.
+    steps : StepConfig, optional
+        As the front end has it.
+    window : ScanWindowConfig, optional
+    stream : str, optional
+        Of the head; by default the only one.
+
+    Raises
+    ------
+    MissingDataError
+        No head that turns about an upright axis, or several and none named.
+    DataError
+        The scans do not say: too few of them could be put on each other.
+    """
+    heads = turning_heads(log)
+    if stream is None and len(heads) == 1:
+        stream = next(iter(heads))
+    if stream not in heads:
+        raise MissingDataError(
+            "no scanner that turns about an upright axis", where=log.name, got=stream, wanted=", ".join(heads) or "one"
+        )
+    scans = log[stream]
+    begin = float(scans.times[0])
+    part = log.slice(begin, begin + SECONDS)
+    head: RangeScans = part[stream]
+    assert head.spin is not None
+    config = replace(steps or StepConfig(), scanners=(stream,))
+    found = 0.0
+    for _ in range(_ROUNDS):
+        turned = replace(part, streams={**part.streams, stream: replace(head, spin=head.spin - found)})
+        tracker = Tracker(make_steps(turned, config), window or ScanWindowConfig())
+        seen = [tracker.step().lost == "" for _ in range(len(tracker.steps))]
+        if np.mean(seen) < 0.3:
+            raise DataError(
+                "too few scans could be put on each other",
+                where=stream,
+                got=f"{np.mean(seen):.0%}",
+                wanted="30 % or more",
+            )
+        askew, sigma = float(tracker.lasting[2]), float(np.sqrt(tracker.P[tracker.w + 2, tracker.w + 2]))
+        found -= heads[stream] * askew
+        if abs(askew) < max(0.2 * sigma, 2e-4):
+            break
+    return EncoderOffset(stream, found, sigma)
+
+
+def encoder_findings(
+    log: SensorLog, steps: StepConfig, window: ScanWindowConfig, askew: float, sigma: float
+) -> list[Finding]:
+    """A line for a head whose encoder is off, where a run went askew by so much [rad]; none where it went straight."""
+    heads = turning_heads(log)
+    if len(heads) != 1 or abs(askew) < max(0.5 * NAMED, 5.0 * sigma):
+        return []
+    try:
+        e = encoder_offset(log, steps, window)
+    except DataError:
+        return []
+    if abs(e.offset) < NAMED:
+        return []
+    degrees = np.rad2deg(abs(e.offset))
+    text = (
+        f"Scans of {e.stream} say that the robot moves askew all along: its encoder reads {degrees:.1f}° too "
+        f"{'much' if e.offset > 0 else 'little'} (± {np.rad2deg(e.sigma):.1f}°), or its mount is turned as much. Take "
+        "it off the angles of the head, and run again."
+    )
+    return [Finding("bad", "scan-encoder", text)]
