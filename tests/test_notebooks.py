@@ -65,6 +65,7 @@ def test_there_are_notebooks() -> None:
         "05_from_segmap_to_map",
         "06_consistency_study",
         "07_one_set_of_submaps",
+        "08_outdoors_and_indoors",
         "09_ten_to_the_eighth",
         "11_your_lidar",
     } <= {p.stem for p in NOTEBOOKS}

@@ -56,7 +56,7 @@ def moving_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
     standing, whole = make.grid(still)[0], make.grid(log)[0]
     hits = make.grid(only)[1]
     size = make.empty.voxel_size
-    met = (np.unique(np.floor(hits / size).astype(np.int64), axis=0) + 0.5) * size
+    met: Array = (np.unique(np.floor(hits / size).astype(np.int64), axis=0) + 0.5) * np.float64(size)
     met = met[~standing.occupied_at(met)]
     known = np.asarray(standing.occupied_cloud())
     centres, moved = outvoted(whole, make.moments(log))
