@@ -197,12 +197,13 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
             less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn + rate * dt
             h = 0.5 * turn
             cx, cyy = math.cos(h) * ux + math.sin(h) * uy, -math.sin(h) * ux + math.cos(h) * uy
-            shrink = math.exp(-g[DISTANCE_SCALE])
+            longer = math.exp(g[DISTANCE_SCALE])  # the noise is in what was measured: it is not scaled
             phi = th + h - 0.5 * less
             cp, sp = math.cos(phi), math.sin(phi)
             mx, my = poses[k + 1, 0] - x, poses[k + 1, 1] - y
             qx, qy = cp * mx + sp * my, -sp * mx + cp * my
-            ex, ey = qx - shrink * cx + speed * dt, qy - shrink * cyy
+            qx, qy = longer * qx, longer * qy
+            ex, ey = qx - cx + speed * dt, qy - cyy
             et = wrap(poses[k + 1, 2] - th - turn + less)
             var_x = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
             var_y = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
@@ -216,14 +217,16 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
                 jn[:] = 0.0
                 if row == 0:
                     w, e, dphi = 1.0 / math.sqrt(var_x), ex, qy
-                    jp[0], jp[1], jn[0], jn[1] = -w * cp, -w * sp, w * cp, w * sp
-                    scale = shrink * cx
+                    u = w * longer
+                    jp[0], jp[1], jn[0], jn[1] = -u * cp, -u * sp, u * cp, u * sp
+                    scale = qx
                     if D == 5:
                         jp[4] = w * dt
                 elif row == 1:
                     w, e, dphi = 1.0 / math.sqrt(var_y), ey, -qx
-                    jp[0], jp[1], jn[0], jn[1] = w * sp, -w * cp, -w * sp, w * cp
-                    scale = shrink * cyy
+                    u = w * longer
+                    jp[0], jp[1], jn[0], jn[1] = u * sp, -u * cp, -u * sp, u * cp
+                    scale = qy
                 else:
                     w, e, dphi, scale = 1.0 / math.sqrt(var_t), et, -1.0, 0.0
                     jn[2] = w

@@ -57,7 +57,7 @@ class Pairs:
     seconds, metres, turn : (n,)
         In motion, driven, and turned (with its sign), by the odometry between them; ``turned`` without sign.
     chord : (n,)
-        Distance between them by the odometry [m].
+        Way between them by the match, in the direction of the odometry [m].
     heading, along, side : (n,)
         Odometry less match [rad, m, m].
     """
@@ -126,7 +126,8 @@ def matched_pairs(steps: Steps, most: int) -> Pairs:
             shift = e[g.position]
             along = float(shift @ start)
             side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
-            chord = float(np.asarray(T[: steps.dim]) @ direction)
+            # the way that the match says: noise in the regressor would make the scale too large
+            chord = float(np.asarray(found.T_target_source[: steps.dim]) @ direction)
             gone = [float(s[b] - s[a]) for s in sums.values()]
             rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
@@ -314,12 +315,12 @@ def _distance(p: Pairs) -> tuple[Estimate, dict[str, float]]:
         keep = full.keep
         gain = regress(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
     raw = _gated("distance_scale", full, parts, 0, gain)
-    # odometry less match over odometry is 1 - 1 / factor
-    value = -math.log1p(-min(raw.value, 0.9))
+    # odometry less match over match is the factor less 1
+    value = math.log1p(max(raw.value, -0.9))
     scale = Estimate(
         **{k: getattr(raw, k) for k in raw.__dataclass_fields__ if k not in ("value", "other")},
         value=value,
-        other=-math.log1p(-min(raw.other, 0.9)),
+        other=math.log1p(max(raw.other, -0.9)),
     )
     side = regress(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
     return scale, {"along_metre": float(full.sigmas[1]), "lateral_metre": float(side.sigmas[1])}

@@ -131,3 +131,12 @@ def test_advice_names_the_cause_and_no_scale_on_covariances(log) -> None:
     (note,) = join_note(run)
     assert "calibration" in note
     assert "covariance_scale=" not in note
+
+
+def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> None:
+    """Noise of half a step length is in what is measured, not in the way: it must not be taken for a scale."""
+    robot = dataclasses.replace(ROBOT, speed=0.6, along_metre=0.12, clock=0.0, distance_scale=1.0, range_sigma=0.03)
+    noisy = drive(robot, 5, 60.0)
+    effort = dataclasses.replace(QUICK, clock=False)
+    e = {e.name: e for e in calibrate_sightings(Seen.of(noisy, "landmarks", noisy["landmarks"]), effort).estimates}
+    assert abs(e["distance_scale"].value) < 2.5 * e["distance_scale"].sigma

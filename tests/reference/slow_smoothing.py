@@ -55,11 +55,12 @@ def residuals(s: Smoothing, states: np.ndarray) -> tuple[np.ndarray, float]:
                 continue
             ux, uy, turn, dt, d, *given = w.steps[k + 1]
             less = g["yaw_bias"] * dt + g["turn_per_metre"] * d + g["turn_scale"] * turn
-            chord = np.exp(-g["distance_scale"]) * (_rotation(-turn / 2) @ [ux, uy])
+            chord = _rotation(-turn / 2) @ [ux, uy]
             if D == 5:
                 less += poses[k, 3] * dt
                 chord = chord - [poses[k, 4] * dt, 0.0]
             moved = _rotation(-(th + turn / 2 - less / 2)) @ (poses[k + 1, :2] - poses[k, :2])
+            moved = np.exp(g["distance_scale"]) * moved
             along = p["along_metre"] ** 2 * d + p["along_second"] ** 2 * dt + p["floor_position"] ** 2
             side = p["lateral_metre"] ** 2 * d + p["floor_position"] ** 2
             head = p["heading_metre"] ** 2 * d + p["heading_radian"] ** 2 * abs(turn)
