@@ -16,7 +16,6 @@ from graphslam.core.random import SeedTree
 WHEELS = ("along_metre", "along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
 TRIMS = (5.0, 4.0)
 """Sightings with a whitened residual above are left out, with a new fit after each."""
-LASTING = ("rate_sigma", "rate_time", "speed_sigma", "speed_time")
 
 
 def smoothing_of(windows: Sequence[Window], sensor: Array, free: Sequence[str], *, visits: bool = False) -> Smoothing:

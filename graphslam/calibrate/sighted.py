@@ -40,12 +40,10 @@ class Effort:
     """Poses of all short windows together; of the one stretch of ranges alone."""
     clock: bool = True
     """Is the offset of the clocks looked for?"""
-    lasting: bool = False
-    """Are errors of the motion that last looked for (Gauss-Markov)?"""
 
 
 QUICK = Effort()
-FULL = Effort(windows=60, poses=6000, lasting=True)
+FULL = Effort(windows=60, poses=6000)
 
 
 def calibrate_sightings(seen: Seen, effort: Effort = QUICK, *, seed: int = 0) -> Calibration:
