@@ -18,7 +18,6 @@ not dropped: the nearest stamps that rise (isotonic regression), if none has to 
 from __future__ import annotations
 
 import os
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +33,7 @@ from graphslam.core.records import LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
 from graphslam.io.look import Look
+from graphslam.io.planar_scans import one_layout
 from graphslam.io.recognise import CARMEN_SCANS
 
 MAX_RANGE = 80.0
@@ -307,11 +307,9 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
         )
     for reason, numbers_of in lost.items():
         drops.drop("laser", reason, len(numbers_of))
-    layouts = Counter(x.layout for x in lines)
-    usual = max(layouts, key=lambda k: (layouts[k], k))
-    beams = _directions(usual)
-    ranges = np.stack([x.ranges if x.layout == usual else _on_beams(x, beams) for x in lines])
-    drops.drop("laser", f"scan of other beams put on the usual {usual[2]} (kept)", len(lines) - layouts[usual])
+    directions = {x.layout: _directions(x.layout) for x in lines}
+    ranges, beams, moved = one_layout([(x.ranges, directions[x.layout]) for x in lines])
+    drops.drop("laser", f"scan of other beams put on the usual {len(beams)} (kept)", moved)
     poses = [x.pose for x in lines if x.pose is not None]
     reach = [x.max_range for x in lines if x.max_range is not None]
     return _Scans(
@@ -327,15 +325,6 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
 def _directions(layout: tuple[float, float, int]) -> Array:
     start, step, n = layout
     return np.asarray(start + step * np.arange(n, dtype=np.float64)) if step > 0 else bearings(n)
-
-
-def _on_beams(line: _Line, beams: Array) -> npt.NDArray[np.float32]:
-    """Ranges of a scan on other beams: each takes the nearest one within a step, NaN where there is none."""
-    own = _directions(line.layout)
-    k = np.clip(np.searchsorted(own, beams), 1, len(own) - 1)
-    k = k - (beams - own[k - 1] < own[k] - beams)
-    near = np.abs(own[k] - beams) <= max(own[1] - own[0], beams[1] - beams[0])
-    return np.where(near, line.ranges[k], np.nan).astype(np.float32)
 
 
 def _still(poses: Array) -> bool:

@@ -114,7 +114,7 @@ def _bin(raw: bytes, where: str, columns: int) -> Cloud:
     return clean(np.frombuffer(raw, "<f4").reshape(-1, columns)[:, :3].astype(np.float64))
 
 
-def _table(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
+def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
     """A cloud of columns by name."""
     lower = {k.lower().removeprefix("scalar_"): k for k in fields}
     if not {"x", "y", "z"} <= lower.keys():
@@ -154,7 +154,7 @@ def _ply(raw: bytes, where: str) -> Cloud:
     if form == "ascii":
         skip = sum(e[1] for e in elements[:at])
         rows = body.splitlines()[skip : skip + n]
-        return _table(_ascii(rows, n, labels, where), where)
+        return columns_cloud(_ascii(rows, n, labels, where), where)
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form)
     if order is None:
         raise FormatError("unknown form of PLY", where=where, got=form, wanted="ascii or binary")
@@ -164,7 +164,7 @@ def _ply(raw: bytes, where: str) -> Cloud:
             raise FormatError("lists before the vertices are not read", where=where, wanted="vertices first")
         first += count * sum(np.dtype(k).itemsize for _, k in inner)
     dtype = np.dtype([(p, order + k) for p, k in properties])
-    return _table(_records(body[first:], n, dtype, where), where)
+    return columns_cloud(_records(body[first:], n, dtype, where), where)
 
 
 def _ascii(rows: list[bytes], n: int, labels: list[str], where: str) -> dict[str, npt.NDArray[Any]]:
@@ -228,9 +228,9 @@ def _pcd(raw: bytes, where: str) -> Cloud:
     body, form = raw[end.end() :], end[1].decode().lower()
     if form == "ascii":
         labels = [f if c == 1 else f"{f}#{j}" for f, _, c in columns for j in range(c)]
-        return _table(_ascii([r for r in body.splitlines() if r.strip()][:n], n, labels, where), where)
+        return columns_cloud(_ascii([r for r in body.splitlines() if r.strip()][:n], n, labels, where), where)
     if form == "binary":
-        return _table(_records(body, n, dtype, where), where)
+        return columns_cloud(_records(body, n, dtype, where), where)
     if form != "binary_compressed":
         raise FormatError("unknown form of PCD", where=where, got=form, wanted="ascii, binary or binary_compressed")
     packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
@@ -244,7 +244,7 @@ def _pcd(raw: bytes, where: str) -> Cloud:
         if c == 1:
             out[f] = np.frombuffer(data, d, count=n, offset=at)
         at += size
-    return _table(out, where)
+    return columns_cloud(out, where)
 
 
 def lzf(data: bytes, size: int, where: str) -> bytes:

@@ -193,6 +193,9 @@ def _bag(look: Look) -> Claim | None:
     if look.path.is_file():
         candidates = [look.path]
     kinds = [(p, k) for p in candidates[:200] if (k := bag_kind(look, p))]
+    index = look.named("metadata.yaml")
+    if index is not None and look.lines(index, 1)[:1] == ["rosbag2_bagfile_information:"]:
+        return Claim(f"ROS 2 bag {look.relative(index.parent) if index.parent != look.path else look.path.name}")
     if not kinds:
         empty = [p for p in look.files if ending(p) in (".bag", ".db3", ".mcap")]
         if not empty:
@@ -341,6 +344,11 @@ BUILT_IN: dict[str, Reader] = {
         _euroc,
     ),
     "lidar-pack": Reader("packed clouds: xyz_i16_planar.npy", f"{_IO}.lidar_pack:read_lidar_pack", _lidar_pack),
+    "ros-bag": Reader(
+        "ROS 1 bag, ROS 2 bag (sqlite3, MCAP) or MCAP of ROS messages: laser, clouds, IMU, odometry, GPS, tf_static",
+        f"{_IO}.bags:read_bag",
+        _bag,
+    ),
     "kitti": Reader(
         "KITTI odometry (velodyne/, times.txt, poses) and raw (velodyne_points/, oxts/)",
         f"{_IO}.cloud_logs:read_kitti",

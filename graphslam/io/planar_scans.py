@@ -1,0 +1,52 @@
+"""Planar scans whose beams are not all the same, put on the beams of most of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+
+Ranges = npt.NDArray[np.float32]
+
+
+def on_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
+    """Ranges of a scan on other beams: each takes the nearest one within a step, NaN where there is none.
+
+    Parameters
+    ----------
+    ranges, own : (n,)
+        Of the scan, and its directions, rising [rad].
+    beams : (m,)
+    """
+    k = np.clip(np.searchsorted(own, beams), 1, len(own) - 1)
+    k = k - (beams - own[k - 1] < own[k] - beams)
+    near = np.abs(own[k] - beams) <= max(own[1] - own[0], beams[1] - beams[0])
+    return np.where(near, ranges[k], np.nan).astype(np.float32)
+
+
+def one_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, int]:
+    """Scans of any beams as one table.
+
+    Parameters
+    ----------
+    scans : sequence of (ranges, directions)
+        Directions rise [rad]; scans that share them should share the array.
+
+    Returns
+    -------
+    ranges : (k, m)
+    beams : (m,)
+        Of most scans.
+    moved : int
+        Scans that had others.
+    """
+    keys = [(len(b), float(b[0]), float(b[-1])) for _, b in scans]
+    counts = Counter(keys)
+    usual = max(counts, key=lambda k: (counts[k], k))
+    beams = scans[keys.index(usual)][1]
+    rows = [r if k == usual else on_beams(r, b, beams) for (r, b), k in zip(scans, keys)]
+    return np.stack(rows), beams, len(scans) - counts[usual]
