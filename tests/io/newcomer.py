@@ -1,6 +1,6 @@
 """Six sources as a newcomer would bring them, made of recorded sets: ``python -m tests.io.newcomer OUT``.
 
-A CARMEN file, a KITTI-style folder of BIN without poses, a folder of PLY (written by ``plyfile``) with TUM poses, a ROS 2
+A CARMEN file, a KITTI-style folder of BIN without poses, a folder of PLY (by ``plyfile``) with TUM poses, a ROS 2
 bag (``rosbags``), an MCAP file (``mcap``), and two CSV tables. Recorded data stay out of the repository.
 """
 
