@@ -24,6 +24,13 @@ ALIKE = 0.3
 """… and so does that whose whitened residuals are so alike from one to the next."""
 
 
+LARGEST = {"distance_scale": 0.15, "turn_scale": 0.5, "range_scale": 0.15}
+"""Wear, load and slip of wheels stay below these. More is a wrong unit, a wrong sign, a mounting or a sensor that does
+not measure what it says, and matches cannot tell which stream is wrong."""
+LARGEST_NOISE = {"along_metre": 0.3, "heading_metre": 0.5}
+"""Odometry that is worse than this tells nothing of the way: streams contradict each other [m/√m, rad/√m]."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """One constant.
@@ -53,6 +60,11 @@ class Estimate:
     def applied(self) -> bool:
         """Is it taken out of the log?"""
         return not self.why_not
+
+    @property
+    def contradiction(self) -> bool:
+        """Is it too large for an error of a sensor that works?"""
+        return abs(self.value) - SURE * self.sigma > LARGEST.get(self.name, math.inf)
 
     def gated(self) -> Estimate:
         """The same with the verdict of the gates."""
@@ -94,6 +106,14 @@ class Calibration:
 
     def findings(self) -> list[Finding]:
         """Lines of a verdict: what is applied, what is not, and why."""
+        against = self.contradictions()
+        if against:
+            text = f"From {self.data}: {', '.join(against)}. No sensor that works errs so much: a unit, a sign, a "
+            text += (
+                "mounting or one of the streams is wrong, and which one cannot be told. Nothing was calibrated; the "
+            )
+            text += "defaults of the noise are used. To do: `graphslam data check`."
+            return [Finding("bad", "calibration-contradiction", text)]
         out = []
         for e in self.estimates:
             said = in_words(e.name, e.value, e.sigma)
@@ -109,6 +129,12 @@ class Calibration:
         if self.noise:
             out.append(Finding("", "calibrated", f"Noise from {self.data}: {noise_in_words(self.noise)}."))
         return [*out, *self.notes]
+
+    def contradictions(self) -> list[str]:
+        """What is too large for an error of sensors that work, in words; then nothing of the calibration is used."""
+        out = [in_words(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
+        large = {k: v for k, v in self.noise.items() if v > LARGEST_NOISE.get(k, math.inf)}
+        return out + ([f"noise {noise_in_words(large)}"] if large else [])
 
     def config(self) -> dict[str, Any]:
         """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""

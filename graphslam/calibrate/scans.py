@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate
-from graphslam.calibrate.sighted import Effort, corrections_of
+from graphslam.calibrate.sighted import Effort, calibration_of
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
@@ -245,11 +245,7 @@ def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
         )
         text += f" m/√m and {math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m."
         notes.append(Finding("", "calibrated", text))
-    values = corrections_of(estimates, noise)
-    kind = "scans" if steps.dim == 2 else "clouds"
-    return Calibration(
-        kind=kind, corrections=values, estimates=tuple(estimates), noise=noise, notes=tuple(notes), data=data
-    )
+    return calibration_of("scans" if steps.dim == 2 else "clouds", estimates, noise, notes, data)
 
 
 def _turning(p: Pairs, noise: dict[str, float]) -> float:

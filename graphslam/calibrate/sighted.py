@@ -70,6 +70,7 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
     long.sigmas, long.constants = dict(start[0]), start[1].copy()
     clock = None
     long, _ = L.fitted(long, trims=L.TRIMS[1:])
+    _enough(long, seen)
     notes: list[Finding] = []
     if effort.clock:
         clock = profile_clock(short, seen)
@@ -86,13 +87,15 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
         noise |= two
         if two or lasts or alike > ALIKE:
             notes.append(_lasting_note(short, long, alike))
-    return _made("sightings", seen, estimates, noise, notes, _data(short))
+    return calibration_of("sightings", estimates, noise, notes, _data(short))
 
 
 def _again(seen: Seen, clock: Estimate, effort: Effort) -> Calibration:
     """The calibration with the motion's clock put right."""
     mended = Seen.of(calibrated(seen.log, Corrections(clock=rounded(clock.value))), seen.name, seen.sightings)
     found = _range_and_bearing(mended, replace(effort, clock=False))
+    if found.contradictions():
+        return found
     corrections = replace(found.corrections, clock=rounded(clock.value))
     return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
 
@@ -115,7 +118,7 @@ def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> Calibration:
         notes.append(Finding("", "calibrated", text))
     if lasts or alike > ALIKE:
         notes.append(_lasting_note(half, whole, alike))
-    return _made("ranges", seen, estimates, noise, notes, f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})")
+    return calibration_of("ranges", estimates, noise, notes, f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})")
 
 
 def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
@@ -325,20 +328,22 @@ def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
     return Finding("look", "errors-last", text)
 
 
-def _made(
-    kind: str, seen: Seen, estimates: list[Estimate], noise: dict[str, float], notes: list[Finding], data: str
+def calibration_of(
+    kind: str, estimates: Sequence[Estimate], noise: dict[str, float], notes: Sequence[Finding], data: str
 ) -> Calibration:
-    return Calibration(
+    """A calibration with what is applied of it: nothing where streams contradict each other."""
+    found = Calibration(
         kind=kind,
-        corrections=corrections_of(estimates, noise),
+        corrections=_corrections(estimates, noise),
         estimates=tuple(estimates),
         noise={k: float(v) for k, v in noise.items()},
         notes=tuple(notes),
         data=data,
     )
+    return replace(found, corrections=Corrections()) if found.contradictions() else found
 
 
-def corrections_of(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
+def _corrections(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
     """What is applied: constants that passed the gates, and the noise."""
     applied = {e.name: e.value for e in estimates if e.applied}
     values: dict[str, float] = {}

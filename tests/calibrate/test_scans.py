@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import graphslam as gs
+from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.scans import calibrate_scans, regress
 from graphslam.calibrate.sighted import QUICK
 from graphslam.core.errors import DataError
@@ -85,6 +86,18 @@ def test_run_of_a_front_end_on_grids_is_calibrated(log) -> None:
     options = {"frontend": {"steps": {"period": "none"}, "filter": {"particles": 4}}, "map": {"fuse": False}}
     run = gs.run(log.slice(0.0, 60.0), frontend="rbpf-grid", config=options, progress=False)
     assert run.report["calibrate"]["given"]["distance_scale"] == pytest.approx(SCALE, abs=0.01)
+
+
+def test_ranges_twice_too_long_are_a_contradiction_and_correct_nothing(log) -> None:
+    scans = log["scans"]
+    doubled = dataclasses.replace(scans, ranges=2.0 * scans.ranges, max_range=60.0)
+    made = make_steps(dataclasses.replace(log, streams={**log.streams, "scans": doubled}), StepConfig(period=None))
+    found = calibrate_scans(made, QUICK)
+    scale = next(e for e in found.estimates if e.name == "distance_scale")
+    assert scale.contradiction
+    assert found.corrections == Corrections()
+    (line,) = found.findings()
+    assert (line.level, line.code) == ("bad", "calibration-contradiction")
 
 
 def test_scans_that_see_nothing_are_refused(log) -> None:
