@@ -1,7 +1,7 @@
 """Pose graphs that are one long chain with loops: everything between loop ends is eliminated exactly, along the chain.
 
-Poses at which a loop begins or ends stay, with the first and the last one; each segment between two of them leaves one
-block for its ends. The reduced network is factored by the sparse block Cholesky. Time and memory are linear in the
+Poses at which a loop begins or ends stay, with the first and the last one; the links of a segment between two of them
+are joined to one. The reduced network is factored by the sparse block Cholesky. Time and memory are linear in the
 poses, and depend on the loops by the fill of a network of twice their number.
 """
 
@@ -18,11 +18,11 @@ from graphslam.core.errors import DataError, IndeterminateError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import segment_kernels as kernels
-from graphslam.skeleton.chain_kernels import Chain
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import KeyframePattern
 from graphslam.skeleton.problem import inverse_covariance
 from graphslam.skeleton.schur import moved
+from graphslam.skeleton.segment_kernels import Links
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +82,17 @@ class ChainGraph:
         return len(self.translation) + 1
 
     @cached_property
-    def links(self) -> tuple[Chain, Chain]:
-        """Odometry and loops, as the kernels take them."""
-        up, nothing = np.zeros((self.poses, 3)), np.zeros(1)
+    def links(self) -> tuple[Links, Links]:
+        """Odometry, in segments between the ends of loops, and loops, as the kernels take them."""
+        N, L = self.poses, len(self.ends)
         info = inverse_covariance(self.covariance, "covariance")
         more = inverse_covariance(self.loop_covariance, "loop_covariance")
+        k = np.arange(N, dtype=np.int64)
+        kept = np.unique(np.concatenate([k[[0, -1]], self.ends.ravel()]))
+        steps = np.column_stack([k[:-1], k[1:]])
         return (
-            Chain(self.rotation, self.translation, info, up, nothing),
-            Chain(self.loop_rotation, self.loop_translation, more, up, nothing),
+            Links(steps, kept, self.rotation, self.translation, self.covariance, info),
+            Links(self.ends, np.arange(L + 1), self.loop_rotation, self.loop_translation, self.loop_covariance, more),
         )
 
     def dead_reckoning(self) -> Poses:
@@ -153,39 +156,40 @@ def relax_chain(
         The objective is not finite.
     """
     odometry, loops = graph.links
-    N = graph.poses
-    kept = np.unique(np.concatenate([[0, N - 1], graph.ends.ravel()])).astype(np.int64)
+    N, kept = graph.poses, odometry.first
     K = len(kept)
-    # blocks of the reduced network: (c, c), (c, c + 1), and a loop's, whose ends may stand the other way round
-    i, j = np.searchsorted(kept, graph.ends).T if len(graph.ends) else (np.empty(0, np.int64), np.empty(0, np.int64))
-    turned = i > j
-    c = np.arange(K, dtype=np.int64)
-    all_keys = np.concatenate([c * K + c, (c * K + c + 1)[:-1], np.where(turned, j * K + i, i * K + j)])
-    keys, place = np.unique(all_keys, return_inverse=True)
+    # the reduced network: segments of the odometry, then loops
+    c = np.arange(K)
+    ends = np.concatenate([np.column_stack([c[:-1], c[1:]]), np.searchsorted(kept, graph.ends)]).astype(np.int64)
+    keys, place = np.unique(np.concatenate([c * K + c, ends.min(axis=1) * K + ends.max(axis=1)]), return_inverse=True)
     pattern = KeyframePattern(keys.astype(np.int64), K)
+
+    def joined(poses: Poses) -> tuple[float, Array, Array]:
+        covariance, misfit = np.empty((len(ends), 6, 6)), np.empty((len(ends), 6))
+        total = kernels.join_links(odometry, poses, covariance[: K - 1], misfit[: K - 1])
+        total += kernels.join_links(loops, poses, covariance[K - 1 :], misfit[K - 1 :])
+        return float(total), covariance, misfit
+
     here = graph.dead_reckoning() if poses is None else poses
-    total, parts = _linearised(graph, here, odometry, loops)
+    total, stiffness, misfit = joined(here)
     history, predicted, far, converged = [total], np.inf, np.inf, False
     for _ in range(iterations):
         if not np.isfinite(total):
             raise SolverError("objective of the chain graph is not finite")
-        diagonal, upper, between, g = parts
-        x = -g
-        left, right, rhs = np.empty((K, 6, 6)), np.empty((K - 1, 6, 6)), np.empty((K, 6))
-        bad = kernels.eliminate(diagonal, upper, x, kept, (left, right), rhs)
+        blocks, g = np.zeros((len(keys), 6, 6)), np.zeros((K, 6))
+        energy, bad = kernels.tie_ends(ends, here.position[kept], stiffness, misfit, (place[:K], place[K:]), blocks, g)
         if bad >= 0:
-            raise IndeterminateError(f"pose {bad} of the chain is not constrained", (f"x{bad}",))
-        blocks = np.zeros((len(keys), 6, 6))
-        blocks[place[:K]] = left
-        blocks[place[K : 2 * K - 1]] = right
-        np.add.at(blocks, place[2 * K - 1 :], np.where(turned[:, None, None], between.swapaxes(1, 2), between))
-        solved = pattern.factor(blocks).solve(rhs.ravel()).reshape(K, 6)
-        kernels.substitute(diagonal, upper, x, kept, solved)
-        predicted = -float(np.einsum("ij,ij->", x, g))
+            i, j = kept[ends[bad]]
+            raise IndeterminateError(f"nothing ties pose {i} of the chain to pose {j}", (f"x{i}", f"x{j}"))
+        blocks[place[0]] += 1e12 * np.eye(6)  # held: softer than the rounding of its moves, harder than any measurement
+        x = np.empty((N, 6))
+        x[kept] = pattern.factor(blocks).solve(-g.ravel()).reshape(K, 6)
+        predicted = total - energy - float(np.einsum("ij,ij->", x[kept], g))
+        kernels.follow_links(odometry, here, stiffness[: K - 1], misfit[: K - 1], x)
         scale = 1.0
         while True:
             there = moved(here, x, scale)
-            after, parts = _linearised(graph, there, odometry, loops)
+            after, stiffness, misfit = joined(there)
             if after <= total * (1.0 + 1e-12) or scale < 1e-4:
                 break
             scale *= 0.5
@@ -200,14 +204,3 @@ def relax_chain(
             converged = True
             break
     return RelaxedChain(here, total, history, predicted, far, converged)
-
-
-def _linearised(graph: ChainGraph, poses: Poses, odometry: Chain, loops: Chain) -> tuple[float, tuple[Array, ...]]:
-    """Objective; diagonal blocks, blocks along the chain, blocks of the loops, half the gradient."""
-    N = graph.poses
-    g, diagonal, upper = np.zeros((N, 6)), np.zeros((N, 6, 6)), np.zeros((N - 1, 6, 6))
-    between = np.empty((len(graph.ends), 6, 6))
-    total = chains.linearise(odometry, poses, True, diagonal, upper, g)
-    total += kernels.linearise_loops(loops, graph.ends, poses, diagonal, between, g)
-    diagonal[0] += 1e12 * np.eye(6)  # held: softer than the rounding of its own moves, harder than any measurement
-    return float(total), (diagonal, upper, between, g)

@@ -35,8 +35,12 @@ def _log(R, r):
     """Rotation vector of a rotation matrix, below a half turn."""
     c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
-    s = np.sqrt(x * x + y * y + z * z)
-    k = 1.0 + s * s / 6.0 if s < 1e-4 and c > 0.0 else np.arctan2(s, c) / max(s, 1e-300)
+    q = x * x + y * y + z * z
+    if q < 2e-3 and c > 0.0:  # asin(s) / s; what is left out is below 1e-15
+        k = 1.0 + q * (1.0 / 6.0 + q * (3.0 / 40.0 + q * (15.0 / 336.0 + q * 105.0 / 3456.0)))
+    else:
+        s = np.sqrt(q)
+        k = np.arctan2(s, c) / max(s, 1e-300)
     r[0], r[1], r[2] = k * x, k * y, k * z
 
 

@@ -1,150 +1,320 @@
-"""Numba kernels of pose graphs that are a chain with loops: the poses between loop ends are eliminated along the chain.
+"""Numba kernels of pose graphs whose links are joined to segments: a path of links acts on its two ends like one link.
 
-Blocks as in :mod:`~graphslam.skeleton.chain_kernels`. Plain arrays only.
+Poses are perturbed in the world frame as in :mod:`~graphslam.skeleton.chain_kernels`. The residual of a link from pose
+i to pose j is r; its derivative is ``J Δ`` with ``Δ = (w_j - w_i, u_j - u_i - w_i × (p_j - p_i))`` and ``J =
+diag(J_r⁻¹(r) R_jᵀ, R_iᵀ)``. Twists taken about one point add up along a path, so what its links give way adds up, too,
+as springs one after the other: with ``G`` = ``J⁻¹``, then the shift to the path's first pose, the path is one link of
+covariance ``Σ G Ω⁻¹ Gᵀ`` and residual ``Σ G r``. This is the exact elimination of all poses in between. Plain arrays
+only.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
+import numpy.typing as npt
 
-from graphslam.skeleton.chain_kernels import Chain, _cholesky, linearise
-from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.chain_kernels import Array, _cholesky, _log, _solve
+from graphslam.skeleton.landmark_kernels import _nine
+
+Index = npt.NDArray[np.int64]
 
 
-@nb.njit(cache=True, nogil=True)
-def linearise_loops(chain, ends, poses, diagonal, between, g):
-    """Add loops to ``diagonal (N, 6, 6)`` and half the gradient ``g (N, 6)``; their blocks to ``between (L, 6, 6)``.
+class Links(NamedTuple):
+    """Relative poses, and the segments they form."""
+
+    ends: Index
+    """(E, 2): poses i and j of each."""
+    first: Index
+    """(S + 1,): where the links of each segment begin; each begins where the one before it ends."""
+    rotation: Array
+    """(E, 3, 3): turn from i to j, in the frame of i …"""
+    translation: Array
+    """(E, 3): … and way [m]."""
+    covariance: Array
+    """(1, 6, 6) or (E, 6, 6): rotation vector, then way."""
+    information: Array
+    """Its inverse."""
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _residual(links, e, turns, way, scratch, r):
+    """Write the residual (6,) of link e between two rotations, p_j - p_i = ``way`` in the world."""
+    Ra, Rb = turns
+    dx, dy, dz = way
+    A, E = scratch
+    Z = _nine(links.rotation, e)
+    # E = Zᵀ Raᵀ Rb
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = Ra[i] * Rb[j] + Ra[3 + i] * Rb[3 + j] + Ra[6 + i] * Rb[6 + j]
+    for i in range(3):
+        for j in range(3):
+            E[i, j] = Z[i] * A[0, j] + Z[3 + i] * A[1, j] + Z[6 + i] * A[2, j]
+    _log(E, r)
+    for i in range(3):
+        r[3 + i] = Ra[i] * dx + Ra[3 + i] * dy + Ra[6 + i] * dz - links.translation[e, i]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _turned(Rb, r, B):
+    """Write ``R_j J_r(r)`` (3, 3), J_r the right Jacobian of the rotation residual: a turn of the body in the world."""
+    x, y, z = r[0], r[1], r[2]
+    t2 = x * x + y * y + z * z
+    if t2 < 1e-2:
+        b = 0.5 - t2 * (1.0 / 24.0 - t2 * (1.0 / 720.0 - t2 / 40320.0))
+        c = 1.0 / 6.0 - t2 * (1.0 / 120.0 - t2 * (1.0 / 5040.0 - t2 / 362880.0))
+    else:
+        t = np.sqrt(t2)
+        b, c = 2.0 * np.sin(0.5 * t) ** 2 / t2, (t - np.sin(t)) / (t2 * t)
+    # J_r = I - b [r]× + c [r]×²
+    j00, j01, j02 = 1.0 - c * (y * y + z * z), c * x * y + b * z, c * x * z - b * y
+    j10, j11, j12 = c * x * y - b * z, 1.0 - c * (x * x + z * z), c * y * z + b * x
+    j20, j21, j22 = c * x * z + b * y, c * y * z - b * x, 1.0 - c * (x * x + y * y)
+    for i in range(3):
+        u, v, w = Rb[3 * i], Rb[3 * i + 1], Rb[3 * i + 2]
+        B[i, 0] = u * j00 + v * j10 + w * j20
+        B[i, 1] = u * j01 + v * j11 + w * j21
+        B[i, 2] = u * j02 + v * j12 + w * j22
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def join_links(links, poses, covariance, misfit):
+    """Join the links of each segment to one.
 
     Parameters
     ----------
-    chain : Chain
-        Measurements of the loops, in place of those between neighbours.
-    ends : (L, 2)
+    links : Links
+    poses : Poses
+    covariance, misfit : (S, 6, 6), (S, 6)
+        Out: of ``y = (w_b - w_a, u_b - u_a - w_b × (p_b - p_a))`` for the ends a and b of each segment, and ``Σ G r``.
+        The segment costs ``(y + misfit)ᵀ covariance⁻¹ (y + misfit)``, with the poses between where that is least.
 
     Returns
     -------
     float
-        Σ rᵀ Ω r.
+        Σ rᵀ Ω r over all links.
     """
-    R, p = np.empty((2, 3, 3)), np.empty((2, 3))
-    pair = Poses(R, p)
-    two, one, gradient = np.empty((2, 6, 6)), np.empty((1, 6, 6)), np.empty((2, 6))
-    up, nothing = np.zeros((2, 3)), np.zeros(1)
+    r, f = np.empty(6), np.empty(6)
+    B, N, M, A, X = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    P, Q = poses.rotation, poses.position
+    mixed = False
+    for k in range(len(links.covariance)):
+        for i in range(3):
+            for j in range(3):
+                mixed |= links.covariance[k, i, 3 + j] != 0.0
+    single = len(links.information) == 1
     total = 0.0
-    for e in range(len(ends)):
-        i, j = ends[e, 0], ends[e, 1]
-        R[0], R[1] = poses.rotation[i], poses.rotation[j]
-        p[0], p[1] = poses.position[i], poses.position[j]
-        two[:] = 0.0
-        one[:] = 0.0
-        gradient[:] = 0.0
-        f = e if len(chain.information) > 1 else 0
-        single = Chain(
-            chain.rotation[e : e + 1], chain.translation[e : e + 1], chain.information[f : f + 1], up, nothing
-        )
-        total += linearise(single, pair, True, two, one, gradient)
-        diagonal[i] += two[0]
-        diagonal[j] += two[1]
-        between[e] = one[0]
-        g[i] += gradient[0]
-        g[j] += gradient[1]
+    for s in range(len(links.first) - 1):
+        V, c = covariance[s], misfit[s]
+        V[:] = 0.0
+        c[:] = 0.0
+        a = links.ends[links.first[s], 0]
+        for e in range(links.first[s], links.first[s + 1]):
+            i, j = links.ends[e, 0], links.ends[e, 1]
+            Ra, Rb = _nine(P, i), _nine(P, j)
+            way = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
+            _residual(links, e, (Ra, Rb), way, (A, X), r)
+            k = 0 if single else e
+            for m in range(6):
+                f[m] = 0.0
+                for n in range(6):
+                    f[m] += links.information[k, m, n] * r[n]
+            for m in range(6):
+                total += r[m] * f[m]
+            _turned(Rb, r, B)
+            S = links.covariance[k]
+            # N = B Σ_ww Bᵀ, M = Ra Σ_uu Raᵀ
+            for m in range(3):
+                x = B[m, 0] * S[0, 0] + B[m, 1] * S[1, 0] + B[m, 2] * S[2, 0]
+                y = B[m, 0] * S[0, 1] + B[m, 1] * S[1, 1] + B[m, 2] * S[2, 1]
+                z = B[m, 0] * S[0, 2] + B[m, 1] * S[1, 2] + B[m, 2] * S[2, 2]
+                for n in range(3):
+                    N[m, n] = x * B[n, 0] + y * B[n, 1] + z * B[n, 2]
+                x = Ra[3 * m] * S[3, 3] + Ra[3 * m + 1] * S[4, 3] + Ra[3 * m + 2] * S[5, 3]
+                y = Ra[3 * m] * S[3, 4] + Ra[3 * m + 1] * S[4, 4] + Ra[3 * m + 2] * S[5, 4]
+                z = Ra[3 * m] * S[3, 5] + Ra[3 * m + 1] * S[4, 5] + Ra[3 * m + 2] * S[5, 5]
+                for n in range(3):
+                    M[m, n] = x * Ra[3 * n] + y * Ra[3 * n + 1] + z * Ra[3 * n + 2]
+            lx, ly, lz = Q[j, 0] - Q[a, 0], Q[j, 1] - Q[a, 1], Q[j, 2] - Q[a, 2]
+            # shifted to the segment's first pose by H = [l]×: wu = X + N Hᵀ, uu = M + H (X + N Hᵀ) + Xᵀ Hᵀ
+            for m in range(3):
+                x, y, z = N[m, 0], N[m, 1], N[m, 2]
+                A[m, 0], A[m, 1], A[m, 2] = ly * z - lz * y, lz * x - lx * z, lx * y - ly * x
+            if mixed:
+                for m in range(3):
+                    x = B[m, 0] * S[0, 3] + B[m, 1] * S[1, 3] + B[m, 2] * S[2, 3]
+                    y = B[m, 0] * S[0, 4] + B[m, 1] * S[1, 4] + B[m, 2] * S[2, 4]
+                    z = B[m, 0] * S[0, 5] + B[m, 1] * S[1, 5] + B[m, 2] * S[2, 5]
+                    for n in range(3):
+                        X[m, n] = x * Ra[3 * n] + y * Ra[3 * n + 1] + z * Ra[3 * n + 2]
+                        A[m, n] += X[m, n]
+                for n in range(3):
+                    x, y, z = X[0, n], X[1, n], X[2, n]
+                    M[n, 0] += ly * z - lz * y
+                    M[n, 1] += lz * x - lx * z
+                    M[n, 2] += lx * y - ly * x
+            for n in range(3):
+                x, y, z = A[0, n], A[1, n], A[2, n]
+                M[0, n] += ly * z - lz * y
+                M[1, n] += lz * x - lx * z
+                M[2, n] += lx * y - ly * x
+            for m in range(3):
+                for n in range(3):
+                    V[m, n] += N[m, n]
+                    V[m, 3 + n] += A[m, n]
+                    V[3 + m, 3 + n] += M[m, n]
+            # B r = R_j r, because J_r(r) r = r
+            x = Rb[0] * r[0] + Rb[1] * r[1] + Rb[2] * r[2]
+            y = Rb[3] * r[0] + Rb[4] * r[1] + Rb[5] * r[2]
+            z = Rb[6] * r[0] + Rb[7] * r[1] + Rb[8] * r[2]
+            c[0] += x
+            c[1] += y
+            c[2] += z
+            c[3] += Ra[0] * r[3] + Ra[1] * r[4] + Ra[2] * r[5] + ly * z - lz * y
+            c[4] += Ra[3] * r[3] + Ra[4] * r[4] + Ra[5] * r[5] + lz * x - lx * z
+            c[5] += Ra[6] * r[3] + Ra[7] * r[4] + Ra[8] * r[5] + lx * y - ly * x
+        for m in range(3):
+            for n in range(3):
+                V[3 + m, n] = V[n, 3 + m]
     return total
 
 
 @nb.njit(cache=True, nogil=True)
-def eliminate(diagonal, upper, x, kept, reduced, rhs):
-    """Eliminate all poses between kept ones; ``diagonal``, ``upper`` and ``x`` hold what :func:`substitute` needs.
+def tie_ends(ends, position, covariance, misfit, place, blocks, g):
+    """Add joined links to the matrix and half the gradient of the poses at their ends.
 
     Parameters
     ----------
-    diagonal, upper, x : (N, 6, 6), (N - 1, 6, 6), (N, 6)
-        Matrix and right-hand side; changed.
-    kept : (K,)
-        Rising, with the first and the last pose.
-    reduced : (diagonal (K, 6, 6), upper (K - 1, 6, 6))
-        What is left for the kept poses, and for each and the next: out.
-    rhs : (K, 6)
-        Out.
+    ends : (S, 2)
+        Of each segment, among K poses.
+    position : (K, 3)
+    covariance, misfit : (S, 6, 6), (S, 6)
+        From :func:`join_links`; the covariances are replaced by their inverses.
+    place : (diagonal (K,), between (S,))
+        Where in ``blocks (nb, 6, 6)`` the block of each pose is, and that of each segment, whose rows belong to the
+        pose with the smaller number. Added to.
+    g : (K, 6)
+        Added to.
 
     Returns
     -------
-    int
-        First pose that nothing holds, or -1.
+    energy : float
+        Σ misfitᵀ covariance⁻¹ misfit.
+    bad : int
+        The first segment whose covariance is not positive definite, or -1.
     """
-    left, right = reduced
-    E, U, W, V = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 13)), np.empty((6, 13))
-    for c in range(len(kept)):
-        a = kept[c]
-        left[c] = diagonal[a]
-        rhs[c] = x[a]
-        if c + 1 == len(kept):
-            break
-        b = kept[c + 1]
-        E[:] = upper[a]
-        for k in range(a + 1, b):
-            D = diagonal[k]
-            if not _cholesky(D):
-                return k
-            # W = D⁻¹ [Eᵀ, U, x], row by row, so that whole rows are worked on at once
+    diagonal, between = place
+    L, x, f = np.empty((6, 6)), np.empty(6), np.empty(6)
+    Y = np.empty((6, 6))
+    energy = 0.0
+    for s in range(len(ends)):
+        a, b = ends[s, 0], ends[s, 1]
+        M = covariance[s]
+        L[:] = M
+        if not _cholesky(L):
+            return energy, s
+        for c in range(6):
+            x[:] = 0.0
+            x[c] = 1.0
+            _solve(L, x)
             for r in range(6):
-                for col in range(6):
-                    U[r, col] = upper[k, r, col]
-                    W[r, col] = E[col, r]
-                    W[r, 6 + col] = U[r, col]
-                W[r, 12] = x[k, r]
-            for r in range(6):
-                for m in range(r):
-                    f = D[r, m]
-                    for col in range(13):
-                        W[r, col] -= f * W[m, col]
-                f = 1.0 / D[r, r]
-                for col in range(13):
-                    W[r, col] *= f
-            for r in range(5, -1, -1):
-                for m in range(r + 1, 6):
-                    f = D[m, r]
-                    for col in range(13):
-                        W[r, col] -= f * W[m, col]
-                f = 1.0 / D[r, r]
-                for col in range(13):
-                    W[r, col] *= f
-            # V = E W: what the pose leaves to the kept one before it, and to its tie to the next
-            for r in range(6):
-                for col in range(13):
-                    V[r, col] = 0.0
-                for m in range(6):
-                    f = E[r, m]
-                    for col in range(13):
-                        V[r, col] += f * W[m, col]
-            for r in range(6):
-                for col in range(6):
-                    left[c, r, col] -= V[r, col]
-                    E[r, col] = -V[r, 6 + col]
-                    D[r, col] = W[r, col]  # the factor is not needed any more
-                    upper[k, r, col] = W[r, 6 + col]
-                rhs[c, r] -= V[r, 12]
-                x[k, r] = W[r, 12]
+                M[r, c] = x[r]
+        for r in range(6):
+            f[r] = 0.0
+            for c in range(6):
+                f[r] += M[r, c] * misfit[s, c]
+            energy += f[r] * misfit[s, r]
+        dx, dy, dz = position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
+        # y = X δ_b - δ_a, X = [[I, 0], [[d]×, I]]; Y = M X
+        for r in range(6):
+            p, q, t = M[r, 3], M[r, 4], M[r, 5]
+            Y[r, 0] = M[r, 0] + q * dz - t * dy
+            Y[r, 1] = M[r, 1] + t * dx - p * dz
+            Y[r, 2] = M[r, 2] + p * dy - q * dx
+            Y[r, 3], Y[r, 4], Y[r, 5] = p, q, t
+        A, B, E = blocks[diagonal[a]], blocks[diagonal[b]], blocks[between[s]]
+        for c in range(6):
+            p, q, t = Y[3, c], Y[4, c], Y[5, c]
+            B[0, c] += Y[0, c] + dz * q - dy * t
+            B[1, c] += Y[1, c] + dx * t - dz * p
+            B[2, c] += Y[2, c] + dy * p - dx * q
+            B[3, c] += p
+            B[4, c] += q
+            B[5, c] += t
+        for r in range(6):
+            for c in range(6):
+                A[r, c] += M[r, c]
+                if a < b:
+                    E[r, c] -= Y[r, c]
+                else:
+                    E[c, r] -= Y[r, c]
+            g[a, r] -= f[r]
+        g[b, 0] += f[0] + dz * f[4] - dy * f[5]
+        g[b, 1] += f[1] + dx * f[5] - dz * f[3]
+        g[b, 2] += f[2] + dy * f[3] - dx * f[4]
+        g[b, 3] += f[3]
+        g[b, 4] += f[4]
+        g[b, 5] += f[5]
+    return energy, -1
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def follow_links(links, poses, information, misfit, x):
+    """Fill the steps ``x (N, 6)`` of all poses inside segments from those of their ends.
+
+    Parameters
+    ----------
+    links : Links
+    poses : Poses
+    information, misfit : (S, 6, 6), (S, 6)
+        From :func:`join_links` and :func:`tie_ends`, at the same poses.
+    x : (N, 6)
+        In: the steps of the poses at the ends of segments.
+    """
+    r, h, y, f = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    A, B, E = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    P, Q = poses.rotation, poses.position
+    single = len(links.covariance) == 1
+    for s in range(len(links.first) - 1):
+        a, b = links.ends[links.first[s], 0], links.ends[links.first[s + 1] - 1, 1]
+        dx, dy, dz = Q[b, 0] - Q[a, 0], Q[b, 1] - Q[a, 1], Q[b, 2] - Q[a, 2]
+        for k in range(6):
+            y[k] = misfit[s, k] + x[b, k] - x[a, k]
+        y[3] += dy * x[b, 2] - dz * x[b, 1]
+        y[4] += dz * x[b, 0] - dx * x[b, 2]
+        y[5] += dx * x[b, 1] - dy * x[b, 0]
+        # what pulls at the segment is the same all along it
+        for m in range(6):
+            f[m] = 0.0
+            for n in range(6):
+                f[m] += information[s, m, n] * y[n]
+        wx, wy, wz = x[a, 0], x[a, 1], x[a, 2]
+        ux, uy, uz = x[a, 3], x[a, 4], x[a, 5]
+        for e in range(links.first[s], links.first[s + 1] - 1):
+            i, j = links.ends[e, 0], links.ends[e, 1]
+            Ra, Rb = _nine(P, i), _nine(P, j)
+            dx, dy, dz = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
+            _residual(links, e, (Ra, Rb), (dx, dy, dz), (A, E), r)
+            _turned(Rb, r, B)
+            lx, ly, lz = Q[j, 0] - Q[a, 0], Q[j, 1] - Q[a, 1], Q[j, 2] - Q[a, 2]
+            # h = Gᵀ f, then the change of the residual, Ω⁻¹ h - r
+            p, q, t = f[0] - ly * f[5] + lz * f[4], f[1] - lz * f[3] + lx * f[5], f[2] - lx * f[4] + ly * f[3]
+            for m in range(3):
+                h[m] = B[0, m] * p + B[1, m] * q + B[2, m] * t
+                h[3 + m] = Ra[m] * f[3] + Ra[3 + m] * f[4] + Ra[6 + m] * f[5]
+            S = links.covariance[0 if single else e]
             for m in range(6):
-                for r in range(6):
-                    f = U[m, r]
-                    for col in range(6):
-                        diagonal[k + 1, r, col] -= f * W[m, 6 + col]
-                    x[k + 1, r] -= f * W[m, 12]
-        right[c] = E
-    return -1
-
-
-@nb.njit(cache=True, nogil=True)
-def substitute(diagonal, upper, x, kept, solved):
-    """Fill ``x (N, 6)`` from the kept poses ``solved (K, 6)``, segment by segment."""
-    for c in range(len(kept)):
-        x[kept[c]] = solved[c]
-    for c in range(len(kept) - 1):
-        a, b = kept[c], kept[c + 1]
-        for k in range(b - 1, a, -1):
-            for r in range(6):
-                s = x[k, r]
-                for m in range(6):
-                    s -= diagonal[k, r, m] * x[a, m] + upper[k, r, m] * x[k + 1, m]
-                x[k, r] = s
+                y[m] = -r[m]
+                for n in range(6):
+                    y[m] += S[m, n] * h[n]
+            # Δ = J⁻¹ of it; the way first, because the turn of pose i belongs to it
+            ux += wy * dz - wz * dy + Ra[0] * y[3] + Ra[1] * y[4] + Ra[2] * y[5]
+            uy += wz * dx - wx * dz + Ra[3] * y[3] + Ra[4] * y[4] + Ra[5] * y[5]
+            uz += wx * dy - wy * dx + Ra[6] * y[3] + Ra[7] * y[4] + Ra[8] * y[5]
+            wx += B[0, 0] * y[0] + B[0, 1] * y[1] + B[0, 2] * y[2]
+            wy += B[1, 0] * y[0] + B[1, 1] * y[1] + B[1, 2] * y[2]
+            wz += B[2, 0] * y[0] + B[2, 1] * y[1] + B[2, 2] * y[2]
+            x[j, 0], x[j, 1], x[j, 2], x[j, 3], x[j, 4], x[j, 5] = wx, wy, wz, ux, uy, uz

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import CovarianceError, DataError
-from graphslam.core.se3 import matrix_to_quat, quat_to_matrix, so3_exp, so3_log
+from graphslam.core.se3 import quat_to_matrix, so3_exp
+from graphslam.skeleton import segment_kernels as kernels
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
 from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.schur import moved
+from tests.reference.dense_chain import jacobian, residuals, slow_optimum
 
 
 def drawn(N: int, ends: list[tuple[int, int]], seed: int = 0, noise: float = 0.02) -> tuple[ChainGraph, Poses]:
@@ -31,42 +34,6 @@ def drawn(N: int, ends: list[tuple[int, int]], seed: int = 0, noise: float = 0.0
     each = np.array([noise**2 * np.diag(rng.uniform(0.5, 2.0, 6)) for _ in ends]).reshape(-1, 6, 6)
     graph = ChainGraph(*measured(k, k + 1), cov, e, *measured(e[:, 0], e[:, 1]), each if ends else cov)
     return graph, Poses(R, p)
-
-
-def residuals(graph: ChainGraph, poses: Poses) -> np.ndarray:
-    """Normalised residuals of all links, one after the other."""
-    out = []
-    k = np.arange(graph.poses - 1)
-    for pairs, Z, d, cov in (
-        (np.column_stack([k, k + 1]), graph.rotation, graph.translation, graph.covariance),
-        (graph.ends, graph.loop_rotation, graph.loop_translation, graph.loop_covariance),
-    ):
-        for n, (i, j) in enumerate(pairs):
-            w = so3_log(matrix_to_quat(Z[n].T @ poses.rotation[i].T @ poses.rotation[j]))
-            r = np.concatenate([w, poses.rotation[i].T @ (poses.position[j] - poses.position[i]) - d[n]])
-            L = np.linalg.cholesky(np.linalg.inv(cov[n if len(cov) > 1 else 0]))
-            out.append(L.T @ r)
-    return np.concatenate(out)
-
-
-def at(poses: Poses, x: np.ndarray) -> Poses:
-    v = np.concatenate([np.zeros(6), x]).reshape(-1, 6)  # the first pose is held
-    return Poses(quat_to_matrix(so3_exp(v[:, :3])) @ poses.rotation, poses.position + v[:, 3:])
-
-
-def slow_optimum(graph: ChainGraph, poses: Poses) -> tuple[Poses, float]:
-    n, h = 6 * (graph.poses - 1), 1e-6
-    for _ in range(12):
-        r = residuals(graph, poses)
-        J = np.column_stack(
-            [(residuals(graph, at(poses, h * e)) - residuals(graph, at(poses, -h * e))) / (2 * h) for e in np.eye(n)]
-        )
-        x = np.linalg.lstsq(J, -r, rcond=None)[0]
-        poses = at(poses, x)
-        if np.abs(x).max() < 1e-9:
-            break
-    r = residuals(graph, poses)
-    return poses, float(r @ r)
 
 
 @pytest.mark.parametrize(
@@ -113,3 +80,51 @@ def test_impossible_graphs_are_refused() -> None:
             graph.loop_translation,
             -np.eye(6),
         )
+
+
+def test_a_segment_joined_to_one_link_is_the_dense_elimination() -> None:
+    graph, truth = drawn(9, [])
+    rng = np.random.default_rng(3)
+    poses = moved(truth, 0.1 * rng.standard_normal((9, 6)))  # residuals that are not small
+    poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
+    odometry, _ = graph.links
+    covariance, misfit = np.empty((1, 6, 6)), np.empty((1, 6))
+    total = kernels.join_links(odometry, poses, covariance, misfit)
+    r, J = residuals(graph, poses), jacobian(graph, poses)
+    assert total == pytest.approx(float(r @ r), rel=1e-9)
+    b = 0.1 * rng.standard_normal(6)  # a step of the last pose; the first is held
+    inner = np.linalg.lstsq(J[:, :-6], -r - J[:, -6:] @ b, rcond=None)[0]
+    left = r + J @ np.concatenate([inner, b])
+    y = np.concatenate([b[:3], b[3:] - np.cross(b[:3], poses.position[-1])]) + misfit[0]
+    assert y @ np.linalg.solve(covariance[0], y) == pytest.approx(float(left @ left), rel=1e-7)
+    x = np.zeros((9, 6))
+    x[-1] = b
+    kernels.follow_links(odometry, poses, np.linalg.inv(covariance), misfit, x)
+    np.testing.assert_allclose(x[1:-1].ravel(), inner, atol=1e-6)
+
+
+def test_joined_links_tie_their_ends_as_the_dense_matrix_does() -> None:
+    graph, truth = drawn(5, [(1, 3), (4, 2), (3, 1)])
+    poses = moved(truth, 0.1 * np.random.default_rng(4).standard_normal((5, 6)))
+    poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
+    covariance, misfit = np.empty((3, 6, 6)), np.empty((3, 6))
+    total = kernels.join_links(graph.links[1], poses, covariance, misfit)
+    blocks, g = np.zeros((7, 6, 6)), np.zeros((5, 6))
+    place = np.arange(5), np.array([5, 6, 5])
+    energy, bad = kernels.tie_ends(graph.ends, poses.position, covariance, misfit, place, blocks, g)
+    r, J = residuals(graph, poses)[-18:], jacobian(graph, poses)[-18:]
+    dense = J.T @ J
+    assert bad == -1
+    assert energy == pytest.approx(total, rel=1e-9)
+    assert total == pytest.approx(float(r @ r), rel=1e-9)
+    np.testing.assert_allclose(g[1:].ravel(), J.T @ r, rtol=1e-6, atol=1e-4)
+    for block, i, j in [(blocks[k], k, k) for k in range(1, 5)] + [(blocks[5], 1, 3), (blocks[6], 2, 4)]:
+        wanted = dense[6 * (i - 1) : 6 * i, 6 * (j - 1) : 6 * j]
+        np.testing.assert_allclose(block, wanted, rtol=1e-6, atol=1e-4)
+
+
+def test_a_better_start_than_dead_reckoning_is_taken() -> None:
+    graph, truth = drawn(40, [(3, 38)])
+    found = relax_chain(graph, truth)
+    assert found.history[0] == pytest.approx(float(np.sum(residuals(graph, truth) ** 2)), rel=1e-9)
+    assert found.objective == pytest.approx(relax_chain(graph).objective, rel=1e-6)
