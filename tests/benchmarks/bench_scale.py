@@ -14,9 +14,9 @@ from our forward pass. Each is a process with a limit on time and memory (``--se
 an iteration gains less than 10⁻⁵ of the objective. Its factors measure bearing and range instead of a point, so
 objectives are compared as ours, at its poses.
 
-``--chain 100000,1000000`` relaxes plain pose graphs: odometry, and loops at one pose in a hundred, with the links between
-loops joined, beside GTSAM in the same four ways from the same start. GTSAM's residual of a link differs from ours in how
-it turns the way; its objective is therefore also computed at our poses.
+``--chain 100000,1000000`` relaxes plain pose graphs: odometry, and loops at one pose in a hundred, the links between
+loops joined, beside GTSAM in the same four ways from the same start. GTSAM's residual of a link differs from ours in
+how it turns the way; its objective is therefore also computed at our poses.
 
 ``--tiles FOLDER`` writes each world to disk and relaxes it from there, one tile of 2·10⁴ poses in memory at a time.
 
