@@ -18,6 +18,8 @@ GAIN = 5.0
 """… gains so much likelihood over noise alone [nats],"""
 AGREE = 2.0
 """… and differs by less than so many σ between the two lengths of windows."""
+VAGUE = 0.05
+"""A scale that is told less exactly than this is left: wheels and rangefinders are better than that without it."""
 LASTS = 1.5
 """Noise that is so much larger in long windows than in short ones lasts."""
 ALIKE = 0.3
@@ -71,6 +73,8 @@ class Estimate:
         why = ""
         if not abs(self.value) > SURE * self.sigma:
             why = "no more than chance"
+        elif self.name.endswith("_scale") and self.sigma > VAGUE:
+            why = f"a scale that is told to ± {100 * self.sigma:.0f} % only says more of noise than of wheels"
         elif not self.gain > GAIN:
             why = f"it gains {max(self.gain, 0.0):.1f} nats over noise alone, and more than {GAIN:g} are asked for"
         elif abs(self.value - self.other) > AGREE * math.hypot(self.sigma, self.other_sigma):

@@ -359,6 +359,10 @@ class _Frames:
                 self.fixed.setdefault(key, rows.values[0])
                 del self.moving[key]
 
+    def know(self, a: str, b: str) -> bool:
+        """Is the place of one in the other known?"""
+        return self.between(a, b) is not None
+
     def between(self, a: str, b: str) -> Array | None:
         """``T_a_b`` over fixed transforms, or None."""
         if a == b:
@@ -475,7 +479,9 @@ def read_bag(
     if drops is not None:
         drops.counts.update(counter.counts)
     read = {k: len(rows[k].stamps) if k in rows else len(s.times) for k, s in streams.items()}
-    meta = {"source": p.name, "notes": notes, "base_frame": base, "topics": {k: t.name for k, t in chosen.items()}}
+    lost = [] if mount else [k for k in ("clouds", "laser") if k in streams and not frames.know(base, rows[k].frame)]
+    topics = {k: t.name for k, t in chosen.items()}
+    meta = {"source": p.name, "notes": notes, "base_frame": base, "topics": topics, "unplaced": lost}
     return SensorLog(name=name or p.stem, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 

@@ -14,6 +14,7 @@ from graphslam.app.cli import app
 from graphslam.app.cli.run import join_note
 from graphslam.app.studies.calibration_robot import draw_robot, drive
 from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.estimate import Estimate
 from graphslam.calibrate.sighted import QUICK, calibrate_sightings
 from graphslam.calibrate.windows import Seen
 from graphslam.core.config import read_toml
@@ -140,3 +141,12 @@ def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> No
     effort = dataclasses.replace(QUICK, clock=False)
     e = {e.name: e for e in calibrate_sightings(Seen.of(noisy, "landmarks", noisy["landmarks"]), effort).estimates}
     assert abs(e["distance_scale"].value) < 2.5 * e["distance_scale"].sigma
+
+
+def test_a_scale_that_is_hardly_told_is_left() -> None:
+    """On a robot of MRCLAM wheels looked half as long as they are, ± 20 %, and the map came out 300 m wide."""
+    sure = Estimate(name="distance_scale", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
+    vague = dataclasses.replace(sure, value=0.68, sigma=0.2, gain=3783.0, other=0.7, other_sigma=0.2)
+    assert sure.gated().applied
+    assert not vague.gated().applied
+    assert "20 %" in vague.gated().why_not

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.errors import MissingDataError
 from graphslam.core.gnss import Pseudoranges
 from graphslam.core.imu import Imu
@@ -19,6 +21,11 @@ from graphslam.core.records import (
     SteeringControls,
     VelocityControls,
 )
+
+LEVEL = 1e-6
+"""Odometry whose heights and tilts never change by more is that of wheels, written in space [m, quaternion]."""
+NAMED = 0.9
+"""Share of sightings with an identity from which on identities are taken as known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +63,23 @@ def choose_front_end(log: SensorLog) -> Choice:
     if has(RangeScans) and (moves or has(Imu)):
         return Choice("segslam", "spinning scanners with motion")
     if has(PointClouds):
-        return Choice("kiss-icp", "clouds of a 3-D lidar, which it follows without other sensors")
+        if not any(isinstance(s, Odometry) and _in_space(s) for s in log.streams.values()):
+            return Choice("kiss-icp", "clouds of a 3-D lidar, which it follows without other sensors")
+        if "clouds" in log.meta.get("unplaced", ()):
+            return Choice(
+                "kiss-icp", "clouds of a 3-D lidar whose place on the robot is not known, so without odometry"
+            )
+        return Choice("segslam", "clouds of a 3-D lidar with odometry")
     if has(LaserScans) and moves:
         return Choice("segslam", "planar laser with odometry")
     held = ", ".join(f"{n} ({type(s).__name__}, {len(s.times)} records)" for n, s in log.streams.items()) or "nothing"
     raise MissingDataError("no front end makes a map of this log", where=log.name, got=held, wanted=_wanted(log))
+
+
+def _in_space(odometry: Odometry) -> bool:
+    """Does it tell heights and tilts, too? That of wheels does not, though it may be written as if it did."""
+    steps = odometry.increments
+    return steps.shape[1] == 7 and len(steps) > 1 and float(np.abs(steps[1:, 2:5]).max()) > LEVEL
 
 
 def _wanted(log: SensorLog) -> str:
@@ -83,6 +102,9 @@ def kind_preset(log: SensorLog) -> str:
     kinds: set[object] = {type(s) for s in log.streams.values()}
     if PointClouds in kinds:
         return "clouds"
+    seen = next((s for s in log.streams.values() if isinstance(s, LandmarkObservations)), None)
+    if seen is not None and seen.ids is not None and np.any(seen.has_bearing) and np.mean(seen.ids >= 0) >= NAMED:
+        return "named-landmarks"
     return "planar-laser" if LaserScans in kinds and (Odometry in kinds or VelocityControls in kinds) else ""
 
 
