@@ -50,7 +50,7 @@ class MeshWorld:
 
 MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
-    "mine": MeshWorld("graphslam.sim.mine", "mine"),
+    "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
     "building": MeshWorld("graphslam.sim.building", "building"),
     "court": MeshWorld("graphslam.sim.court", "court"),
 }
@@ -76,7 +76,7 @@ def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
     name : str
         ``garage``, ``mine`` or ``building``.
     layout : str, optional
-        Of the garage: ``A``, ``B`` or ``C``.
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
     seed : int
         Of what can be moved in it.
 
@@ -112,7 +112,7 @@ def simulate(
         confuse an association. Of the campus: ``full``, ``three-blocks``, ``block``, ``quick``. Of the robot in the
         other worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
-        Of the garage: ``A``, ``B`` or ``C``.
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
     world_seed : int, optional
         Of what can be moved in a world of triangles, and of the campus, where it shall not be ``seed``.
     progress : bool

@@ -13,7 +13,7 @@ from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.refine.fixes import FixModel
 from graphslam.refine.motion import MotionModel, States, Terms
-from graphslam.refine.surfaces import Association, Cloud, Surfaces
+from graphslam.refine.surfaces import Association, Cloud, Surfaces, blocks
 from graphslam.registration.plane_kernels import Pairs, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import rotations
 
@@ -54,8 +54,11 @@ class Pattern:
 
     def at(self, a: Index, b: Index) -> Index:
         """Where blocks begin; the rows are those of the node that is eliminated first."""
-        rows, columns = self._sorted(a, b)
-        return self.offset[np.searchsorted(self.keys, rows * self.N + columns)]
+        out = np.empty(len(a), np.int64)
+        for s in blocks(len(a)):
+            rows, columns = self._sorted(a[s], b[s])
+            out[s] = self.offset[np.searchsorted(self.keys, rows * self.N + columns)]
+        return out
 
     def add(self, terms: Terms, H: Array, g: Array) -> float:
         """Add the blocks of a kind of factor to ``H`` and ``Jᵀ r`` to ``g``; the sum of squares."""
@@ -181,7 +184,8 @@ class Problem:
         if self._key != key:
             n = self.motion.steps_count
             nodes = self.motion.nodes
-            a, b = [pairs.i], [pairs.j]
+            met = np.unique(pairs.i * n + pairs.j)  # of millions of pairs of points some thousands of steps
+            a, b = [met // n], [met % n]
             for u in range(nodes.shape[1]):
                 for v in range(u):
                     a.append(nodes[:, u])

@@ -399,11 +399,13 @@ class _Work:
             within=self.motion.within if sigma is None else None,
         )
         before = self.poses
+        solved: Solved | None = None
         for _ in range(steps):
+            solved = None  # a factor of a long path is the largest thing here: never two of them
             r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
-        if passes and distance <= self.config.distances[0]:
+        if passes and distance <= self.config.distances[0] and solved is not None:
             self.motion.widen(self.poses, self.states, solved.factor)
         self.noise = noise
         d = self.group.dim

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,23 @@ from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
+
+
+BLOCK = 1 << 16
+"""Rows that are worked on together: a matrix for each point of a long log would take gigabytes."""
+
+
+def blocks(n: int) -> Iterator[slice]:
+    """Rows ``0 … n`` a block at a time."""
+    return (slice(k, min(k + BLOCK, n)) for k in range(0, n, BLOCK))
+
+
+def turned(R: Array, step: Index, x: Array) -> Array:
+    """``R_step x`` of vectors ``(q, d)``, each by the rotation ``(n, d, d)`` of its own step."""
+    out = np.empty(x.shape)
+    for s in blocks(len(x)):
+        np.einsum("kij,kj->ki", R[step[s]], x[s], out=out[s])
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +95,17 @@ class Cloud:
         An error of the increment grew evenly over the time of the step: a beam of age α was placed by the share α of
         it too far.
         """
-        c = -self.age[:, None] * corrections[self.step]  # small: to first order
 
         def moved(x: Array) -> Array:
-            if x.shape[1] == 3:
-                return np.asarray(x + np.cross(c[:, :3], x) + c[:, 3:])
-            return np.asarray(x + c[:, :2] + c[:, 2:] * np.column_stack([-x[:, 1], x[:, 0]]))
+            out = np.empty(x.shape)
+            for s in blocks(len(x)):
+                c = -self.age[s, None] * corrections[self.step[s]]  # small: to first order
+                y = x[s]
+                if x.shape[1] == 3:
+                    out[s] = y + np.cross(c[:, :3], y) + c[:, 3:]
+                else:
+                    out[s] = y + c[:, :2] + c[:, 2:] * np.column_stack([-y[:, 1], y[:, 0]])
+            return out
 
         return replace(self, points=moved(self.points), origins=moved(self.origins))
 
@@ -99,9 +122,12 @@ class Cloud:
 
     def world(self, poses: Array) -> tuple[Array, Array]:
         """Points and origins ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
-        R, t = rotations(poses)[self.step], poses[:, : self.points.shape[1]][self.step]
-        move = np.einsum
-        return move("kij,kj->ki", R, self.points) + t, move("kij,kj->ki", R, self.origins) + t
+        R, t = rotations(poses), poses[:, : self.points.shape[1]]
+        W, O = turned(R, self.step, self.points), turned(R, self.step, self.origins)
+        for x in (W, O):
+            for s in blocks(len(x)):
+                x[s] += t[self.step[s]]
+        return W, O
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +165,7 @@ def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces
         if not len(own):
             continue
         normals[own], flat[own] = fit_places(W, O, own, np.concatenate(places[max(c - 1, 0) : c + 2]), config)
-    return Surfaces(np.einsum("kji,kj->ki", rotations(poses)[cloud.step], normals), flat, stands)
+    return Surfaces(turned(np.swapaxes(rotations(poses), 1, 2), cloud.step, normals), flat, stands)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +278,44 @@ def associate(
     """
     W, O = cloud.world(poses)
     R = rotations(poses)
-    N = np.einsum("kij,kj->ki", R[cloud.step], surfaces.normals)
+    N = turned(R, cloud.step, surfaces.normals)
+    p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, alike, least_share)
+    O -= W
+    beam = np.linalg.norm(O, axis=1)
+    beam[beam == 0] = 1.0
+    del W
+    mp, mq = (np.bincount(k, minlength=len(cloud.points))[k] for k in (p, q))
+    i, j = cloud.step[p], cloud.step[q]
+    shared = None if within is None else [ALIKE * np.bincount(k, minlength=len(within)) for k in (i, j)]
+    once, spent = np.zeros((len(p), 3)), np.zeros((len(p), 3))
+    for s in blocks(len(p)):
+        a, b, n = p[s], q[s], N[q[s]]
+        cp, cq = (np.asarray((np.einsum("ki,ki->k", n, O[rows]) / beam[rows]) ** 2) for rows in (a, b))
+        once[s, 0], once[s, 1] = cp + cq, 1.0
+        spent[s, 0], spent[s, 1] = mp[s] * cp + mq[s] * cq, 0.5 * (mp[s] + mq[s])
+        if within is None or shared is None:
+            continue
+        own = np.einsum("kji,kj->ki", R[i[s]], n), surfaces.normals[b]
+        for rows, k, m, times, alike_steps in zip((a, b), (i[s], j[s]), own, (mp[s], mq[s]), shared):
+            lever = _lever(cloud.points[rows], m)
+            v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
+            once[s, 2] += v
+            spent[s, 2] += v * np.maximum(times, alike_steps[k])
+    return Association(Pairs(p, q, i, j), w, once, spent)
+
+
+def _nearest_surfaces(
+    cloud: Cloud,
+    surfaces: Surfaces,
+    W: Array,
+    N: Array,
+    chunks: ChunkPairs,
+    distance: float,
+    every: int,
+    alike: float,
+    least_share: float,
+) -> tuple[Index, Index, Index]:
+    """Rows of source points, of the surfaces that they lie on, and the numbers of their chunk pairs ``(k,)``."""
     trees: dict[int, tuple[cKDTree, Index]] = {}
 
     def tree(c: int) -> tuple[cKDTree, Index]:
@@ -281,28 +344,7 @@ def associate(
         found_q.append(q)
         whose.append(np.full(len(p), m))
     none = np.zeros(0, np.int64)
-    p, q = np.concatenate([none, *found_p]), np.concatenate([none, *found_q])
-    w = np.concatenate([none, *whose]).astype(np.int64)
-    O = O - W
-    beam = np.linalg.norm(O, axis=1)
-    beam[beam == 0] = 1.0
-
-    def incidence(rows: Index) -> Array:
-        return np.asarray((np.einsum("ki,ki->k", N[q], O[rows]) / beam[rows]) ** 2)
-
-    cp, cq = incidence(p), incidence(q)
-    mp, mq = (np.bincount(k, minlength=len(cloud.points))[k] for k in (p, q))
-    i, j = cloud.step[p], cloud.step[q]
-    once = [cp + cq, np.ones(len(p)), np.zeros(len(p))]
-    spent = [mp * cp + mq * cq, 0.5 * (mp + mq), np.zeros(len(p))]
-    if within is not None:
-        n = surfaces.normals[q]
-        for rows, k, m, times in ((p, i, np.einsum("kji,kj->ki", R[i], N[q]), mp), (q, j, n, mq)):
-            lever = _lever(cloud.points[rows], m)
-            v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
-            once[2] += v
-            spent[2] += v * np.maximum(times, ALIKE * np.bincount(k, minlength=len(within))[k])
-    return Association(Pairs(p, q, i, j), w, np.column_stack(once), np.column_stack(spent))
+    return np.concatenate([none, *found_p]), np.concatenate([none, *found_q]), np.concatenate([none, *whose])
 
 
 def _lever(points: Array, normals: Array) -> Array:

@@ -78,18 +78,23 @@ _STUBS = (
 # S, east through the first of the pair, round the south, east through the second, round the north, and again through
 # parts of both rings by way of the middle cross-cut.
 _TOUR = "SABMCGHIABbmcDEFbmMHIABMmEF"
+# Round once more: back to the beginning of the pair, and then as before.
+_TOURS = {"once": _TOUR, "twice": _TOUR + "b" + _TOUR[2:]}
 # The way ends at this bend of the gallery that it would take next.
 _END = (38.0, 32.0)
 
 
-def mine(*, seed: int = 0) -> World:
+def mine(layout: str = "once", *, seed: int = 0) -> World:
     """The mine world.
 
     Parameters
     ----------
+    layout : {"once", "twice"}
+        How often the tour is made, in one drive.
     seed : int
         Moves timber, crates and fallen rock; galleries and way stay.
     """
+    tour = _TOURS[layout]
     galleries = [g for name in _GALLERIES for g in _pieces(name)]
     stubs = [_stub(*s) for s in _STUBS]
     rng = SeedTree(0).child("mine", "rock").generator()  # not the world's seed: walls never change
@@ -97,7 +102,7 @@ def mine(*, seed: int = 0) -> World:
     field, low = rock_field(galleries + stubs, rock, rng)
     mesh = MeshBuilder()
     mesh.add(*surface_nets(field, low, rock.cell))
-    waypoints = _waypoints()
+    waypoints = _waypoints(tour)
     route = plan_route(waypoints, _RADIUS, where="mine")
     things = _clutter(mesh, galleries, KeepClear(route, margin=0.8), SeedTree(seed).child("mine", "clutter"))
     vertices, triangles = mesh.build()
@@ -114,7 +119,7 @@ def mine(*, seed: int = 0) -> World:
             "levels": [],  # the floor rises and falls
             "things": things,
             "galleries": sorted(_GALLERIES),
-            "tour": _TOUR,
+            "tour": tour,
             "parallel": parallel_stretches(route),
             **describe_route(route),
         },
@@ -148,10 +153,10 @@ def _pieces(name: str) -> list[Gallery]:
     ]
 
 
-def _waypoints() -> Array:
+def _waypoints(tour: str) -> Array:
     """The tour with the bends of its galleries and the ends of their level parts."""
-    points = [np.array(_JUNCTIONS[_TOUR[0]])]
-    for a, b in itertools.pairwise(_TOUR):
+    points = [np.array(_JUNCTIONS[tour[0]])]
+    for a, b in itertools.pairwise(tour):
         name = a + b if a + b in _GALLERIES else b + a
         stretch: list[Array] = []
         for g in _pieces(name):
@@ -163,8 +168,8 @@ def _waypoints() -> Array:
         if name != a + b:
             stretch = [*stretch[-2::-1], np.array(_JUNCTIONS[b])]
         points += stretch
-    line, _ = _line(_TOUR[-1] + "b")
-    return np.array([*points, _level_end(_TOUR[-1] + "b"), line[np.argmin(np.hypot(*(line[:, :2] - _END).T))]])
+    line, _ = _line(tour[-1] + "b")
+    return np.array([*points, _level_end(tour[-1] + "b"), line[np.argmin(np.hypot(*(line[:, :2] - _END).T))]])
 
 
 def _level_end(name: str) -> Array:

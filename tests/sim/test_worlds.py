@@ -207,6 +207,13 @@ def test_closed_worlds_leak_no_beam(name: str) -> None:
     assert np.isfinite(t).all()
 
 
+def test_the_mine_twice_round_is_twice_as_long_and_stands_still() -> None:
+    once, twice = mine("once"), mine("twice")
+    assert twice.meta["length"] > 1.9 * once.meta["length"]
+    assert np.array_equal(once.vertices[:1000], twice.vertices[:1000])
+    assert twice.meta["tour"].startswith(once.meta["tour"])
+
+
 def test_walls_of_the_mine_are_rough_and_differ_from_place_to_place() -> None:
     w, route = world("mine"), world("mine").route()
     profiles = []

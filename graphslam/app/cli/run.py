@@ -187,7 +187,9 @@ def simulate(
     ),
     out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),
-    layout: str | None = typer.Option(None, help="Layout of the garage: A, B or C."),
+    layout: str | None = typer.Option(
+        None, help="Layout of the garage: A, B, C or D; of the mine: once or twice round."
+    ),
     preset: str | None = typer.Option(
         None,
         help="Landmark field: A, B, C, demo or quick. Campus: full, three-blocks, block or quick. "

@@ -1,7 +1,7 @@
 """The study ``refinement``: how near the truth scans bring the solved path, how honestly, and what they forgive.
 
-Worlds: two garages, the mine, the building; ``garage-drawn``: layouts and robots drawn anew in each run, with wrong
-loops in the start and faults of the robot. Clutter and every sensor error are drawn in each run.
+Worlds: two garages, the mine (once and twice round), the building; ``garage-drawn``: layouts and robots drawn anew in
+each run, with wrong loops in the start and faults of the robot. Clutter and every sensor error are drawn in each run.
 
 Quantities
 ----------
@@ -36,6 +36,10 @@ def _alone(config: GraphTrialConfig) -> GraphTrialConfig:
 WORLDS = {name: RefinementTrialConfig(graph=_alone(config)) for name, config in GRAPH_WORLDS.items()}
 WORLDS["garage-drawn"] = RefinementTrialConfig(
     graph=WORLDS["garage-B"].graph, drawn=True, wrong=(1, 3, 10), faults=FAULTS
+)
+WORLDS["mine-twice"] = replace(
+    WORLDS["mine"],
+    graph=replace(WORLDS["mine"].graph, grid=replace(WORLDS["mine"].graph.grid, layout="twice", figures=(), samples=1)),
 )
 QUICK_WORLDS = {"court-quick": RefinementTrialConfig(graph=_alone(GRAPH_QUICK["court-quick"]), wrong=(1,))}
 DRAWN = {"ate_aligned": "ATE, aligned [m]", "nees": "NEES/dof, from the start", "entropy_min": "entropy [nat m³]"}

@@ -1,0 +1,91 @@
+"""Refinement in the plane: lasting errors of wheels, a wheel that slips, turns on the spot, σ of recorded odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.core.geometry import se2_between, se2_compose
+from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam.frontends.odometry.steps import make_steps
+from graphslam.refine.refine import refine
+from graphslam.refine.scans import Scans
+from graphslam.refine.surfaces import Cloud
+from tests.calibrate.room import drive
+
+
+def refined(**errors):
+    """The refinement from dead reckoning, and its greatest distance from the truth [m]."""
+    log, truth = drive(seconds=100.0, stated=5e-3, noise=0.005, **errors)
+    scans = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
+    u = scans.odometry.increments
+    start = [np.zeros(3)]
+    for k in range(1, len(u)):
+        start.append(se2_compose(start[-1], u[k]))
+    found = refine(scans, np.array(start))
+    true = se2_between(np.broadcast_to(truth[0], truth.shape), truth)
+    return found, float(np.hypot(*(found.poses - true)[:, :2].T).max()), np.array(start), true
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return refined()
+
+
+def test_lasting_errors_of_wheels_are_found(plain) -> None:
+    """Distances 3 % too long, and a turn of 0.02 rad a metre too far to the left."""
+    found, off, start, true = refined(scale=1.03, bend=0.02)
+    assert np.hypot(*(start - true)[:, :2].T).max() > 1.0
+    assert off < 0.03
+    scale, sigma = found.constants["scale"]
+    assert sigma < 0.005
+    assert abs(scale - 0.03) < max(4.0 * sigma, 0.003)
+    # what each metre, each radian and each second turn too far can stand for each other: their sum is told
+    metres = np.hypot(*np.diff(true[:, :2], axis=0).T).sum()
+    turned = np.diff(np.unwrap(true[:, 2])).sum()
+    t, b = found.yaw_bias.T
+    bias = float(np.sum(0.5 * (b[1:] + b[:-1]) * np.diff(t)))
+    told = bias + found.constants["bend"][0] * metres + found.constants["turn"][0] * turned
+    assert told == pytest.approx(0.02 * metres, rel=0.1)
+
+
+def test_a_wheel_that_slips_once_bends_nothing(plain) -> None:
+    _, clean, _, _ = plain
+    found, off, start, true = refined(slip=0.5)
+    assert np.hypot(*(start - true)[:, :2].T).max() > 0.4
+    assert off < 1.5 * clean + 0.01
+    assert found.better
+
+
+def test_the_error_is_as_large_as_the_covariance_says(plain) -> None:
+    found, _, _, true = plain
+    e = found.poses[1:] - true[1:]
+    e[:, 2] = np.angle(np.exp(1j * e[:, 2]))
+    R = np.array([[[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]] for a in true[1:, 2]])
+    e = np.einsum("kji,kj->ki", R, e)
+    nees = np.einsum("ki,kij,kj->k", e, np.linalg.inv(found.covariances[1:]), e) / 3.0
+    assert 0.2 < nees.mean() < 3.0
+
+
+def test_turns_on_the_spot_begin_new_chunks() -> None:
+    log, _ = drive(seconds=50.0)
+    scans = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
+    turned = np.abs(scans.odometry.increments[:, 2])
+    cloud = Cloud.of(scans, chunk_length=100.0, chunk_time=1000.0, chunk_turn=0.5)
+    assert cloud.chunks > 3
+    for c in range(cloud.chunks):
+        inside = np.flatnonzero(cloud.chunk == c)
+        assert turned[inside[1:]].sum() <= 0.5
+    assert Cloud.of(scans, chunk_length=100.0, chunk_time=1000.0).chunks == 1
+
+
+def test_scans_that_mended_the_odometry_are_not_in_its_sigma() -> None:
+    """Steps may be mended by matches of their scans; the refinement spends these scans itself."""
+    log, _ = drive(seconds=30.0, stated=0.02)
+    mended = make_steps(log, StepConfig(period=None, match_scans=True))
+    plain = make_steps(log, StepConfig(period=None, match_scans=False))
+    assert mended.recorded is not None
+    mine = Scans.of(mended).odometry.covariances
+    np.testing.assert_array_equal(mine, mended.recorded.covariances)
+    np.testing.assert_allclose(mine, Scans.of(plain).odometry.covariances, rtol=1e-9)
+    assert np.median(mended.odometry.covariances[1:, 2, 2] / mine[1:, 2, 2]) < 0.9
