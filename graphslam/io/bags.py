@@ -328,6 +328,7 @@ class _Rows:
     child: str = ""
     damaged: int = 0
     why: str = ""
+    one_time: bool = False  # points have a field of times, which says nothing
 
 
 class _Frames:
@@ -482,6 +483,9 @@ def read_bag(
     lost = [] if mount else [k for k in ("clouds", "laser") if k in streams and not frames.know(base, rows[k].frame)]
     topics = {k: t.name for k, t in chosen.items()}
     meta = {"source": p.name, "notes": notes, "base_frame": base, "topics": topics, "unplaced": lost}
+    if "clouds" in rows:
+        timed = spool is not None and spool[1] is not None
+        meta["point_times"] = "used" if timed else "constant" if rows["clouds"].one_time else "none"
     return SensorLog(name=name or p.stem, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 
@@ -569,6 +573,7 @@ def _collect(
                 before = ages_of(cloud, stamp or bag_stamp) if timed is not False else None
                 if timed is None and len(cloud.points):
                     timed = before is not None
+                    r.one_time = not timed and cloud.times is not None
                 points.add(cloud.points)
                 ages.add(before if before is not None else np.zeros(len(cloud.points)))
                 r.values.append(len(cloud.points))

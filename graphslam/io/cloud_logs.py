@@ -43,6 +43,7 @@ ODOMETRY_SIGMAS = (0.03, 0.005)
 """Stated σ of one motion between scans, per axis: metres, radians. Tables of poses state none."""
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _SWEEP = (0.005, 2.0)  # how long a scan lasts [s]
+_TIMED = {"none": "points without times", "constant": "times of points say nothing: as good as one time for all"}
 _KEPT = 8  # decoded clouds that are kept
 
 
@@ -261,11 +262,14 @@ def _cloud_log(
         notes.append("no poses")
     streams |= extra
     first = source.ages(0)
-    notes.append("points without times" if first is None else f"points of a scan over {np.ptp(first):.3f} s")
+    timed = "used" if first is not None else "none"
+    if first is None and point_times and read_cloud(kept[0], columns=columns).times is not None:
+        timed = "constant"  # or in no unit that makes a scan last as long as scans do
+    notes.append(_TIMED[timed] if first is None else f"points of a scan over {np.ptp(first):.3f} s")
     if drops is not None:
         drops.counts.update(counter.counts)
     read = {k: len(s.times) for k, s in streams.items() if k != "reference"} | {"clouds": n}
-    meta = {"source": root.name, "notes": notes}
+    meta = {"source": root.name, "notes": notes, "point_times": timed}
     return SensorLog(name=name or root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 

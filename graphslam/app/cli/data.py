@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from graphslam.app.cli.run import JSON
+from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
 from graphslam.app.cli.terminal import emit, log_to_stderr, table
 from graphslam.core.errors import DataError, MissingDataError
 
@@ -98,13 +98,36 @@ def fetch(name: str, as_json: bool = JSON) -> None:
 
 
 @app.command()
-def check(name: str, as_json: bool = JSON) -> None:
-    """Compare all files with their checksums; exit with 1 if one is missing or differs."""
+def check(
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
+    reader: str | None = READER,
+    reader_option: list[str] = READER_OPTION,
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Look for faults before a run: checksums of a card's files; stamps, units, signs, mountings and stuck sensors of a
+    log. Exit with 1 if there is one.
+    """
+    from graphslam.app.data_check import check_source, summary
+    from graphslam.io.cards import list_cards
     from graphslam.io.catalog import check as check_files
 
-    found = check_files(name)
-    rows = [{"file": f.file.path, "state": f.state, "optional": f.file.optional} for f in found]
-    emit({"name": name, "files": rows}, table(rows, ["file", "state"]), as_json=as_json)
-    bad = [f for f in found if f.state != "ok" and not (f.state == "missing" and f.file.optional)]
+    rows, bad = [], []
+    card = next((c for c in list_cards() if c.name == source), None)
+    if card is not None:
+        files = check_files(source)
+        rows = [{"file": f.file.path, "state": f.state, "optional": f.file.optional} for f in files]
+        bad = [f for f in files if f.state != "ok" and not (f.state == "missing" and f.file.optional)]
+    readable = card is None or card.reader not in (None, "pose-network")
+    found = [] if bad or not readable else check_source(source, reader=reader, **reader_options(reader_option))
+    lines = [{"stream": n.stream, **n.finding.as_row()} for n in found]
+    text = [table(rows, ["file", "state"])] if rows else []
+    text += [f"  {n.finding.level or '-':5} {n.finding.text}" for n in found]
+    text += [summary(found)] if found else []
+    emit({"name": source, "files": rows, "lines": lines}, "\n".join(text), as_json=as_json)
     if bad:
-        raise DataError(f"{len(bad)} of {len(found)} files are missing or differ, first {bad[0].file.path}", where=name)
+        raise DataError(
+            f"{len(bad)} of {len(rows)} files are missing or differ, first {bad[0].file.path}", where=source
+        )
+    if any(n.finding.level == "bad" for n in found):
+        raise typer.Exit(1)

@@ -1,0 +1,69 @@
+"""``graphslam data check``: a source looked at before it is computed with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from graphslam.app.run.choice import choose_front_end, reading_line
+from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
+from graphslam.core.findings import Finding
+from graphslam.core.log import SensorLog
+from graphslam.evaluate.log_checks import check_log
+from graphslam.evaluate.stream_checks import Noticed
+from graphslam.io.catalog import load
+
+
+def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[Noticed]:
+    """What can be told to be wrong with a source: of its files, of what is in them, and of what it is good for.
+
+    Parameters
+    ----------
+    source : card name, file or folder
+    reader : str, optional
+    options
+        For the reader.
+
+    Returns
+    -------
+    list of Noticed
+        The first line says what was read. What cannot be read at all is a line of level ``bad``.
+
+    Raises
+    ------
+    UnknownNameError
+        Neither a card nor a path; no such reader.
+    """
+    try:
+        log = load(source, reader=reader, **options)
+    except UnknownNameError:
+        raise
+    except GraphSlamError as error:
+        return [Noticed("", Finding("bad", "unreadable", str(error)))]
+    if not isinstance(log, SensorLog):
+        text = f"{type(log).__name__}: no log of sensors, of which nothing is checked here."
+        return [Noticed("", Finding("", "read", text))]
+    said = [Noticed("", Finding("", "read", f"{reading_line(log) or log.name}."))]
+    said += [Noticed("", Finding("", "left-out", f"Left out by the reader: {n} {what}.")) for what, n in _lost(log)]
+    said += check_log(log)
+    try:
+        choice = choose_front_end(log)
+        said.append(Noticed("", Finding("", "front-end", f"A run would use {choice.frontend}: {choice.why}.")))
+    except MissingDataError as error:
+        said.append(Noticed("", Finding("look", "no-front-end", str(error))))
+    return said
+
+
+def _lost(log: SensorLog) -> list[tuple[str, int]]:
+    return [(what, n) for what, n in log.dropped.items() if not what.endswith("(kept)")]
+
+
+def summary(found: list[Noticed]) -> str:
+    """The last line: whether to run."""
+    bad = sum(n.finding.level == "bad" for n in found)
+    look = sum(n.finding.level == "look" for n in found)
+    if bad:
+        return f"{bad} fault{'s' if bad > 1 else ''}: mend {'these' if bad > 1 else 'it'} before a run."
+    if look:
+        return f"No fault; {look} line{'s' if look > 1 else ''} to look at."
+    return "No fault was found."

@@ -1,0 +1,99 @@
+"""Stamps of streams looked at before a run: unit, jumps, and whether streams were recorded at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+
+from graphslam.core.findings import Finding
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls, VelocityControls
+from graphslam.core.trajectory import Trajectory
+
+STEADY = (Imu, LaserScans, Odometry, PointClouds, RangeScans, SteeringControls, VelocityControls)
+"""Streams that bring records all the time; landmarks and fixes come when there are some."""
+SLOWEST, FASTEST = 30.0, 2e-5
+"""Usual time between records of a sensor [s]: no scanner takes half a minute, no IMU gives 50 000 readings a second."""
+JUMP, JUMP_TIMES = 20.0, 50.0
+"""A pause this long [s], and this many times the usual one, is one that somebody should know of."""
+TOGETHER = 0.5
+"""Share of the shorter of two streams that the other covers: below it they hardly tell of the same drive."""
+REORDERED = 0.001
+"""Share of stamps that fall back or stand twice above which it is said."""
+
+
+def check_clocks(log: SensorLog) -> list[tuple[str, Finding]]:
+    """Lines on the stamps of a log, each with the name of its stream."""
+    out: list[tuple[str, Finding]] = []
+    for name, stream in log.streams.items():
+        if isinstance(stream, STEADY) and len(stream.times) > 2:
+            out += [(name, f) for f in (*_unit(name, stream.times), *_jumps(name, stream.times))]
+    return [*out, *_overlap(log), *_order(log.read, log.dropped)]
+
+
+def _unit(name: str, t: np.ndarray) -> list[Finding]:
+    usual = float(np.median(np.diff(t)))
+    if FASTEST <= usual <= SLOWEST:
+        return []
+    seems = "milliseconds" if usual < 3e4 else "microseconds" if usual < 3e7 else "nanoseconds"
+    if usual < FASTEST:
+        seems = "a unit much longer than a second"
+    text = f"Records of {name} are {usual:.3g} s apart: the stamps seem to be in {seems}, wanted seconds."
+    return [Finding("bad", "stamps-unit", text)]
+
+
+def _jumps(name: str, t: np.ndarray) -> list[Finding]:
+    dt = np.diff(t)
+    k = np.flatnonzero(dt > max(JUMP, JUMP_TIMES * float(np.median(dt))))
+    if not len(k):
+        return []
+    worst = int(k[np.argmax(dt[k])])
+    more = f", and {len(k) - 1} more jumps of {JUMP:g} s or more" if len(k) > 1 else ""
+    text = (
+        f"The stamps of {name} jump by {dt[worst]:.1f} s after record {worst} (at {t[worst]:.3f} s){more}: a clock was "
+        "set meanwhile, or the recording stopped. Cut the log there, or subtract the jump from what comes after."
+    )
+    return [Finding("bad", "clock-jump", text)]
+
+
+def _overlap(log: SensorLog) -> list[tuple[str, Finding]]:
+    out = []
+    kinds = (*STEADY, LandmarkObservations, Gps, Trajectory)
+    there = [(n, s) for n, s in log.streams.items() if isinstance(s, kinds) and len(s.times) > 1]
+    for (a, x), (b, y) in combinations(there, 2):
+        if "reference" in (a, b):
+            continue
+        common = min(x.times[-1], y.times[-1]) - max(x.times[0], y.times[0])
+        shorter = min(np.ptp(x.times), np.ptp(y.times))
+        if common >= TOGETHER * shorter:
+            continue
+        spans = [f"{n} from {s.times[0]:.3f} to {s.times[-1]:.3f} s" for n, s in ((a, x), (b, y))]
+        said = "have no time in common" if common <= 0 else f"share only {common:.1f} s"
+        text = (
+            f"{a} and {b} {said}: {spans[0]}, {spans[1]}. Their clocks have different zeros or units, or they are of "
+            "two drives; bring them onto one clock."
+        )
+        out.append((b, Finding("bad", "no-common-time", text)))
+    return out
+
+
+def _order(read: Mapping[str, int], dropped: Mapping[str, int]) -> list[tuple[str, Finding]]:
+    out = []
+    for key, n in dropped.items():
+        name, _, reason = key.partition(": ")
+        if reason not in ("stamp out of order", "repeated stamp", "stamp is not finite"):
+            continue
+        share = n / max(read.get(name, n), 1)
+        if share <= REORDERED:
+            continue
+        text = (
+            f"{n} records of {name} ({100 * share:.1f} %) were left out: {reason}. Look whether two drivers write into "
+            "one stream, or whether the stamps are those of arrival; stamps of the measurement rise."
+        )
+        out.append((name, Finding("bad" if share > 0.01 else "look", "stamps-order", text)))
+    return out

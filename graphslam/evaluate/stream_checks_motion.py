@@ -1,0 +1,217 @@
+"""Odometry and wheels looked at before a run: by themselves, and against what the robot saw from place to place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GraphSlamError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array, se2_between, se2_compose
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import group_of
+from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, VelocityControls
+from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
+
+Ints = npt.NDArray[np.int64]
+
+FASTEST, FASTEST_TURN = 70.0, 10.0
+"""No robot or car drives faster [m/s] for a quarter of the time, or turns faster [rad/s] for a hundredth of it."""
+LEAP, LEAP_TIMES = 1.0, 30.0
+"""A step this long [m] and this many times as fast as the robot usually drives is a leap of the pose, not a drive."""
+SIDEWAYS = 0.6
+"""Way to the side as a share of that ahead above which a heading is not that of the motion."""
+APART = (0.5, 6.0)
+"""Two sightings of a landmark that are compared are so far apart in time [s]."""
+MOST_PAIRS, LEAST_PAIRS = 4000, 30
+BETTER = 0.5
+"""Under the right hypothesis the landmarks move less than this share of what they do as the log stands, …"""
+NOISY = 2.0
+"""… which is this many times what the stated noise explains."""
+
+
+def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Finding]:
+    """Lines on a stream of motion by itself."""
+    if len(motion.times) < 3:
+        return []
+    dt = np.diff(motion.times)
+    if isinstance(motion, VelocityControls):
+        return _too_fast(np.abs(motion.speed), np.abs(motion.yaw_rate), name)
+    g = group_of(motion.increments)
+    xi = np.asarray(g.log(motion.increments))[1:]
+    way, turn = np.linalg.norm(xi[:, g.position], axis=1), np.abs(xi[:, g.heading])
+    pauses = dt > 5.0 * np.median(dt)
+    speed, rate = way / dt, turn / dt
+    out = _too_fast(speed[~pauses], rate[~pauses], name)
+    usual = float(np.percentile(speed, 90)) if len(speed) else 0.0
+    k = np.flatnonzero((way > LEAP) & (speed > LEAP_TIMES * max(usual, 0.05)))
+    if len(k):
+        text = (
+            f"The pose of {name} leaps by {way[k[0]]:.1f} m in {dt[k[0]]:.2f} s at {motion.times[k[0] + 1]:.3f} s"
+            f" (record {k[0] + 1}; such leaps: {len(k)}), and the robot usually drives up to {usual:.2g} m/s: the "
+            "odometry was set back, or it is a pose corrected by another map. Give the raw odometry, or cut the log."
+        )
+        out.append(Finding("bad", "odometry-leaps", text))
+    if g.dim == 2 and not out:
+        ahead, side = np.abs(xi[:, g.position][:, 0]).sum(), np.abs(xi[:, g.position][:, 1]).sum()
+        if ahead + side > 5.0 and side > SIDEWAYS * ahead:
+            text = (
+                f"By {name} the robot drives {side:.3g} m sideways and {ahead:.3g} m ahead: its heading is not where "
+                "it drives. Headings in degrees, counted from north or clockwise, swapped axes, or another order of "
+                "the quaternion look like that; wanted radians, to the left, zero along x."
+            )
+            out.append(Finding("look", "heading-not-ahead", text))
+    return out
+
+
+def _too_fast(speed: Array, rate: Array, name: str) -> list[Finding]:
+    out = []
+    for values, limit, share, unit, code, why in (
+        (speed, FASTEST, 25, "m/s", "speed-unit", "in millimetres or centimetres"),
+        (rate, FASTEST_TURN, 1, "rad/s", "turn-unit", "in degrees, wanted radians"),
+    ):
+        usual = float(np.percentile(values, 100 - share)) if len(values) else 0.0
+        if usual > limit:
+            text = f"By {name} the robot moves at {usual:.3g} {unit} or more for {share} % of the time: is it {why}?"
+            out.append(Finding("bad", code, text))
+    if len(out) == 2:
+        text = (
+            f"{out[0].text.partition(':')[0]}, and turns as fast: its stamps are too dense, or not those of the drive."
+        )
+        return [Finding("bad", "stamps-unit", text)]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """One thing that may be wrong: factors on what the log says, and the line for the user.
+
+    Parameters
+    ----------
+    text : str
+    speed, turn, ranges, bearings : float
+    yaw : float
+        Added to bearings [rad].
+    """
+
+    text: str
+    speed: float = 1.0
+    turn: float = 1.0
+    ranges: float = 1.0
+    bearings: float = 1.0
+    yaw: float = 0.0
+
+
+_DEG = float(np.pi / 180.0)
+HYPOTHESES = (
+    Hypothesis("speeds seem to be in km/h, wanted m/s: divide them by 3.6", speed=1 / 3.6),
+    Hypothesis("speeds seem to be 3.6 times too small (m/s taken for km/h)", speed=3.6),
+    Hypothesis("speeds or distances of the motion seem to be in millimetres, wanted metres", speed=1e-3),
+    Hypothesis("speeds or distances of the motion seem to be in centimetres, wanted metres", speed=1e-2),
+    Hypothesis("the speed has the wrong sign: the robot drives ahead where the log says back", speed=-1.0),
+    Hypothesis("yaw rates or headings seem to be in degrees, wanted radians", turn=_DEG),
+    Hypothesis("yaw rates or headings seem to be divided by 57.3 once too often", turn=1 / _DEG),
+    Hypothesis("turns and bearings have opposite signs: both count to the left, seen from above", turn=-1.0),
+    Hypothesis("ranges seem to be in millimetres, wanted metres", ranges=1e-3),
+    Hypothesis("ranges seem to be in centimetres, wanted metres", ranges=1e-2),
+    Hypothesis("ranges seem to be in kilometres, wanted metres", ranges=1e3),
+    Hypothesis("ranges seem to be in feet, wanted metres", ranges=0.3048),
+    Hypothesis("bearings seem to be in degrees, wanted radians", bearings=_DEG),
+    Hypothesis("bearings seem to be divided by 57.3 once too often", bearings=1 / _DEG),
+    Hypothesis("bearings seem to count from the left side of the robot, wanted from ahead", yaw=0.5 * np.pi),
+    Hypothesis("bearings seem to count from the right side of the robot, wanted from ahead", yaw=-0.5 * np.pi),
+    Hypothesis("bearings seem to count from behind the robot, wanted from ahead", yaw=np.pi),
+)
+
+
+def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
+    """Does a landmark stay where it is while the robot moves as the log says? If not, what would make it stay.
+
+    Two sightings of the same landmark some seconds apart are put into one frame by the motion between them. Units and
+    signs that may be wrong are tried one after the other: the one under which landmarks stay is named.
+    """
+    pairs = _sighted_twice(z)
+    if pairs is None:
+        return []
+    first, second = pairs
+    scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
+    paths = {}
+    for h in (Hypothesis(""), *HYPOTHESES):
+        key = h.speed, h.turn
+        if key not in paths:
+            path = _path(log, z.times, *key)
+            if path is None:
+                return []
+            paths[key] = se2_between(path[scan[first]], path[scan[second]])
+    a, b = (np.column_stack([z.ranges[k], z.bearings[k]]) for k in (first, second))
+    noise = float(np.median(np.hypot(z.sigmas[first, 0] / z.ranges[first], z.sigmas[first, 1])))
+    as_is = _unrest(a, b, paths[1.0, 1.0], Hypothesis(""))
+    if as_is < NOISY * noise:
+        return []
+    tried = [(_unrest(a, b, paths[h.speed, h.turn], h), k) for k, h in enumerate(HYPOTHESES)]
+    least, k = min(tried)
+    if least > BETTER * as_is:
+        return []
+    text = (
+        f"Landmarks of {name} do not stay in place while the robot moves: from one sighting to the next they shift by "
+        f"{100 * as_is:.0f} % of their range (median of {len(first)} pairs), and by {100 * least:.0f} % if one thing "
+        f"is changed: {HYPOTHESES[k].text}."
+    )
+    return [Finding("bad", "sightings-and-motion", text)]
+
+
+def _sighted_twice(z: LandmarkObservations) -> tuple[Ints, Ints] | None:
+    """Rows of pairs of sightings of one landmark, each row with the last one that is near enough in time."""
+    if z.ids is None or not len(z.ranges) or not np.all(z.has_bearing) or not np.all(z.ranges > 0):
+        return None
+    scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
+    a, b = [], []
+    for i in np.unique(z.ids[z.ids >= 0]):
+        rows = np.flatnonzero(z.ids == i)
+        t = z.times[scan[rows]]
+        k = np.searchsorted(t, t + APART[1], side="right") - 1
+        ok = t[k] >= t + APART[0]
+        a.append(rows[ok])
+        b.append(rows[k[ok]])
+    if sum(map(len, a)) < LEAST_PAIRS:
+        return None
+    first, second = np.concatenate(a), np.concatenate(b)
+    few = np.linspace(0, len(first) - 1, min(len(first), MOST_PAIRS)).round().astype(np.int64)
+    return first[few], second[few]
+
+
+def _path(log: SensorLog, times: Array, speed: float, turn: float) -> Array | None:
+    """Poses ``(n, 3)`` by the motion of a log, its distances and turns multiplied; None where there is none."""
+    streams = dict(log.streams)
+    for name, s in log.streams.items():
+        if isinstance(s, VelocityControls):
+            streams[name] = replace(s, speed=speed * s.speed, yaw_rate=turn * s.yaw_rate)
+        elif isinstance(s, Odometry) and s.increments.shape[1] == 3:
+            xi = np.asarray(group_of(s.increments).log(s.increments))
+            streams[name] = replace(s, increments=group_of(s.increments).exp(xi * [speed, speed, turn]))
+        elif isinstance(s, SteeringControls):
+            streams[name] = replace(s, speed=speed * s.speed, steering=turn * s.steering)
+    try:
+        steps = dead_reckoning(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0].increments
+    except GraphSlamError:
+        return None
+    if steps.shape[1] != 3:
+        return None
+    poses = np.zeros((len(times), 3))
+    for k in range(1, len(poses)):
+        poses[k] = se2_compose(poses[k - 1], steps[k])
+    return poses
+
+
+def _unrest(first: Array, second: Array, steps: Array, h: Hypothesis) -> float:
+    """Median shift of the landmarks over their range."""
+    ends = []
+    for z in (first, second):
+        angle = h.bearings * z[:, 1] + h.yaw
+        ends.append(h.ranges * z[:, :1] * np.column_stack([np.cos(angle), np.sin(angle)]))
+    c, s = np.cos(steps[:, 2]), np.sin(steps[:, 2])
+    d = ends[0] - steps[:, :2]
+    there = np.column_stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]])
+    return float(np.median(np.linalg.norm(there - ends[1], axis=1) / (h.ranges * first[:, 0])))
