@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from graphslam.core.errors import ConfigError, GraphSlamError
 
@@ -56,3 +58,54 @@ def connect(address: str, *, timeout: float = 10.0) -> Client:
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"no Dask scheduler answers at {address!r} ({error}); wanted host:port") from error
     return client
+
+
+@contextmanager
+def hands(workers: int | None = None, address: str | None = None) -> Iterator[Callable[..., list[Any]]]:
+    """Something that runs tasks: ``run(work, [arguments, …])`` gives what each call of ``work`` returned, in order.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Processes of a Dask cluster that lives as long as this; one that dies is started again, and its task repeated.
+    address : str, optional
+        Of a running scheduler. Without either, tasks run here, one after the other.
+
+    Raises
+    ------
+    ConfigError
+        Both are given, or fewer than one worker is wanted.
+    GraphSlamError
+        ``distributed`` is not installed; or workers died over the same task again and again.
+    """
+    if workers is not None and (address is not None or workers < 1):
+        raise ConfigError(f"{workers} workers and the cluster {address!r}; wanted one of them, and at least 1 worker")
+    if workers is None and address is None:
+        yield lambda work, tasks: [work(*task) for task in tasks]
+        return
+    distributed = require_distributed()
+
+    def on(client: Client) -> Callable[..., list[Any]]:
+        def run(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:
+            futures = [client.submit(work, *task, pure=False) for task in tasks]
+            try:
+                return list(client.gather(futures))
+            except distributed.KilledWorker as error:
+                raise GraphSlamError(
+                    f"workers died over the same task again and again ({error}); most often it needs more memory "
+                    "than a worker has"
+                ) from None
+
+        return run
+
+    if address is not None:
+        with connect(address) as client:
+            yield on(client)
+        return
+    with (
+        distributed.LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield on(client)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -74,7 +75,7 @@ class ChainGraph:
             if len(value) not in (1, n):
                 raise DataError(f"{name} of a chain graph", got=len(value), wanted=f"1 or {n}")
             put(self, name, value)
-        _ = self.links
+        _ = self.information
 
     @property
     def poses(self) -> int:
@@ -82,17 +83,27 @@ class ChainGraph:
         return len(self.translation) + 1
 
     @cached_property
-    def links(self) -> tuple[Links, Links]:
-        """Odometry, in segments between the ends of loops, and loops, as the kernels take them."""
-        N, L = self.poses, len(self.ends)
-        info = inverse_covariance(self.covariance, "covariance")
-        more = inverse_covariance(self.loop_covariance, "loop_covariance")
+    def information(self) -> tuple[Array, Array]:
+        """Inverse covariances of odometry and loops."""
+        return (
+            inverse_covariance(self.covariance, "covariance"),
+            inverse_covariance(self.loop_covariance, "loop_covariance"),
+        )
+
+    def links(self, stay: npt.ArrayLike = ()) -> tuple[Links, Links]:
+        """Odometry, in segments between poses that are kept, and loops, as the kernels take them.
+
+        Kept are the ends of loops, the first and the last pose, and those of ``stay``.
+        """
+        N, L, info = self.poses, len(self.ends), self.information
         k = np.arange(N, dtype=np.int64)
-        kept = np.unique(np.concatenate([k[[0, -1]], self.ends.ravel()]))
+        kept = np.unique(np.concatenate([k[[0, -1]], self.ends.ravel(), np.asarray(stay, dtype=np.int64)]))
         steps = np.column_stack([k[:-1], k[1:]])
         return (
-            Links(steps, kept, self.rotation, self.translation, self.covariance, info),
-            Links(self.ends, np.arange(L + 1), self.loop_rotation, self.loop_translation, self.loop_covariance, more),
+            Links(steps, kept, self.rotation, self.translation, self.covariance, info[0]),
+            Links(
+                self.ends, np.arange(L + 1), self.loop_rotation, self.loop_translation, self.loop_covariance, info[1]
+            ),
         )
 
     def dead_reckoning(self) -> Poses:
@@ -101,6 +112,82 @@ class ChainGraph:
         R[0], p[0] = np.eye(3), 0.0
         chains.reckon(self.rotation, self.translation, R, p)
         return Poses(R, p)
+
+
+class KeptNetwork:
+    """What is left of a chain with loops when the poses between kept ones are eliminated.
+
+    Attributes
+    ----------
+    kept : (K,)
+    keys : (nb,)
+        ``row · K + column`` of each block, row ≤ column.
+    """
+
+    def __init__(self, graph: ChainGraph, stay: npt.ArrayLike = ()) -> None:
+        self._odometry, self._loops = graph.links(stay)
+        self.poses, self.kept = graph.poses, self._odometry.first
+        K = len(self.kept)
+        # segments of the odometry, then loops
+        c = np.arange(K)
+        loops = np.searchsorted(self.kept, graph.ends)
+        self._ends = np.concatenate([np.column_stack([c[:-1], c[1:]]), loops]).astype(np.int64)
+        self.keys, place = block_keys(self._ends, K)
+        self._place = place[:K], place[K:]
+
+    def join(self, poses: Poses) -> Joined:
+        """All links, joined at some poses."""
+        S, n = len(self.kept) - 1, len(self._ends)
+        covariance, misfit = np.empty((n, 6, 6)), np.empty((n, 6))
+        total = kernels.join_links(self._odometry, poses, covariance[:S], misfit[:S])
+        total += kernels.join_links(self._loops, poses, covariance[S:], misfit[S:])
+        blocks, g = np.zeros((len(self.keys), 6, 6)), np.zeros((S + 1, 6))
+        energy, bad = kernels.tie_ends(
+            self._ends, poses.position[self.kept], covariance, misfit, self._place, blocks, g
+        )
+        if bad >= 0:
+            i, j = self.kept[self._ends[bad]]
+            raise IndeterminateError(f"nothing ties pose {i} of the chain to pose {j}", (f"x{i}", f"x{j}"))
+        return Joined(poses, float(total), float(energy), blocks, g, covariance, misfit)
+
+    def follow(self, joined: Joined, solved: Array) -> Array:
+        """Steps ``(N, 6)`` of all poses from those ``(K, 6)`` of the kept ones."""
+        S = len(self.kept) - 1
+        x = np.empty((self.poses, 6))
+        x[self.kept] = solved
+        kernels.follow_links(self._odometry, joined.poses, joined.information[:S], joined.misfit[:S], x)
+        return x
+
+
+class Joined(NamedTuple):
+    """Links joined at some poses."""
+
+    poses: Poses
+    total: float
+    """Σ rᵀ Ω r over all links …"""
+    energy: float
+    """… and what is left of it when the poses between kept ones go where it is least."""
+    blocks: Array
+    """(nb, 6, 6): matrix of the kept poses."""
+    gradient: Array
+    """(K, 6): half of it."""
+    information: Array
+    """(S, 6, 6): of the joined links …"""
+    misfit: Array
+    """… and their residuals (S, 6)."""
+
+
+def block_keys(ends: npt.NDArray[np.int64], frames: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Keys of the diagonal blocks of a network and of those of its links, and where each of them is among the keys."""
+    c = np.arange(frames)
+    keys, place = np.unique(
+        np.concatenate([c * frames + c, ends.min(axis=1) * frames + ends.max(axis=1)]), return_inverse=True
+    )
+    return keys.astype(np.int64), place.astype(np.int64)
+
+
+HELD = 1e12 * np.eye(6)
+"""Of the first pose: softer than the rounding of its own moves, harder than any measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,52 +242,32 @@ def relax_chain(
     SolverError
         The objective is not finite.
     """
-    odometry, loops = graph.links
-    N, kept = graph.poses, odometry.first
-    K = len(kept)
-    # the reduced network: segments of the odometry, then loops
-    c = np.arange(K)
-    ends = np.concatenate([np.column_stack([c[:-1], c[1:]]), np.searchsorted(kept, graph.ends)]).astype(np.int64)
-    keys, place = np.unique(np.concatenate([c * K + c, ends.min(axis=1) * K + ends.max(axis=1)]), return_inverse=True)
-    pattern = KeyframePattern(keys.astype(np.int64), K)
-
-    def joined(poses: Poses) -> tuple[float, Array, Array]:
-        covariance, misfit = np.empty((len(ends), 6, 6)), np.empty((len(ends), 6))
-        total = kernels.join_links(odometry, poses, covariance[: K - 1], misfit[: K - 1])
-        total += kernels.join_links(loops, poses, covariance[K - 1 :], misfit[K - 1 :])
-        return float(total), covariance, misfit
-
-    here = graph.dead_reckoning() if poses is None else poses
-    total, stiffness, misfit = joined(here)
-    history, predicted, far, converged = [total], np.inf, np.inf, False
+    network = KeptNetwork(graph)
+    K = len(network.kept)
+    pattern = KeyframePattern(network.keys, K)
+    joined = network.join(graph.dead_reckoning() if poses is None else poses)
+    history, predicted, far, converged = [joined.total], np.inf, np.inf, False
     for _ in range(iterations):
-        if not np.isfinite(total):
+        if not np.isfinite(joined.total):
             raise SolverError("objective of the chain graph is not finite")
-        blocks, g = np.zeros((len(keys), 6, 6)), np.zeros((K, 6))
-        energy, bad = kernels.tie_ends(ends, here.position[kept], stiffness, misfit, (place[:K], place[K:]), blocks, g)
-        if bad >= 0:
-            i, j = kept[ends[bad]]
-            raise IndeterminateError(f"nothing ties pose {i} of the chain to pose {j}", (f"x{i}", f"x{j}"))
-        blocks[place[0]] += 1e12 * np.eye(6)  # held: softer than the rounding of its moves, harder than any measurement
-        x = np.empty((N, 6))
-        x[kept] = pattern.factor(blocks).solve(-g.ravel()).reshape(K, 6)
-        predicted = total - energy - float(np.einsum("ij,ij->", x[kept], g))
-        kernels.follow_links(odometry, here, stiffness[: K - 1], misfit[: K - 1], x)
+        joined.blocks[0] += HELD  # key 0
+        solved = pattern.factor(joined.blocks).solve(-joined.gradient.ravel()).reshape(K, 6)
+        predicted = joined.total - joined.energy - float(np.einsum("ij,ij->", solved, joined.gradient))
+        x = network.follow(joined, solved)
         scale = 1.0
         while True:
-            there = moved(here, x, scale)
-            after, stiffness, misfit = joined(there)
-            if after <= total * (1.0 + 1e-12) or scale < 1e-4:
+            there = network.join(moved(joined.poses, x, scale))
+            if there.total <= joined.total * (1.0 + 1e-12) or scale < 1e-4:
                 break
             scale *= 0.5
-        if after > total * (1.0 + 1e-12):
+        if there.total > joined.total * (1.0 + 1e-12):
             break
-        here, total = there, after
-        history.append(total)
+        joined = there
+        history.append(joined.total)
         far = float(np.sqrt(np.max(np.sum(x[:, 3:] ** 2, axis=1)))) * scale
         if progress is not None:
-            progress(total)
-        if scale == 1.0 and predicted < max(gain * total, 1e-9):
+            progress(joined.total)
+        if scale == 1.0 and predicted < max(gain * joined.total, 1e-9):
             converged = True
             break
-    return RelaxedChain(here, total, history, predicted, far, converged)
+    return RelaxedChain(joined.poses, joined.total, history, predicted, far, converged)

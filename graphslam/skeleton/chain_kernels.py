@@ -146,8 +146,10 @@ def _sandwich(X, P, Y, M, row, column):
 
 
 @nb.njit(cache=True, nogil=True)
-def linearise(chain, poses, blocks, diagonal, upper, g):
+def linearise(chain, poses, span, blocks, diagonal, upper, g):
     """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
+
+    Of the poses ``begin … end - 1`` of the span: their tilt, and the odometry from them on.
 
     Odometry: with J the derivative by the later pose, that by the earlier one is ``-J T``, T = [[I, 0], [-[d]×, I]], d
     the way from one to the other. So with ``M = Jᵀ Ω J`` the blocks are ``Tᵀ M T``, ``-Tᵀ M`` and ``M``.
@@ -157,7 +159,7 @@ def linearise(chain, poses, blocks, diagonal, upper, g):
     J, M, A = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     r, f, h = np.empty(6), np.empty(6), np.empty(6)
     total = 0.0
-    for k in range(N - 1):
+    for k in range(span[0], min(span[1], N - 1)):
         x, y, z = odometry_residual(chain, poses, k, r, J)
         O = chain.information[k if len(chain.information) > 1 else 0]
         for i in range(6):
@@ -198,7 +200,7 @@ def linearise(chain, poses, blocks, diagonal, upper, g):
             for j in range(6):
                 E[i, j] += M[i, j]
                 U[i, j] -= A[i, j]
-    for i in range(N):
+    for i in range(span[0], span[1]):
         a = chain.up_information[i if len(chain.up_information) > 1 else 0]
         R, m3 = poses.rotation[i], chain.up[i]
         x = R[0, 0] * m3[0] + R[0, 1] * m3[1] + R[0, 2] * m3[2]

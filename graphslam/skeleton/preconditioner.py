@@ -135,6 +135,8 @@ def _interval_chunks(network: Network, k: int, begin: int, end: int) -> Iterator
     problem = network.layout.problem
     size = end - begin if problem.tiles is None else max(1, problem.tiles.size // k)
     for a in range(begin, end, max(1, size)):
+        if problem.tiles is not None:
+            problem.tiles.release()
         yield a, min(a + size, end)
 
 
@@ -160,7 +162,7 @@ class Preconditioner:
     def __init__(self, network: Network, levels: Levels, pattern: KeyframePattern | None = None) -> None:
         self.layout, self.levels, self.position = network.layout, levels, network.poses.position
         workers = self.layout.workers
-        self.inverse = inverse_of(network.diagonal(), workers, self.layout.ranges, "pose")
+        self.inverse = inverse_of(network.diagonal(), self.layout.over_poses, "pose")
         self.keyframes: Array | None = None
         self.network: KeyframeNetwork | None = None
         if levels.jacobi:
@@ -176,7 +178,7 @@ class Preconditioner:
                     kernels.keyframe_diagonal(sight, network.poses, landmarks, k, a, b, blocks)
 
             workers.over(fill, ranges)
-            self.keyframes = inverse_of(blocks, workers, ranges, "keyframe")
+            self.keyframes = inverse_of(blocks, lambda work: workers.over(work, ranges), "keyframe")
         if levels.factored:
             self.network = KeyframeNetwork(network, levels.factored, pattern)
 
@@ -188,7 +190,7 @@ class Preconditioner:
     def __call__(self, r: Array) -> Array:
         """``M⁻¹ r`` for ``r (N, 6)``."""
         out = np.empty_like(r)
-        self.layout.workers.over(lambda a, b: chains.multiply_blocks(self.inverse, r, a, b, out), self.layout.ranges)
+        self.layout.over_poses(lambda a, b: chains.multiply_blocks(self.inverse, r, a, b, out))
         if self.keyframes is not None:
             k, n = self.levels.jacobi, len(self.keyframes)
             x, y = np.empty((n, 6)), np.empty((n, 6))

@@ -200,6 +200,18 @@ class SkeletonProblem:
         else:
             yield from self.tiles.ranges(begin, end)
 
+    def room(self, shape: tuple[int, ...]) -> Array:
+        """Zeros for something large: in memory, or on disk where the measurements are."""
+        return np.zeros(shape) if self.tiles is None else self.tiles.room(shape)
+
+    def pieces(self, count: int, least: int = 1 << 20) -> Iterator[tuple[int, int]]:
+        """Ranges of ``count`` rows of large arrays to take at a time; a quarter of them in memory, fewer from disk."""
+        step = max(1, -(-count // 4)) if self.tiles is None else least
+        for a in range(0, count, step):
+            if self.tiles is not None:
+                self.tiles.release()
+            yield a, min(a + step, count)
+
     @cached_property
     def chain(self) -> Chain:
         """Odometry and tilt, as the kernels take them."""

@@ -65,9 +65,14 @@ class Layout:
                 high = max(high, int(label.max(initial=-1)) + 1)
                 kernels.count_sightings(label, self.counts)
             self.reach.append(high)
-        L = problem.landmarks
-        step = max(1, -(-L // 4))
-        self.landmark_ranges = [(a, min(a + step, L)) for a in range(0, L, step)]
+
+    def over_landmarks(self, work: Callable[[int, int], None]) -> None:
+        """``work(begin, end)`` for ranges of landmarks."""
+        self.workers.over(work, self.problem.pieces(self.problem.landmarks))
+
+    def over_poses(self, work: Callable[[int, int], Any]) -> list[Any]:
+        """``work(begin, end)`` for ranges of poses, where the measurements themselves are not needed."""
+        return self.workers.over(work, (c for r in self.ranges for c in self.problem.chunks(*r)))
 
     def over(self, work: Callable[..., None]) -> None:
         """``work(k, sightings, begin, end)`` for the chunks of each range k of poses, in their order within a range."""
@@ -80,7 +85,7 @@ class Layout:
 
     def sums(self, width: int) -> list[Array]:
         """A zero array ``(landmarks in reach, width)`` for each range of poses; the last one has all landmarks."""
-        return [np.zeros((r, width)) for r in self.reach]
+        return [self.problem.room((r, width)) for r in self.reach]
 
     def total(self, sums: list[Array]) -> Array:
         """Sum over the ranges, in their order, in the last array."""
@@ -90,7 +95,7 @@ class Layout:
             for part in sums[:-1]:
                 out[a : min(b, len(part))] += part[a:b]
 
-        self.workers.over(add, self.landmark_ranges)
+        self.over_landmarks(add)
         return out
 
 
@@ -113,9 +118,7 @@ class Network:
         D, b = layout.sums(6), layout.sums(3)
         layout.over(lambda k, sight, a, e: kernels.sum_landmarks(sight, poses, a, e, D[k], b[k]))
         self.inverse, self.landmarks = layout.total(D), layout.total(b)
-        layout.workers.over(
-            lambda a, e: kernels.solve_landmarks(self.inverse, self.landmarks, a, e), layout.landmark_ranges
-        )
+        layout.over_landmarks(lambda a, e: kernels.solve_landmarks(self.inverse, self.landmarks, a, e))
         N = problem.poses
         g, each = np.empty((N, 6)), np.empty(N)
         layout.over(lambda k, sight, a, e: kernels.gradient(sight, poses, self.landmarks, a, e, g, each))
@@ -126,18 +129,25 @@ class Network:
     def _add_chain(self, g: Array, diagonal: Array | None, upper: Array | None) -> float:
         """Add what ties a pose alone or to the next; returns its objective."""
         problem, poses = self.layout.problem, self.poses
-        blocks = diagonal is not None
         none = np.empty((0, 6, 6))
-        total = chains.linearise(
-            problem.chain, poses, blocks, none if diagonal is None else diagonal, none if upper is None else upper, g
-        )
+        total = 0.0
+        for span in [(0, problem.poses)] if diagonal is None else problem.pieces(problem.poses):
+            total += chains.linearise(
+                problem.chain,
+                poses,
+                span,
+                diagonal is not None,
+                none if diagonal is None else diagonal,
+                none if upper is None else upper,
+                g,
+            )
         return float(total) + add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
 
     def chain_blocks(self) -> tuple[Array, Array]:
         """Blocks ``(N, 6, 6)`` and ``(N - 1, 6, 6)`` of what ties a pose alone or to the next."""
         if self._blocks is None:
             N = self.layout.problem.poses
-            diagonal, upper = np.zeros((N, 6, 6)), np.zeros((N - 1, 6, 6))
+            diagonal, upper = self.layout.problem.room((N, 6, 6)), self.layout.problem.room((N - 1, 6, 6))
             self._add_chain(np.zeros((N, 6)), diagonal, upper)
             self._blocks = diagonal, upper
         return self._blocks
@@ -145,9 +155,14 @@ class Network:
     def diagonal(self) -> Array:
         """Diagonal blocks ``(N, 6, 6)`` of the Schur complement."""
         layout = self.layout
-        blocks = self.chain_blocks()[0].copy()
+        chain, blocks = self.chain_blocks()[0], layout.problem.room((layout.problem.poses, 6, 6))
         landmarks = (self.landmarks, self.inverse)
-        layout.over(lambda k, sight, a, e: kernels.diagonal(sight, self.poses, landmarks, a, e, blocks))
+
+        def fill(_: int, sight: Sightings, a: int, e: int) -> None:
+            blocks[a:e] = chain[a:e]
+            kernels.diagonal(sight, self.poses, landmarks, a, e, blocks)
+
+        layout.over(fill)
         return blocks
 
     def product(self, v: Array) -> Array:
@@ -156,7 +171,7 @@ class Network:
         parts = layout.sums(3)
         layout.over(lambda k, sight, a, e: kernels.gather(sight, self.poses, self.landmarks, v, a, e, parts[k]))
         t = layout.total(parts)
-        layout.workers.over(lambda a, e: kernels.settle(self.inverse, t, a, e), layout.landmark_ranges)
+        layout.over_landmarks(lambda a, e: kernels.settle(self.inverse, t, a, e))
         diagonal, upper = self.chain_blocks()
         out = np.empty_like(v)
 
@@ -206,15 +221,15 @@ def moved(poses: Poses, step: Array, scale: float = 1.0) -> Poses:
     return Poses(R, p)
 
 
-def inverse_of(blocks: Array, workers: Workers, ranges: list[tuple[int, int]], what: str) -> Array:
-    """Replace blocks ``(n, 6, 6)`` by their inverses.
+def inverse_of(blocks: Array, over: Callable[..., list[Any]], what: str) -> Array:
+    """Replace blocks ``(n, 6, 6)`` by their inverses; ``over(work)`` calls ``work(begin, end)`` for ranges of them.
 
     Raises
     ------
     IndeterminateError
         One is not positive definite.
     """
-    bad = [k for k in workers.over(lambda a, b: chains.invert_blocks(blocks, a, b), ranges) if k >= 0]
+    bad = [k for k in over(lambda a, b: chains.invert_blocks(blocks, a, b)) if k >= 0]
     if bad:
         raise IndeterminateError(f"{what} {min(bad)} of the skeleton network is not constrained", (f"x{min(bad)}",))
     return blocks

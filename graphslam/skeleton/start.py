@@ -21,16 +21,17 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
     """
     poses = problem.dead_reckoning()
     N = problem.poses
-    objective, g, diagonal, upper = _linearised(problem, poses)
+    blocks = np.empty((N, 6, 6)), np.empty((N - 1, 6, 6))
+    objective, g = _linearised(problem, poses, *blocks)
     for _ in range(iterations):
         step = -g
-        bad = kernels.solve_chain(diagonal, upper, step)
+        bad = kernels.solve_chain(*blocks, step)
         if bad >= 0:
             raise IndeterminateError(f"pose {bad} of the chain is not constrained", (f"x{bad}",))
         scale = 1.0
         while True:
             there = moved(poses, step, scale)
-            after, g, diagonal, upper = _linearised(problem, there)
+            after, g = _linearised(problem, there, *blocks)
             if after <= objective or scale < 1e-3:
                 break
             scale *= 0.5
@@ -42,12 +43,14 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
     return poses
 
 
-def _linearised(problem: SkeletonProblem, poses: Poses) -> tuple[float, Array, Array, Array]:
-    N = problem.poses
-    g, diagonal, upper = np.zeros((N, 6)), np.zeros((N, 6, 6)), np.zeros((N - 1, 6, 6))
-    total = kernels.linearise(problem.chain, poses, True, diagonal, upper, g)
+def _linearised(problem: SkeletonProblem, poses: Poses, diagonal: Array, upper: Array) -> tuple[float, Array]:
+    """Objective and half the gradient of the chain; its blocks replace what was in ``diagonal`` and ``upper``."""
+    g = np.zeros((problem.poses, 6))
+    diagonal[:] = 0.0
+    upper[:] = 0.0
+    total = kernels.linearise(problem.chain, poses, (0, problem.poses), True, diagonal, upper, g)
     total += add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
-    return float(total), g, diagonal, upper
+    return float(total), g
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def forward_pass(
     """
     N, L = problem.poses, problem.landmarks
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
-    seen, D, b = np.full(L, -1, dtype=np.int32), np.zeros((L, 6)), np.zeros((L, 3))
+    seen, D, b = np.full(L, -1, dtype=np.int32), problem.room((L, 6)), problem.room((L, 3))
     rules = (int(ago), float(turn_sigma) ** -2, float(way_sigma) ** -2, float(gate))
     tied = refused = 0
     for span in problem.chunks(0, N):

@@ -8,18 +8,25 @@ can be stopped at any moment and repeated, by one process or by many, and the fo
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+import io
+import mmap
+import tempfile
+import weakref
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.atomic import atomic_open, read_json, sweep_parts, write_json
-from graphslam.core.errors import DataError, FormatError
+from graphslam.core.errors import DataError, FormatError, MissingDataError
+from graphslam.core.npz import read_arrays
 
 FORMAT = "graphslam.tiles/1"
 _INDEX = "tiles.json"
+_STEPS = 32
+"""Ranges from one release of mapped memory to the next."""
 _SHAPE = {
     "format": str,
     "landmarks": int,
@@ -82,6 +89,7 @@ class Tiles:
         self.first = np.concatenate([[0], np.cumsum(np.concatenate(counts), dtype=np.int64)]).astype(np.int64)
         self.measurements = int(self.first[-1])
         self.size = int(np.diff(self._begin).max())
+        self._maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def _path(self, name: str) -> Path:
         if Path(name).name != name or not name.endswith(".tile"):
@@ -90,9 +98,33 @@ class Tiles:
 
     def ranges(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
         """The poses ``begin … end - 1``, cut where tiles meet."""
+        met = 0
         for a, b in zip(self._begin[:-1], self._begin[1:]):
             if a < end and begin < b:
+                if met % _STEPS == 0:
+                    self.release()
+                met += 1
                 yield max(int(a), begin), min(int(b), end)
+
+    def room(self, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+        """Zeros that lie on disk: a nameless file of the folder, mapped, that is gone when the array is.
+
+        What is read and written of it stays in memory until :meth:`release`, or as long as the system likes.
+        """
+        kind = np.dtype(dtype)
+        size = int(np.prod(shape)) * kind.itemsize
+        if not size:
+            return np.zeros(shape, kind)
+        with tempfile.TemporaryFile(dir=self.folder) as stream:
+            stream.truncate(size)
+            mapped = mmap.mmap(stream.fileno(), size)
+        self._maps.add(mapped)
+        return np.frombuffer(mapped, kind).reshape(shape)
+
+    def release(self) -> None:
+        """Let go of the memory of all arrays of :meth:`room`; their numbers stay."""
+        for mapped in list(self._maps):
+            mapped.madvise(mmap.MADV_DONTNEED)
 
     def read(self, begin: int, end: int) -> tuple[Points, Labels]:
         """Points ``(m, 3)`` and landmarks ``(m,)`` of the poses ``begin … end - 1``."""
@@ -151,6 +183,36 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
         index.append({"file": name, "poses": len(n), "measurements": len(label)})
     write_json(out / _INDEX, {"format": FORMAT, "landmarks": high + 1, "tiles": index})
     return Tiles(out)
+
+
+def put_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
+    """Write arrays to a file that is named by the digest of its bytes, if it is not there; its name."""
+    stream = io.BytesIO()
+    np.savez(stream, **{name: np.ascontiguousarray(value) for name, value in arrays.items()})  # type: ignore[arg-type]
+    data = stream.getvalue()
+    name = f"{_digest(data)}.arrays"
+    if not (folder / name).is_file():
+        with atomic_open(folder / name) as out:
+            out.write(data)
+    return name
+
+
+def take_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of such a file.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        There is none, or its digest is not its name.
+    """
+    path = folder / name
+    if path.name != name or path.suffix != ".arrays":
+        raise FormatError("name of a file of arrays", where=str(folder), got=name, wanted="<digest>.arrays")
+    if not path.is_file():
+        raise MissingDataError("file of arrays is missing", where=str(path))
+    if _digest(path.read_bytes()) != path.stem:
+        raise FormatError("file was changed: its digest is not its name", where=str(path))
+    return read_arrays(path)
 
 
 def _numbers(path: Path, out: T, begin: int) -> T:

@@ -18,7 +18,8 @@ objectives are compared as ours, at its poses.
 loops joined, beside GTSAM in the same four ways from the same start. GTSAM's residual of a link differs from ours in
 how it turns the way; its objective is therefore also computed at our poses.
 
-``--tiles FOLDER`` writes each world to disk and relaxes it from there, one tile of 2·10⁴ poses in memory at a time.
+``--tiles FOLDER`` writes each world to disk and relaxes it from there, one tile of 2·10⁴ poses in memory at a time;
+chains as tasks of ``--workers`` processes, or of the workers of a Dask scheduler (``--cluster``).
 
 ``--quick``: 1,200 and 4,800 poses, GTSAM's Cholesky at 600 from dead reckoning. Exit code 1 if we end above the
 optimum: if χ²/dof is above that of the truth, or the objective above GTSAM's.
@@ -294,6 +295,37 @@ def our_chain(poses: int, share: float, file: str) -> dict[str, Any]:
     }
 
 
+def draw_chain(poses: int, share: float, folder: str) -> dict[str, Any]:
+    """Write a chain with loops to disk, in tiles of 2·10⁴ poses."""
+    from graphslam.skeleton.chain_tiles import chain_to_disk, pieces_of
+
+    graph = chain_graph(poses, share)
+    begin = time.process_time()
+    chain_to_disk(folder, pieces_of(graph, 20_000))
+    return {"seconds": time.process_time() - begin}
+
+
+def chain_from_tiles(folder: str, workers: int, cluster: str) -> dict[str, Any]:
+    """Relax a chain with loops from disk."""
+    from graphslam.skeleton.chain_graph import relax_chain
+    from graphslam.skeleton.chain_tiles import relax_tiles
+
+    relax_chain(chain_graph(2000, 0.01))
+    begin, wall = time.process_time(), time.perf_counter()
+    found = relax_tiles(folder, workers=workers or None, cluster=cluster or None)
+    theirs = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        "seconds": time.process_time() - begin,
+        "wall": time.perf_counter() - wall,
+        "workers": theirs.ru_utime + theirs.ru_stime,
+        "history": found.history,
+        "separator": found.separator,
+        "tiles": len(found.names),
+        "peak": peak(),
+        "peak_workers": theirs.ru_maxrss / 1e6,
+    }
+
+
 def their_chain(poses: int, share: float, file: str, solver: str, ordering: str, gigabytes: float) -> dict[str, Any]:
     """The same with GTSAM's Gauss-Newton; and GTSAM's objective at our poses."""
     import gtsam
@@ -430,6 +462,8 @@ def main() -> int:
     parser.add_argument("--chain", default="", help="sizes of plain pose graphs: a chain with loops")
     parser.add_argument("--loops", type=float, default=0.01, help="loops of a chain, for each pose")
     parser.add_argument("--tiles", default="", help="folder for tiles: also relax each size from disk")
+    parser.add_argument("--workers", type=int, default=0, help="processes that relax a chain from disk")
+    parser.add_argument("--cluster", default="", help="Dask scheduler whose workers do so")
     parser.add_argument("--steps", type=int, default=30, help="most steps of a relaxation from disk")
     parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -440,6 +474,8 @@ def main() -> int:
             "theirs": lambda: theirs(int(n), rest[0], rest[1], rest[2], float(rest[3])),
             "draw": lambda: draw_tiles(int(n), rest[0]),
             "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1])),
+            "draw_chain": lambda: draw_chain(int(n), float(rest[0]), rest[1]),
+            "chain_tiles": lambda: chain_from_tiles(n, int(rest[0]), rest[1]),
             "chain": lambda: our_chain(int(n), float(rest[0]), rest[1]),
             "their_chain": lambda: their_chain(int(n), float(rest[0]), rest[1], rest[2], rest[3], float(rest[4])),
         }
@@ -500,6 +536,21 @@ def main() -> int:
             print(f"  best of GTSAM from dead reckoning: {best:.1f} s, {best / mine['seconds']:.1f} × ours")
     for n in [int(k) for k in ("2000" if args.quick else args.chain).split(",") if k]:
         failed += show_chain(n, args.loops, args.seconds, args.gigabytes)
+        if args.tiles:
+            folder = str(Path(args.tiles) / f"chain-{n}")
+            drawn, why = child("draw_chain", str(n), str(args.loops), folder)
+            t, why = child("chain_tiles", folder, str(args.workers), args.cluster) if drawn else (None, why)
+            if drawn is None or t is None:
+                print(f"chain of {n} poses from disk: failed: {why}")
+                failed += 1
+                continue
+            print(
+                f"  from disk: written in {drawn['seconds']:.1f} CPU s; {t['tiles']} tiles, separator of "
+                f"{t['separator']:,} poses; relaxed in {t['seconds']:.1f} CPU s and {t['workers']:.1f} CPU s of "
+                f"workers ({t['wall']:.1f} s wall), peak {t['peak']:.2f} GB, of a worker {t['peak_workers']:.2f} GB; "
+                "objective " + " → ".join(f"{J:.7g}" for J in t["history"]),
+                flush=True,
+            )
     if args.tiles:
         for n in sizes:
             folder = str(Path(args.tiles) / str(n))

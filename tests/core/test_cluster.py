@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import os
 import sys
 
 import pytest
 
-from graphslam.core.cluster import connect, require_distributed
+from graphslam.core.cluster import connect, hands, require_distributed
 from graphslam.core.errors import ConfigError, GraphSlamError
 
 
@@ -32,3 +34,17 @@ def test_a_cluster_is_found_and_not_made_the_default() -> None:
     ):
         assert client.submit(sum, [1, 2, 3]).result() == 6
         assert client not in distributed.client._global_clients.values()
+
+
+def test_tasks_run_here_or_in_processes_of_their_own() -> None:
+    with hands() as run:
+        assert run(math.hypot, [(3, 4), (5, 12)]) == [5.0, 13.0]
+        assert run(os.getpid, [()]) == [os.getpid()]
+    with hands(workers=1) as run:
+        assert run(math.hypot, [(3, 4), (5, 12)]) == [5.0, 13.0]
+        assert run(os.getpid, [()]) != [os.getpid()]
+        with pytest.raises(ValueError, match="domain"):
+            run(math.sqrt, [(-1,)])
+    for wrong in ({"workers": 0}, {"workers": 2, "address": "127.0.0.1:1"}):
+        with pytest.raises(ConfigError, match="at least 1 worker"), hands(**wrong):
+            pass

@@ -87,7 +87,7 @@ def test_a_segment_joined_to_one_link_is_the_dense_elimination() -> None:
     rng = np.random.default_rng(3)
     poses = moved(truth, 0.1 * rng.standard_normal((9, 6)))  # residuals that are not small
     poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
-    odometry, _ = graph.links
+    odometry, _ = graph.links()
     covariance, misfit = np.empty((1, 6, 6)), np.empty((1, 6))
     total = kernels.join_links(odometry, poses, covariance, misfit)
     r, J = residuals(graph, poses), jacobian(graph, poses)
@@ -108,7 +108,7 @@ def test_joined_links_tie_their_ends_as_the_dense_matrix_does() -> None:
     poses = moved(truth, 0.1 * np.random.default_rng(4).standard_normal((5, 6)))
     poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
     covariance, misfit = np.empty((3, 6, 6)), np.empty((3, 6))
-    total = kernels.join_links(graph.links[1], poses, covariance, misfit)
+    total = kernels.join_links(graph.links()[1], poses, covariance, misfit)
     blocks, g = np.zeros((7, 6, 6)), np.zeros((5, 6))
     place = np.arange(5), np.array([5, 6, 5])
     energy, bad = kernels.tie_ends(graph.ends, poses.position, covariance, misfit, place, blocks, g)

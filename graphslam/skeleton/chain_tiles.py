@@ -1,0 +1,430 @@
+"""Chains with loops that are larger than memory: tiles on disk, one in memory at a time, one task a tile and step.
+
+A tile is a range of poses; it shares its last pose with the next one. The *separator* is these shared poses and the
+ends of loops between tiles. A task moves the poses of its tile by the last step, joins its links, eliminates all poses
+that are not of the separator and hands over what is left; the separator is solved exactly where the tasks are given
+out. So a step is the Gauss-Newton step of the whole network, as if it were in memory.
+
+Every file is named by the digest of its bytes, and a task only reads files and writes files: it can be repeated, by the
+same worker or by another one, at any moment, and nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from graphslam.core.atomic import read_json, sweep_parts, write_json
+from graphslam.core.cluster import hands
+from graphslam.core.errors import ConfigError, DataError, FormatError, SolverError
+from graphslam.core.geometry import Array
+from graphslam.skeleton import chain_kernels as chains
+from graphslam.skeleton import segment_kernels as kernels
+from graphslam.skeleton.chain_graph import HELD, ChainGraph, Joined, KeptNetwork, block_keys
+from graphslam.skeleton.landmark_kernels import Poses
+from graphslam.skeleton.preconditioner import KeyframePattern
+from graphslam.skeleton.problem import inverse_covariance
+from graphslam.skeleton.schur import moved
+from graphslam.skeleton.segment_kernels import Links
+from graphslam.skeleton.tile_store import put_arrays, take_arrays
+
+FORMAT = "graphslam.chain-tiles/1"
+_INDEX = "chain.json"
+_SHAPE = {"format": str, "ties": str, "tiles": [{"file": str, "poses": str, "begin": int, "end": int}]}
+_LOOPS = ("ends", "loop_rotation", "loop_translation", "loop_covariance")
+
+Index = npt.NDArray[np.int64]
+
+
+class ChainPiece(NamedTuple):
+    """Odometry that goes on where the piece before ended, and the loops whose later ends are in it.
+
+    Arrays as in :class:`~graphslam.skeleton.chain_graph.ChainGraph`, but ``ends`` are numbers in the whole chain.
+    """
+
+    rotation: Array
+    translation: Array
+    covariance: Array
+    ends: Index
+    loop_rotation: Array
+    loop_translation: Array
+    loop_covariance: Array
+
+
+def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
+    """Write a chain with loops as tiles, and poses from dead reckoning to start from.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it is not there. Files that it holds already are kept.
+    pieces : iterable of ChainPiece
+        One tile each.
+
+    Raises
+    ------
+    DataError
+        A loop ends beyond the piece it stands in, or what :class:`~graphslam.skeleton.chain_graph.ChainGraph` refuses.
+    """
+    out = Path(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    sweep_parts(out)
+    R, p = np.eye(3), np.zeros(3)
+    tiles, ties, begin = [], [], 0
+    for piece in pieces:
+        n = len(piece.translation) + 1
+        end = begin + n - 1
+        # as a chain of its own, with loops between any of its poses, everything about it is looked at
+        loops = {name: np.asarray(getattr(piece, name)) for name in _LOOPS}
+        ends = loops["ends"].astype(np.int64).reshape(-1, 2)
+        if len(ends) and (ends.min() < 0 or ends.max() > end or (ends[:, 0] == ends[:, 1]).any()):
+            raise DataError("loop of a tile", got=(int(ends.min()), int(ends.max())), wanted=f"poses of 0 … {end}")
+        checked = ChainGraph(*piece[:3], np.tile([[0, 1]], (len(ends), 1)), *piece[4:])
+        loops["loop_covariance"] = np.broadcast_to(checked.loop_covariance, (len(ends), 6, 6))
+        inner = (ends >= begin).all(axis=1)
+        arrays = {name: getattr(checked, name) for name in ("rotation", "translation", "covariance")}
+        arrays |= {name: loops[name][inner] for name in _LOOPS} | {"ends": ends[inner] - begin}
+        ties.append({name: loops[name][~inner] for name in _LOOPS})
+        here = Poses(np.empty((n, 3, 3)), np.empty((n, 3)))
+        here.rotation[0], here.position[0] = R, p
+        chains.reckon(checked.rotation, checked.translation, here.rotation, here.position)
+        R, p = here.rotation[-1], here.position[-1]
+        start = put_arrays(out, {"rotation": here.rotation, "position": here.position})
+        tiles.append({"file": put_arrays(out, arrays), "poses": start, "begin": begin, "end": end})
+        begin = end
+    between = put_arrays(out, {name: np.concatenate([t[name] for t in ties]) for name in ties[0]})
+    write_json(out / _INDEX, {"format": FORMAT, "ties": between, "tiles": tiles})
+    return out
+
+
+def pieces_of(graph: ChainGraph, size: int) -> Iterator[ChainPiece]:
+    """A chain in memory, cut for :func:`chain_to_disk` into pieces of ``size`` links."""
+    if size < 1:
+        raise ConfigError(f"tiles of {size} links; wanted 1 or more")
+    last = graph.ends.max(axis=1) if len(graph.ends) else np.empty(0, np.int64)
+    for a in range(0, graph.poses - 1, size):
+        b = min(a + size, graph.poses - 1)
+        own = (last > a) & (last <= b)
+        yield ChainPiece(
+            graph.rotation[a:b],
+            graph.translation[a:b],
+            graph.covariance[a:b] if len(graph.covariance) > 1 else graph.covariance,
+            graph.ends[own],
+            graph.loop_rotation[own],
+            graph.loop_translation[own],
+            graph.loop_covariance[own] if len(graph.loop_covariance) > 1 else graph.loop_covariance,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxedTiles:
+    """A relaxed chain on disk.
+
+    Parameters
+    ----------
+    folder : path
+    names : list of str
+        Files of the poses, tile by tile.
+    objective : float
+    history : list of float
+    predicted, largest_move : float
+    converged : bool
+    separator : int
+        Poses of the separator.
+    """
+
+    folder: Path
+    names: list[str]
+    objective: float
+    history: list[float]
+    predicted: float
+    largest_move: float
+    converged: bool
+    separator: int
+
+    def poses(self, tile: int) -> Poses:
+        """Poses of one tile; its first one is the last one of the tile before."""
+        return _poses(self.folder, self.names[tile])
+
+
+def relax_tiles(
+    folder: str | Path,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    iterations: int = 30,
+    gain: float = 1e-6,
+    progress: Callable[[float], None] | None = None,
+) -> RelaxedTiles:
+    """Gauss-Newton on a chain with loops on disk, each system solved exactly.
+
+    Parameters
+    ----------
+    folder : path
+        From :func:`chain_to_disk`; poses are written beside the tiles.
+    workers : int, optional
+        Processes of a Dask cluster on this machine; default: all is done in this process, tile by tile.
+    cluster : str, optional
+        Address of a running Dask scheduler, whose workers see the same folder.
+    iterations, gain, progress
+        As in :func:`~graphslam.skeleton.chain_graph.relax_chain`.
+
+    Raises
+    ------
+    FormatError
+        A file is missing or was changed.
+    SolverError
+        The objective is not finite.
+    """
+    where = Path(folder).resolve()
+    index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
+    tiles = index["tiles"]
+    separator = _Separator(take_arrays(where, index["ties"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
+    given = {index["ties"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
+
+    with hands(workers, cluster) as run:
+
+        def step(names: list[str], x: Array | None, scale: float = 1.0) -> list[Done]:
+            rows = separator.rows
+            return run(
+                work_on_tile,
+                [
+                    (str(where), t["file"], name, stay, None if x is None else x[a:b], scale)
+                    for t, name, stay, (a, b) in zip(tiles, names, separator.stay, rows)
+                ],
+            )
+
+        def keep(done: list[Done]) -> None:
+            """Remove what earlier steps wrote."""
+            needed = given | {d.poses for d in done}
+            for path in where.glob("*.arrays"):
+                if path.name not in needed:
+                    path.unlink(missing_ok=True)
+
+        done = step([t["poses"] for t in tiles], None)
+        left = separator.gather(where, done)
+        history, predicted, far, converged = [left.total], np.inf, np.inf, False
+        for _ in range(iterations):
+            if not np.isfinite(left.total):
+                raise SolverError("objective of the chain graph is not finite")
+            x = separator.solve(left)
+            predicted = left.gain - float(np.einsum("ij,ij->", x, left.gradient))
+            scale = 1.0
+            while True:
+                then = step([d.poses for d in done], x, scale)
+                there = separator.gather(where, then)
+                if there.total <= left.total * (1.0 + 1e-12) or scale < 1e-4:
+                    break
+                scale *= 0.5
+            if there.total > left.total * (1.0 + 1e-12):
+                break
+            done, left = then, there
+            keep(done)
+            history.append(left.total)
+            far = max(d.far for d in done)
+            if progress is not None:
+                progress(left.total)
+            if scale == 1.0 and predicted < max(gain * left.total, 1e-9):
+                converged = True
+                break
+    keep(done)
+    sweep_parts(where)
+    names = [d.poses for d in done]
+    return RelaxedTiles(where, names, left.total, history, predicted, far, converged, separator.size)
+
+
+class Done(NamedTuple):
+    """What a task hands back: names of files, and a few figures."""
+
+    poses: str
+    left: str
+    total: float
+    gain: float
+    far: float
+
+
+def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | None, scale: float) -> Done:
+    """Move the poses of a tile, and eliminate what is not of the separator.
+
+    Parameters
+    ----------
+    folder, tile, poses : str
+        Files.
+    stay : (s,)
+        Poses of the tile that are of the separator, its first and last one among them.
+    x : (s, 6), optional
+        Their steps; none: poses stay where they are.
+    scale : float
+        Share of the step that is taken.
+    """
+    where = Path(folder)
+    network = KeptNetwork(ChainGraph(**take_arrays(where, tile)), stay)
+    inner = _Inner(network, stay)
+    here, far = _poses(where, poses), 0.0
+    if x is not None:
+        joined = network.join(here)
+        full = network.follow(joined, inner.solve(inner.eliminate(joined), x))
+        here = moved(here, full, scale)
+        poses = put_arrays(where, {"rotation": here.rotation, "position": here.position})
+        far = float(np.sqrt(np.max(np.sum(full[:, 3:] ** 2, axis=1)))) * scale
+    joined = network.join(here)
+    left = inner.eliminate(joined)
+    arrays = {
+        "keys": left.keys,
+        "blocks": left.blocks,
+        "gradient": left.gradient,
+        "rotation": here.rotation[stay],
+        "position": here.position[stay],
+    }
+    return Done(poses, put_arrays(where, arrays), joined.total, joined.total - joined.energy + left.gain, far)
+
+
+def _poses(folder: Path, name: str) -> Poses:
+    arrays = take_arrays(folder, name)
+    return Poses(arrays["rotation"], arrays["position"])
+
+
+class Left(NamedTuple):
+    """What the elimination of the inner poses leaves to those that stay."""
+
+    keys: Index
+    blocks: Array
+    gradient: Array
+    gain: float
+    parts: list[tuple[Index, Index, Array]]
+    """Inner poses that hang together (numbers among the kept ones), those that stay beside them (numbers among those
+    that stay), and the inner ones' steps for unit steps of the others; for none at all in the last column."""
+
+
+class _Inner:
+    """Kept poses of a tile that are not of the separator: ends of loops inside it."""
+
+    def __init__(self, network: KeptNetwork, stay: Index) -> None:
+        K = len(network.kept)
+        self._stay = np.searchsorted(network.kept, stay)
+        self._number = np.full(K, -1, np.int64)
+        self._number[self._stay] = np.arange(len(stay))
+        i, j = np.divmod(network.keys, K)
+        inner_i, inner_j = self._number[i] < 0, self._number[j] < 0
+        both = inner_i & inner_j
+        group = connected_components(coo_array((np.ones(both.sum()), (i[both], j[both])), shape=(K, K)), False)[1]
+        self._i, self._j = i, j
+        self._outside = np.flatnonzero(~inner_i & ~inner_j)
+        inside = np.flatnonzero(inner_i | inner_j)
+        of = np.where(inner_i, group[i], group[j])[inside]
+        order = np.argsort(of, kind="stable")
+        cuts = np.flatnonzero(np.diff(of[order])) + 1
+        self._parts = [self._part(e) for e in np.split(inside[order], cuts)] if len(inside) else []
+
+    def _part(self, edges: Index) -> tuple[Index, Index, KeyframePattern, Index, Index]:
+        i, j = self._i[edges], self._j[edges]
+        inner = (self._number[i] < 0) & (self._number[j] < 0)
+        nodes = np.unique(np.concatenate([k[self._number[k] < 0] for k in (i, j)]))
+        beside = np.unique(np.concatenate([self._number[k][self._number[k] >= 0] for k in (i, j)]))
+        a, b = np.searchsorted(nodes, i[inner]), np.searchsorted(nodes, j[inner])
+        return nodes, beside, KeyframePattern(a * len(nodes) + b, len(nodes)), edges[inner], edges[~inner]
+
+    def eliminate(self, joined: Joined) -> Left:
+        """What is left for the poses that stay."""
+        s = len(self._stay)
+        numbers, blocks = [], [joined.blocks[self._outside]]
+        numbers.append(np.stack([self._number[self._i[self._outside]], self._number[self._j[self._outside]]]))
+        g, gain, parts = joined.gradient[self._stay].copy(), 0.0, []
+        for nodes, beside, pattern, inside, across in self._parts:
+            factor = pattern.factor(joined.blocks[inside])
+            c, t = len(nodes), len(beside)
+            B = np.zeros((c, 6, t + 1, 6))
+            for e in across:
+                i, j, block = self._i[e], self._j[e], joined.blocks[e]
+                if self._number[i] >= 0:
+                    i, j, block = j, i, block.T
+                B[np.searchsorted(nodes, i), :, np.searchsorted(beside, self._number[j])] += block
+            B[:, :, t, 0] = joined.gradient[nodes]
+            flat = B.reshape(6 * c, 6 * t + 6)[:, : 6 * t + 1]
+            X = np.column_stack([factor.solve(column) for column in flat.T])
+            S = flat.T @ X
+            gain += float(S[-1, -1])
+            g[beside] -= S[:-1, -1].reshape(t, 6)
+            a, b = np.triu_indices(t)
+            numbers.append(np.stack([beside[a], beside[b]]))
+            blocks.append(-S[:-1, :-1].reshape(t, 6, t, 6)[a, :, b, :])
+            parts.append((nodes, beside, -X))
+        i, j = np.concatenate(numbers, axis=1)
+        keys, place = np.unique(i * s + j, return_inverse=True)
+        out = np.zeros((len(keys), 6, 6))
+        np.add.at(out, place, np.concatenate(blocks))
+        return Left(keys, out, g, gain, parts)
+
+    def solve(self, left: Left, x: Array) -> Array:
+        """Steps of all kept poses from those ``(s, 6)`` of the ones that stay."""
+        out = np.empty((len(self._number), 6))
+        out[self._stay] = x
+        for nodes, beside, X in left.parts:
+            out[nodes] = (X[:, :-1] @ x[beside].ravel() + X[:, -1]).reshape(-1, 6)
+        return out
+
+
+class _Together(NamedTuple):
+    """The network of the separator."""
+
+    total: float
+    gain: float
+    keys: Index
+    blocks: Array
+    gradient: Array
+
+
+class _Separator:
+    """Poses that tiles share, and ends of loops between tiles."""
+
+    def __init__(self, ties: dict[str, npt.NDArray[Any]], spans: list[tuple[int, int]]) -> None:
+        ends = ties["ends"].astype(np.int64).reshape(-1, 2)
+        cuts = np.array([a for a, _ in spans] + [spans[-1][1]], dtype=np.int64)
+        nodes = np.unique(np.concatenate([cuts, ends.ravel()]))
+        if nodes[0] < cuts[0] or nodes[-1] > cuts[-1] or (np.diff(cuts) < 1).any():
+            raise FormatError("tiles of a chain that do not follow each other, or loops that end beyond them")
+        self.size = len(nodes)
+        self.rows = [tuple(np.searchsorted(nodes, [a, b]) + [0, 1]) for a, b in spans]
+        self.stay = [nodes[lo:hi] - a for (lo, hi), (a, _) in zip(self.rows, spans)]
+        self._ends = np.searchsorted(nodes, ends).astype(np.int64)
+        covariance = ties["loop_covariance"].reshape(-1, 6, 6)
+        info = inverse_covariance(covariance, "loop_covariance") if len(covariance) else covariance
+        first = np.arange(len(ends) + 1)
+        self._links = Links(self._ends, first, ties["loop_rotation"], ties["loop_translation"], covariance, info)
+        self._pattern: KeyframePattern | None = None
+
+    def gather(self, folder: Path, done: list[Done]) -> _Together:
+        """What the tiles left, and the loops between them."""
+        K = self.size
+        keys, blocks, g = [], [], np.zeros((K, 6))
+        poses = Poses(np.empty((K, 3, 3)), np.empty((K, 3)))
+        for d, (a, b) in zip(done, self.rows):
+            left = take_arrays(folder, d.left)
+            i, j = np.divmod(left["keys"].astype(np.int64), b - a)
+            keys.append((a + i) * K + a + j)
+            blocks.append(left["blocks"])
+            g[a:b] += left["gradient"]
+            poses.rotation[a:b], poses.position[a:b] = left["rotation"], left["position"]
+        own, where = block_keys(self._ends, K)
+        covariance, misfit = np.empty((len(self._ends), 6, 6)), np.empty((len(self._ends), 6))
+        total = float(kernels.join_links(self._links, poses, covariance, misfit))
+        between = np.zeros((len(own), 6, 6))
+        kernels.tie_ends(self._ends, poses.position, covariance, misfit, (where[:K], where[K:]), between, g)
+        every, place = np.unique(np.concatenate([*keys, own]), return_inverse=True)
+        out = np.zeros((len(every), 6, 6))
+        np.add.at(out, place, np.concatenate([*blocks, between]))
+        return _Together(total + sum(d.total for d in done), sum(d.gain for d in done), every, out, g)
+
+    def solve(self, left: _Together) -> Array:
+        """Steps ``(K, 6)`` of the separator."""
+        if self._pattern is None:
+            self._pattern = KeyframePattern(left.keys, self.size)
+        left.blocks[0] += HELD
+        return np.asarray(self._pattern.factor(left.blocks).solve(-left.gradient.ravel())).reshape(-1, 6)

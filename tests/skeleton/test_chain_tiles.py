@@ -1,0 +1,137 @@
+"""A chain with loops in tiles on disk is the chain in memory; and a killed worker changes no byte."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphslam.core.cluster import require_distributed
+from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
+from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, pieces_of, relax_tiles
+from graphslam.skeleton.landmark_kernels import Poses
+from tests.skeleton.test_chain_graph import drawn
+
+# inside tiles, between them, at their borders, crossed, twice, and into the same pose from both sides
+LOOPS = [(2, 95), (10, 40), (41, 44), (43, 48), (30, 31), (20, 60), (60, 90), (90, 60), (88, 5), (70, 74), (72, 77)]
+
+
+@pytest.fixture(scope="module")
+def graph() -> ChainGraph:
+    return drawn(99, LOOPS, seed=2)[0]
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("size", [1000, 50, 20, 7])
+def test_tiles_end_where_memory_does(graph: ChainGraph, tmp_path: Path, size: int) -> None:
+    found = relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, size)), gain=1e-12)
+    wanted = relax_chain(graph, gain=1e-12)
+    assert len(found.names) == -(-98 // size)
+    assert found.converged
+    np.testing.assert_allclose(found.history, wanted.history, rtol=1e-9)
+    assert found.history[-1] == found.objective
+    assert found.predicted == pytest.approx(wanted.predicted, abs=1e-8)
+    assert found.largest_move == pytest.approx(wanted.largest_move, abs=1e-8)
+    parts = [found.poses(k) for k in range(len(found.names))]
+    for a, b in pairwise(parts):  # the shared pose is the same to the byte
+        assert a.position[-1].tobytes() == b.position[0].tobytes()
+        assert a.rotation[-1].tobytes() == b.rotation[0].tobytes()
+    whole = Poses(*(np.concatenate([p[k][:-1] for p in parts] + [parts[-1][k][-1:]]) for k in range(2)))
+    np.testing.assert_allclose(whole.position, wanted.poses.position, atol=1e-8)
+    np.testing.assert_allclose(whole.rotation, wanted.poses.rotation, atol=1e-8)
+
+
+def test_each_link_may_have_its_covariance(tmp_path: Path) -> None:
+    graph, _ = drawn(30, [(1, 28), (12, 17)])
+    scale = np.linspace(0.5, 2.0, 29)[:, None, None]
+    graph = ChainGraph(
+        graph.rotation,
+        graph.translation,
+        graph.covariance * scale,
+        graph.ends,
+        graph.loop_rotation,
+        graph.loop_translation,
+        graph.loop_covariance,
+    )
+    found = relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, 8)))
+    assert found.objective == pytest.approx(relax_chain(graph).objective, rel=1e-9)
+
+
+def test_a_killed_worker_changes_no_byte(graph: ChainGraph, tmp_path: Path) -> None:
+    alone, shared = tmp_path / "alone", tmp_path / "shared"
+    for folder in (alone, shared):
+        chain_to_disk(folder, pieces_of(graph, 9))
+    assert bytes_of(alone) == bytes_of(shared)
+    wanted = relax_tiles(alone, gain=1e-12)
+    killed = []
+    with require_distributed().LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as cluster:
+
+        def kill(k: int) -> None:
+            pid = cluster.workers[k].pid
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+
+        def progress(_: float) -> None:
+            if not killed:
+                kill(0)  # before the tasks of the next step are given out …
+                threading.Timer(0.02, kill, (1,)).start()  # … and while they run
+
+        found = relax_tiles(shared, cluster=cluster.scheduler_address, gain=1e-12, progress=progress)
+    assert len(set(killed)) == 2
+    assert found.names == wanted.names
+    assert found.history == wanted.history
+    assert bytes_of(shared) == bytes_of(alone)
+
+
+def test_a_run_that_was_killed_is_repeated_without_a_changed_byte(graph: ChainGraph, tmp_path: Path) -> None:
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    for folder in (whole, stopped):
+        chain_to_disk(folder, pieces_of(graph, 25))
+
+    class Stop(Exception):
+        pass
+
+    def stop(_: float) -> None:
+        raise Stop
+
+    with pytest.raises(Stop):
+        relax_tiles(stopped, progress=stop)
+    (stopped / ".half.arrays.1-0123abcd.part").write_bytes(b"half")
+    assert relax_tiles(stopped).names == relax_tiles(whole).names
+    assert bytes_of(stopped) == bytes_of(whole)
+
+
+def test_impossible_tiles_are_refused(graph: ChainGraph, tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError):
+        relax_tiles(tmp_path)
+    with pytest.raises(ConfigError, match="one of them"):
+        relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, 50)), workers=2, cluster="127.0.0.1:1")
+    pieces = list(pieces_of(graph, 50))
+    with pytest.raises(DataError, match="poses of 0 … 50"):
+        chain_to_disk(tmp_path / "other", [ChainPiece(*pieces[0][:3], *pieces[1][3:])])
+    with pytest.raises(DataError, match="finite"):
+        chain_to_disk(tmp_path / "other", [pieces[0]._replace(translation=np.full((50, 3), np.nan))])
+    with pytest.raises(ConfigError, match="links"):
+        next(pieces_of(graph, 0))
+    for path in sorted(tmp_path.glob("*.arrays")):
+        good = path.read_bytes()
+        path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+        with pytest.raises(FormatError, match="digest"):
+            relax_tiles(tmp_path)
+        path.write_bytes(good)
+        break
+    index = tmp_path / "chain.json"
+    index.write_text(index.read_text().replace(path.name, "../" + path.name))
+    with pytest.raises(FormatError, match="name of a file"):
+        relax_tiles(tmp_path)
