@@ -206,3 +206,13 @@ def test_a_pose_that_nothing_holds_is_named(problem: SkeletonProblem) -> None:
     )
     with pytest.raises(IndeterminateError, match="pose 4"):
         relax_skeleton(alone, RelaxConfig(start="odometry", levels=Levels()))
+
+
+def test_a_chain_whose_end_is_held_by_less_than_rounding_still_starts() -> None:
+    # a metre of lateral drift behind the last fix, 1e-7 m of noise a step: shares of 1e-16 of the last pose's block
+    config = LapsConfig(poses=2400, laps=2, gps_every=40, odometry=(0.01, 1e-7), up_sigma=1.0)
+    laps = draw_laps(config, seed=1)
+    problem = laps.problem()
+    start, reckoned = chain_start(problem), problem.dead_reckoning()
+    near, off = (np.linalg.norm(p.position - laps.truth.position, axis=1).max() for p in (start, reckoned))
+    assert near <= off
