@@ -142,21 +142,27 @@ def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
     return {"seconds": time.process_time() - begin, "measurements": tiles.measurements, "peak": peak()}
 
 
-def from_tiles(poses: int, folder: str, iterations: int) -> dict[str, Any]:
+def from_tiles(poses: int, folder: str, iterations: int, start: str) -> dict[str, Any]:
     """Relax a network whose measurements stay on disk."""
     from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.preconditioner import Levels
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
+    from graphslam.skeleton.schur import moved
     from graphslam.skeleton.tile_store import Tiles
 
     for levels in (Levels(0, 20), Levels(10, 80)):
         relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels))
     world = draw_laps(LapsConfig(poses=poses))
     problem = world.problem(tiles=Tiles(folder))
-    truth = world.truth.position
+    truth, given = world.truth.position, None
+    if start == "truth":
+        drift, at = np.zeros((poses, 6)), 2 * np.pi * np.arange(poses) / poses
+        drift[:, 3:] = 0.3 * np.sin(np.outer(at, [7, 5, 3]))
+        given = moved(world.truth, drift)
+        del drift, at
     del world
     wall = time.perf_counter()
-    found = relax_skeleton(problem, RelaxConfig(split=False, soft=0, iterations=iterations))
+    found = relax_skeleton(problem, RelaxConfig(split=False, soft=0, iterations=iterations), given)
     wall = time.perf_counter() - wall
     return {
         "seconds": sum(found.seconds.values()),
@@ -465,6 +471,12 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=0, help="processes that relax a chain from disk")
     parser.add_argument("--cluster", default="", help="Dask scheduler whose workers do so")
     parser.add_argument("--steps", type=int, default=30, help="most steps of a relaxation from disk")
+    parser.add_argument(
+        "--start",
+        choices=["forward", "truth"],
+        default="forward",
+        help="of a relaxation from disk: truth is bent by 0.3 m",
+    )
     parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
@@ -473,7 +485,7 @@ def main() -> int:
             "ours": lambda: ours(int(n), int(rest[0])),
             "theirs": lambda: theirs(int(n), rest[0], rest[1], rest[2], float(rest[3])),
             "draw": lambda: draw_tiles(int(n), rest[0]),
-            "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1])),
+            "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1]), rest[2]),
             "draw_chain": lambda: draw_chain(int(n), float(rest[0]), rest[1]),
             "chain_tiles": lambda: chain_from_tiles(n, int(rest[0]), rest[1]),
             "chain": lambda: our_chain(int(n), float(rest[0]), rest[1]),
@@ -555,7 +567,7 @@ def main() -> int:
         for n in sizes:
             folder = str(Path(args.tiles) / str(n))
             drawn, why = child("draw", str(n), folder)
-            t, why = child("tiles", str(n), folder, str(args.steps)) if drawn else (None, why)
+            t, why = child("tiles", str(n), folder, str(args.steps), args.start) if drawn else (None, why)
             if drawn is None or t is None:
                 print(f"{n} poses from disk: failed: {why}")
                 failed += 1
