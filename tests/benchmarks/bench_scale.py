@@ -142,7 +142,7 @@ def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
     return {"seconds": time.process_time() - begin, "measurements": tiles.measurements, "peak": peak()}
 
 
-def from_tiles(poses: int, folder: str, iterations: int, start: str) -> dict[str, Any]:
+def from_tiles(poses: int, folder: str, iterations: int, start: str, threads: int) -> dict[str, Any]:
     """Relax a network whose measurements stay on disk."""
     from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.preconditioner import Levels
@@ -162,7 +162,7 @@ def from_tiles(poses: int, folder: str, iterations: int, start: str) -> dict[str
         del drift, at
     del world
     wall = time.perf_counter()
-    found = relax_skeleton(problem, RelaxConfig(split=False, soft=0, iterations=iterations), given)
+    found = relax_skeleton(problem, RelaxConfig(split=False, soft=0, iterations=iterations, threads=threads), given)
     wall = time.perf_counter() - wall
     return {
         "seconds": sum(found.seconds.values()),
@@ -485,7 +485,7 @@ def main() -> int:
             "ours": lambda: ours(int(n), int(rest[0])),
             "theirs": lambda: theirs(int(n), rest[0], rest[1], rest[2], float(rest[3])),
             "draw": lambda: draw_tiles(int(n), rest[0]),
-            "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1]), rest[2]),
+            "tiles": lambda: from_tiles(int(n), rest[0], int(rest[1]), rest[2], int(rest[3])),
             "draw_chain": lambda: draw_chain(int(n), float(rest[0]), rest[1]),
             "chain_tiles": lambda: chain_from_tiles(n, int(rest[0]), rest[1]),
             "chain": lambda: our_chain(int(n), float(rest[0]), rest[1]),
@@ -567,7 +567,9 @@ def main() -> int:
         for n in sizes:
             folder = str(Path(args.tiles) / str(n))
             drawn, why = child("draw", str(n), folder)
-            t, why = child("tiles", str(n), folder, str(args.steps), args.start) if drawn else (None, why)
+            t, why = (
+                child("tiles", str(n), folder, str(args.steps), args.start, str(args.threads)) if drawn else (None, why)
+            )
             if drawn is None or t is None:
                 print(f"{n} poses from disk: failed: {why}")
                 failed += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -10,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from graphslam.app.cli import app
 from graphslam.core.cluster import require_distributed
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
@@ -92,6 +95,21 @@ def test_a_killed_worker_changes_no_byte(graph: ChainGraph, tmp_path: Path) -> N
     assert found.names == wanted.names
     assert found.history == wanted.history
     assert bytes_of(shared) == bytes_of(alone)
+
+
+def test_the_command_relaxes_a_folder(graph: ChainGraph, tmp_path: Path) -> None:
+    folder = chain_to_disk(tmp_path / "tiles", pieces_of(graph, 25))
+    done = CliRunner().invoke(app, ["relax", str(folder), "--json"], catch_exceptions=False)
+    assert done.exit_code == 0
+    value = json.loads(done.stdout)
+    assert value["converged"]
+    assert value["objective"] == pytest.approx(relax_chain(graph).objective, rel=1e-9)
+    assert (value["tiles"], len(value["poses"])) == (4, 4)
+    assert all((folder / name).is_file() for name in value["poses"])
+    for options, words in ((["--workers", "0"], "at least 1 worker"), (["--cluster", "127.0.0.1:1"], "127.0.0.1:1")):
+        done = CliRunner().invoke(app, ["relax", str(folder), *options])
+        assert done.exit_code != 0
+        assert words in str(done.exception)
 
 
 def test_a_run_that_was_killed_is_repeated_without_a_changed_byte(graph: ChainGraph, tmp_path: Path) -> None:

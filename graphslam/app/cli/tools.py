@@ -1,4 +1,4 @@
-"""``graphslam solve``, ``eval``, ``doctor``."""
+"""``graphslam solve``, ``relax``, ``eval``, ``doctor``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, U
 def register(app: typer.Typer) -> None:
     """Add the verbs to the command line."""
     app.command()(solve)
+    app.command()(relax)
     app.command("eval")(evaluate)
     app.command()(doctor)
 
@@ -58,6 +59,31 @@ def solve(
         path, solver, repair=repair, create_missing=create_missing, out=out, starts=names, certificate=certify
     )
     emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
+
+
+def relax(
+    folder: Path = typer.Argument(..., help="Chain with loops in tiles: a folder that chain_to_disk wrote."),
+    workers: int | None = typer.Option(None, help="Processes that share the tiles. Default: one tile after the other."),
+    cluster: str | None = typer.Option(None, help="host:port of a Dask scheduler whose workers share the tiles."),
+    as_json: bool = JSON,
+) -> None:
+    """Relax a pose graph that is larger than memory: a chain with loops, in tiles on disk."""
+    from graphslam.skeleton.chain_tiles import relax_tiles
+
+    found = relax_tiles(folder, workers=workers, cluster=cluster)
+    value = {
+        "folder": str(folder),
+        "tiles": len(found.names),
+        "separator": found.separator,
+        "objective_initial": found.history[0],
+        "objective": found.objective,
+        "iterations": len(found.history) - 1,
+        "converged": found.converged,
+        "predicted": found.predicted,
+        "largest_move": found.largest_move,
+        "poses": found.names,
+    }
+    emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items() if k != "poses"), as_json=as_json)
 
 
 def evaluate(
