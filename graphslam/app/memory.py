@@ -8,7 +8,6 @@ figure.
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import logging
 import math
@@ -22,6 +21,7 @@ from pathlib import Path
 from types import TracebackType
 
 import graphslam
+from graphslam.core.heap import give_back
 from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.join.registry import join
@@ -97,10 +97,7 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
     submaps = read_submaps(folder)
     join(submaps[:2], method, polish=polish)  # modules and thread pools that load on first use
     gc.collect()
-    try:  # hand freed heap back, or the join would reuse it unseen
-        ctypes.CDLL(None).malloc_trim(0)
-    except (OSError, AttributeError):
-        logger.debug("no malloc_trim here")
+    give_back()  # or the join would reuse it unseen
     before = _status("VmRSS")
     try:
         Path("/proc/self/clear_refs").write_text("5")

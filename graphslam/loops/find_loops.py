@@ -159,6 +159,7 @@ class LoopSearch:
             if c.ties is not None and c.front_end:
                 go(tie_candidates(submaps, p, _believed(closer), c.ties))
                 _drop_orphans(closer)
+            measurer.forget()
         logger.info("loops: %s", closer.ledger.counts() or "no candidates")
         return closer
 

@@ -73,6 +73,10 @@ class LoopMeasurer:
         """The chain has grown; maps that are prepared stay so."""
         self.submaps, self.places = submaps, places
 
+    def forget(self) -> None:
+        """Let go of what was prepared of the maps; it is made again where it is asked for."""
+        self._maps.clear()
+
     def prepared(self, k: int) -> PreparedMap:
         """The map of submap ``k`` of the chain.
 

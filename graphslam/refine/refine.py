@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.heap import give_back
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.frontends.odometry.recorded import chain
@@ -382,6 +383,7 @@ class _Work:
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
         """Associate anew, and Gauss–Newton steps; without a σ the noise comes from the residuals."""
+        give_back()
         if passes:
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
         if again or self.surfaces is None:
@@ -435,12 +437,13 @@ class _Work:
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         information = point_information(self.found, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
         taken = np.zeros(len(guides), bool)
+        solved: Solved | None = None
         for _ in range(MOST_GATES):
-            w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
-            solved = self.step(information, [guides.terms(self.poses, w)])
-            for _ in range(2 * int(taken.any())):
+            for _ in range(1 + 2 * int(taken.any())):
+                solved = None  # see `round`
                 w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
                 solved = self.step(information, [guides.terms(self.poses, w)])
+            assert solved is not None
             fits = guides.distances(self.poses, solved, self.group.dof) < ACCEPTED
             if np.array_equal(fits, taken):
                 break

@@ -37,6 +37,7 @@ from graphslam.backend.streams import ImuPart, beacons_of, compasses_of, imus_of
 from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.findings import verdict_json
+from graphslam.core.heap import give_back
 from graphslam.core.json_file import check_json
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import level
@@ -229,6 +230,9 @@ def _made(
         raise MissingDataError("the log gave no submap", where=log.name)
     steps = front.steps(log) if settings.refine.use else None
     scans = None if steps is None else Scans.of(steps)
+    del steps
+    front.forget()
+    give_back()
     taken = take(log, drops.counts, reference_identities(log, front), noticed, scans)
     result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
     return replace(result, log=log)
@@ -356,26 +360,29 @@ def _judge(
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))
     imu_metrics(out, back.graph, drops)
-    fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     clock, graph_path = time.perf_counter(), global_map.trajectory
     fixes = None if gps is None or solution.T_gps_world is None else (split(gps, settings.gps)[0], settings.gps)
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
+    seconds_refine = time.perf_counter() - clock
+    give_back()
+    fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     ledger = back.graph.ledger
     if refined is not None:
         global_map = refined.map
         ledger, spent = refined_ledger(ledger, submaps, refined.refinement)
         refining = [*refining, *spent]
-        seconds["refine"] = time.perf_counter() - clock
+        seconds["refine"] = seconds_refine
         seconds["total"] += seconds["refine"]
         refinement_metrics(out, refined.refinement)
         if fused is not None and refined.submaps:
-            before = fused
+            unit = "m³" if fused.fused.dim == 3 else "m²"
+            out.add("map_entropy_graph", fused.fused.entropy(), f"nat {unit}")
+            out.add("map_known_volume_graph", fused.fused.known_volume(), unit)
+            # the open chain is that of the front end, whose exits the refinement replaced
+            chain = fused.open_entropy, fused.open_volume
+            fused = None  # two maps of a long run at once would take twice the memory
             fused, why_not = _fused_map(refined.submaps, map_of_frames(refined.map), settings.map, effective)
-            if fused is not None:  # the open chain is that of the front end, whose exits the refinement replaced
-                fused = replace(fused, open_entropy=before.open_entropy, open_volume=before.open_volume)
-                unit = "m³" if before.fused.dim == 3 else "m²"
-                out.add("map_entropy_graph", before.fused.entropy(), f"nat {unit}")
-                out.add("map_known_volume_graph", before.fused.known_volume(), unit)
+            fused = None if fused is None else replace(fused, open_entropy=chain[0], open_volume=chain[1])
     if fused is not None:
         for row in fused.metrics():
             out.add(*row)
