@@ -53,6 +53,9 @@ class FrontEnd(Protocol):
         """The steps that it made of the log, for a refinement by scans; None where it works on no scans."""
         return None
 
+    def forget(self) -> None:
+        """Let go of what it keeps of the last log; it is made again where it is asked for."""
+
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
         """Name of the stream of landmarks that it reads, and the observations in it; None where it tells none.
 

@@ -23,3 +23,7 @@ class StepwiseFrontEnd(FrontEnd):
             self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
         made: Steps = self._made[1]
         return made
+
+    def forget(self) -> None:
+        """Let go of the steps of the last log."""
+        self._made.clear()

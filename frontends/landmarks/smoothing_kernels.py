@@ -152,6 +152,12 @@ def _linearise(poses, landmarks, evidence, normal):
         k, j = ob_pose[o], ob_lm[o]
         observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
         n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
+        near = math.sqrt(ob[o, 2])
+        if h[0] < near:
+            # nearer than its σ a range tells no place: there the bearing's derivative by it, 1/r, has no bound
+            share = h[0] / near
+            h[5], h[6], h[7] = share * h[5], share * h[6], share * (h[7] + 1.0) - 1.0
+            h[10], h[11] = share * h[10], share * h[11]
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for r_ in range(3):
             a0, a1 = h[2 + r_] * w0, h[5 + r_] * w1

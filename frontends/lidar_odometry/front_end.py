@@ -176,6 +176,10 @@ class LidarFrontEnd(FrontEnd):
         name, clouds = self._clouds(log)
         return _steps(log, name, clouds, self._made[1], self.config)
 
+    def forget(self) -> None:
+        """Let go of the path and the scans of the last log."""
+        self._made.clear()
+
     def _clouds(self, log: SensorLog) -> tuple[str, PointClouds]:
         name = self.config.stream or log.of_type(PointClouds)
         if name is None:

@@ -71,6 +71,25 @@ def test_smoother_equals_dense_least_squares(seed, ranges_only):
     np.testing.assert_allclose(s.gaussian.covariance, G @ C[np.ix_(ix, ix)] @ G.T, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-6, 1e-3])
+def test_a_landmark_under_the_sensor_is_not_placed_by_its_bearing(off):
+    """The derivative of a bearing by the place grows without bound: the covariance became indefinite by rounding."""
+    truth, landmarks, u, k, j, z = drive(np.random.default_rng(8))
+    spot = se2_compose(truth[6], SENSOR)
+    landmarks[3] = spot[:2] + [off, 0.0]
+    exact = np.array([measure(truth[a], SENSOR, landmarks[b]) for a, b in zip(k, j)])
+    z[:, :2] = exact
+    args = (u, np.tile(Q, (len(truth), 1, 1)))
+    with_it = smooth(truth, landmarks, *args, k, j, z, SENSOR)
+    rest = (k != 6) | (j != 3)
+    without = smooth(truth, landmarks, *args, k[rest], j[rest], z[rest], SENSOR)
+    a, b = (np.sqrt(np.diag(x.gaussian.covariance)[9:11]) for x in (with_it, without))
+    assert np.all(np.linalg.eigvalsh(with_it.gaussian.covariance) > 0.0)
+    assert np.all(a <= 1.05 * b)  # each where its own optimum is
+    # one sighting has its range, and where it is nearer than that no more than as much across
+    assert np.all(a > 0.4 * np.minimum(b, R[0]))
+
+
 def test_covariance_is_confirmed_by_monte_carlo():
     nees, chi2, dof = [], [], 0
     for trial in range(300):
