@@ -123,8 +123,9 @@ class Tiles:
 
     def release(self) -> None:
         """Let go of the memory of all arrays of :meth:`room`; their numbers stay."""
-        for mapped in list(self._maps):
-            mapped.madvise(mmap.MADV_DONTNEED)
+        if hasattr(mmap, "MADV_DONTNEED"):  # elsewhere the system decides alone
+            for mapped in list(self._maps):
+                mapped.madvise(mmap.MADV_DONTNEED)
 
     def read(self, begin: int, end: int) -> tuple[Points, Labels]:
         """Points ``(m, 3)`` and landmarks ``(m,)`` of the poses ``begin … end - 1``."""

@@ -43,6 +43,32 @@ def test_a_run_in_tiles_is_the_run_in_memory(problem: SkeletonProblem, tmp_path:
         assert (a.refused, a.soft) == (b.refused, b.soft)
 
 
+def test_room_on_disk_keeps_its_numbers_and_leaves_no_file(problem: SkeletonProblem, tmp_path: Path) -> None:
+    tiled = to_disk(problem, tmp_path, 30)
+    assert tiled.tiles is not None
+    names = sorted(p.name for p in tmp_path.iterdir())
+    room = tiled.room((300_000, 3))
+    assert not room.any()
+    room[:] = np.arange(900_000.0).reshape(-1, 3)
+    before = _mapped()
+    tiled.tiles.release()
+    if before is not None:  # 7.2 MB were mapped, and are let go of
+        assert _mapped() < before - 5_000
+    np.testing.assert_array_equal(room, np.arange(900_000.0).reshape(-1, 3))
+    assert tiled.room((0, 3)).shape == (0, 3)
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    assert problem.room((4, 3)).base is None  # in memory it is an array like any other
+
+
+def _mapped() -> int | None:
+    """Mapped files of this process in memory [kB], where the system tells."""
+    status = Path("/proc/self/status")
+    found = (
+        [w.split()[1] for w in status.read_text().splitlines() if w.startswith("RssFile")] if status.exists() else []
+    )
+    return int(found[0]) if found else None
+
+
 def test_a_world_is_drawn_to_disk_as_in_memory(problem: SkeletonProblem, laps: Laps, tmp_path: Path) -> None:
     tiles = laps.to_tiles(tmp_path)
     points, landmark = tiles.read(0, problem.poses)
