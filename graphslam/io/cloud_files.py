@@ -19,7 +19,7 @@ import numpy.typing as npt
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import check_size, read_bytes, usable
-from graphslam.io.look import ending
+from graphslam.io.look import ending, plain_name
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestampoffset", "time_offset", "gps_time")
 """Names of fields with times of points, in small letters and without ``scalar_`` before them."""
@@ -29,6 +29,8 @@ _PLY_TYPES = {
     **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
 _HEADER = 1 << 16
+_PCD = rb"(#.*\n)*\s*VERSION\s"
+_KNOWN = "BIN, PLY, PCD, LAS or LAZ"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,26 +93,71 @@ def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
         return _ply(raw, str(p))
     if raw[:4] == b"LASF":
         return _las(raw, str(p))
-    if re.match(rb"(#.*\n)*\s*VERSION\s", raw[:2000]):
+    if re.match(_PCD, raw[:2000]):
         return _pcd(raw, str(p))
     if ending(p) == ".bin":
         return _bin(raw, str(p), columns)
-    raise FormatError(
-        "no cloud of a known format", where=str(p), got=repr(raw[:12]), wanted="BIN, PLY, PCD, LAS or LAZ"
-    )
+    raise FormatError("no cloud of a known format", where=str(p), got=repr(raw[:12]), wanted=_KNOWN)
 
 
-def _bin(raw: bytes, where: str, columns: int) -> Cloud:
+def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
+    """Points that a file holds by its header, and has the bytes for: without decoding it, but for compressed files.
+
+    Parameters
+    ----------
+    path : path
+    columns : int
+        As for :func:`read_cloud`.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    p = Path(path)
+    if plain_name(p) != p.name.lower():  # compressed: its size is known when it is unpacked
+        return len(read_cloud(p, columns=columns).points)
+    try:
+        size = p.stat().st_size
+        with open(p, "rb") as stream:
+            head = stream.read(_HEADER)
+    except OSError as error:
+        raise MissingDataError(f"file cannot be read ({error.strerror})", where=str(p)) from None
+    if head.startswith(b"ply"):
+        said = _ply_layout(head, str(p))
+    elif head[:4] == b"LASF":
+        return _las_count(head, size, str(p))
+    elif re.match(_PCD, head[:2000]):
+        said = _pcd_layout(head, str(p))
+    elif ending(p) == ".bin":
+        return _bin_count(size, str(p), columns)
+    else:
+        raise FormatError("no cloud of a known format", where=str(p), got=repr(head[:12]), wanted=_KNOWN)
+    if size < said.least_bytes():
+        raise FormatError(
+            "file is truncated",
+            where=str(p),
+            got=f"{size} bytes",
+            wanted=f"{said.least_bytes()} for {said.count} points",
+        )
+    return said.count
+
+
+def _bin_count(size: int, where: str, columns: int) -> int:
     if not 3 <= columns <= 32:
         raise FormatError("number of columns is impossible", where=where, got=columns, wanted="3 to 32")
-    if len(raw) % (4 * columns):
-        fits = [c for c in (3, 4, 5, 6) if len(raw) % (4 * c) == 0]
+    if size % (4 * columns):
+        fits = [c for c in (3, 4, 5, 6) if size % (4 * c) == 0]
         raise FormatError(
             f"size is no multiple of {columns} float32",
             where=where,
-            got=f"{len(raw)} bytes",
+            got=f"{size} bytes",
             wanted=f"whole points, or option columns ({' or '.join(map(str, fits)) or 'no usual number'} would fit)",
         )
+    return size // (4 * columns)
+
+
+def _bin(raw: bytes, where: str, columns: int) -> Cloud:
+    _bin_count(len(raw), where, columns)
     return clean(np.frombuffer(raw, "<f4").reshape(-1, columns)[:, :3].astype(np.float64))
 
 
@@ -125,12 +172,34 @@ def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
     return clean(xyz, times, name)
 
 
-def _ply(raw: bytes, where: str) -> Cloud:
-    end = re.search(rb"end_header[ \t]*\r?\n", raw[:_HEADER])
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the header of a file says: where its points begin, how many, and how they are written.
+
+    ``dtype`` is None for text, of whose lines ``skip`` come before the points; ``packed``: columns of compressed PCD.
+    """
+
+    begin: int
+    count: int
+    labels: list[str]
+    dtype: np.dtype[Any] | None = None
+    skip: int = 0
+    packed: list[tuple[str, str, int]] | None = None
+
+    def least_bytes(self) -> int:
+        """Bytes that a file with so many points has at least."""
+        if self.packed is not None:
+            return self.begin + 8
+        size = 2 * len(self.labels) if self.dtype is None else self.dtype.itemsize
+        return self.begin + self.count * size - (self.dtype is None)  # the last line may end without a break
+
+
+def _ply_layout(head: bytes, where: str) -> _Layout:
+    end = re.search(rb"end_header[ \t]*\r?\n", head[:_HEADER])
     if end is None:
         raise FormatError("PLY header has no end", where=where, wanted="end_header in the first 64 kB")
     form, elements = "", list[tuple[str, int, list[tuple[str, str]]]]()
-    for line in raw[: end.start()].decode("latin-1").splitlines():
+    for line in head[: end.start()].decode("latin-1").splitlines():
         words = line.split()
         try:
             if words[:1] == ["format"]:
@@ -150,21 +219,27 @@ def _ply(raw: bytes, where: str) -> Cloud:
     labels = [p for p, _ in properties]
     if n < 0 or any(k == "list" for _, k in properties) or len(set(labels)) != len(labels) or not labels:
         raise FormatError("vertices of this PLY file are not read", where=where, got=labels, wanted="plain numbers")
-    body = raw[end.end() :]
     if form == "ascii":
-        skip = sum(e[1] for e in elements[:at])
-        rows = body.splitlines()[skip : skip + n]
-        return columns_cloud(_ascii(rows, n, labels, where), where)
+        return _Layout(end.end(), n, labels, skip=sum(e[1] for e in elements[:at]))
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form)
     if order is None:
         raise FormatError("unknown form of PLY", where=where, got=form, wanted="ascii or binary")
     first = 0
     for _, count, inner in elements[:at]:
-        if any(k == "list" for _, k in inner):
+        if count < 0 or any(k == "list" for _, k in inner):
             raise FormatError("lists before the vertices are not read", where=where, wanted="vertices first")
         first += count * sum(np.dtype(k).itemsize for _, k in inner)
     dtype = np.dtype([(p, order + k) for p, k in properties])
-    return columns_cloud(_records(body[first:], n, dtype, where), where)
+    return _Layout(end.end() + first, n, labels, dtype)
+
+
+def _ply(raw: bytes, where: str) -> Cloud:
+    said = _ply_layout(raw[:_HEADER], where)
+    body = raw[said.begin :]
+    if said.dtype is None:
+        rows = body.splitlines()[said.skip : said.skip + said.count]
+        return columns_cloud(_ascii(rows, said.count, said.labels, where), where)
+    return columns_cloud(_records(body, said.count, said.dtype, where), where)
 
 
 def _ascii(rows: list[bytes], n: int, labels: list[str], where: str) -> dict[str, npt.NDArray[Any]]:
@@ -193,12 +268,12 @@ def _records(body: bytes, n: int, dtype: np.dtype[Any], where: str) -> dict[str,
     return {c: a[c] for c in dtype.names if a[c].ndim == 1}
 
 
-def _pcd(raw: bytes, where: str) -> Cloud:
-    end = re.search(rb"\bDATA\s+(\w+)[ \t]*\r?\n", raw[:_HEADER])
+def _pcd_layout(head: bytes, where: str) -> _Layout:
+    end = re.search(rb"\bDATA\s+(\w+)[ \t]*\r?\n", head[:_HEADER])
     if end is None:
         raise FormatError("PCD header has no end", where=where, wanted="DATA in the first 64 kB")
     said: dict[str, list[str]] = {}
-    for line in raw[: end.start()].decode("latin-1").splitlines():
+    for line in head[: end.start()].decode("latin-1").splitlines():
         words = line.split("#")[0].split()
         if words:
             said[words[0].upper()] = words[1:]
@@ -225,21 +300,29 @@ def _pcd(raw: bytes, where: str) -> Cloud:
     if len({c[0] for c in columns}) != len(columns):
         raise FormatError("a field stands twice", where=where, got=fields)
     dtype = np.dtype([(f, d) if c == 1 else (f, d, (c,)) for f, d, c in columns])
-    body, form = raw[end.end() :], end[1].decode().lower()
+    form = end[1].decode().lower()
     if form == "ascii":
-        labels = [f if c == 1 else f"{f}#{j}" for f, _, c in columns for j in range(c)]
-        return columns_cloud(_ascii([r for r in body.splitlines() if r.strip()][:n], n, labels, where), where)
-    if form == "binary":
-        return columns_cloud(_records(body, n, dtype, where), where)
-    if form != "binary_compressed":
+        return _Layout(end.end(), n, [f if c == 1 else f"{f}#{j}" for f, _, c in columns for j in range(c)])
+    if form not in ("binary", "binary_compressed"):
         raise FormatError("unknown form of PCD", where=where, got=form, wanted="ascii, binary or binary_compressed")
+    return _Layout(end.end(), n, fields, dtype, packed=columns if form == "binary_compressed" else None)
+
+
+def _pcd(raw: bytes, where: str) -> Cloud:
+    said = _pcd_layout(raw[:_HEADER], where)
+    body, n = raw[said.begin :], said.count
+    if said.dtype is None:
+        rows = [r for r in body.splitlines() if r.strip()][:n]
+        return columns_cloud(_ascii(rows, n, said.labels, where), where)
+    if said.packed is None:
+        return columns_cloud(_records(body, n, said.dtype, where), where)
     packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     check_size(plain, where)
-    if plain != n * dtype.itemsize or packed > len(body) - 8:
+    if plain != n * said.dtype.itemsize or packed > len(body) - 8:
         raise FormatError("file is truncated", where=where, got=f"{len(body) - 8} bytes", wanted=f"{packed} packed")
     data = lzf(body[8 : 8 + packed], plain, where)
     out, at = {}, 0
-    for f, d, c in columns:  # field after field, not point after point
+    for f, d, c in said.packed:  # field after field, not point after point
         size = np.dtype(d).itemsize * c * n
         if c == 1:
             out[f] = np.frombuffer(data, d, count=n, offset=at)
@@ -298,15 +381,9 @@ def _las(raw: bytes, where: str) -> Cloud:
             where=where,
             wanted="pip install 'graphslam-submaps[las]'",
         ) from None
-    if len(raw) < 227:
-        raise FormatError("LAS header is truncated", where=where, got=f"{len(raw)} bytes", wanted="227 or more")
-    n = max(int(np.frombuffer(raw[107:111], "<u4")[0]), _count_14(raw))
-    size = int(np.frombuffer(raw[105:107], "<u2")[0])
-    if not raw[104] & 0x80 and n * size > len(raw):  # before laspy allocates
-        raise FormatError("file is truncated", where=where, got=f"{len(raw)} bytes", wanted=f"{n} points of {size}")
-    check_size(n * 24, where)
-    if raw[104] & 0x80 and n > 40 * len(raw):
-        raise FormatError("LAZ header claims too many points", where=where, got=n, wanted=f"in {len(raw)} bytes")
+    n = _las_count(raw, len(raw), where)  # before laspy allocates
+    if raw[104] & 0x80 and n:
+        _check_chunks(raw, where)
     try:
         las = laspy.read(io.BytesIO(raw))
         xyz = np.column_stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)]).astype(np.float64)
@@ -320,6 +397,37 @@ def _las(raw: bytes, where: str) -> Cloud:
     if times is not None and (not len(times) or np.ptp(times) == 0.0):
         times = None
     return clean(xyz, times, "" if times is None else "gps_time")
+
+
+def _las_count(head: bytes, length: int, where: str) -> int:
+    if len(head) < 227:
+        raise FormatError("LAS header is truncated", where=where, got=f"{len(head)} bytes", wanted="227 or more")
+    n = max(int(np.frombuffer(head[107:111], "<u4")[0]), _count_14(head))
+    size = int(np.frombuffer(head[105:107], "<u2")[0])
+    if not head[104] & 0x80 and n * size > length:
+        raise FormatError("file is truncated", where=where, got=f"{length} bytes", wanted=f"{n} points of {size}")
+    extra = int(np.frombuffer(head[100:104], "<u4")[0])
+    if head[25] >= 4 and len(head) >= 247:
+        extra += int(np.frombuffer(head[243:247], "<u4")[0])
+    if extra * 54 > length:  # laspy reads as many as are claimed, for hours
+        raise FormatError("LAS header claims too many records", where=where, got=extra, wanted=f"in {length} bytes")
+    check_size(n * 24, where)
+    if head[104] & 0x80 and n > 40 * length:
+        raise FormatError("LAZ header claims too many points", where=where, got=n, wanted=f"in {length} bytes")
+    return n
+
+
+def _check_chunks(raw: bytes, where: str) -> None:
+    """The table of chunks of LAZ: the decoder allocates what it claims, and the process ends where that is too much."""
+    first = int(np.frombuffer(raw[96:100], "<u4")[0])
+    at = int(np.frombuffer(raw[first : first + 8].ljust(8, b"\0"), "<i8")[0])
+    if at == -1:  # written in one go: it stands in the last bytes
+        at = int(np.frombuffer(raw[-8:], "<i8")[0])
+    if not first <= at <= len(raw) - 8:
+        raise FormatError("LAZ is truncated: its table of chunks is not there", where=where, got=f"{len(raw)} bytes")
+    chunks = int(np.frombuffer(raw[at + 4 : at + 8], "<u4")[0])
+    if chunks > len(raw):
+        raise FormatError("LAZ table claims too many chunks", where=where, got=chunks, wanted=f"in {len(raw)} bytes")
 
 
 def _count_14(raw: bytes) -> int:

@@ -32,7 +32,7 @@ from graphslam.core.reading import read_text, usable
 from graphslam.core.records import Gps, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.cloud_files import Cloud, read_cloud
+from graphslam.io.cloud_files import Cloud, count_points, read_cloud
 from graphslam.io.look import Look, ending
 from graphslam.io.recognise import cloud_folder, is_kitti_poses, numbers, pose_file
 from graphslam.io.text_records import read_table
@@ -44,6 +44,8 @@ ODOMETRY_SIGMAS = (0.03, 0.005)
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _SWEEP = (0.005, 2.0)  # how long a scan lasts [s]
 _TIMED = {"none": "points without times", "constant": "times of points say nothing: as good as one time for all"}
+MOST_DECODED = 100
+"""Clouds that are decoded when a folder is opened, evenly over it."""
 _KEPT = 8  # decoded clouds that are kept
 
 
@@ -362,12 +364,20 @@ def _tum(path: Path, counter: DropCounter) -> Trajectory:
 def _good_files(
     files: list[Path], columns: int, counter: DropCounter
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Which files can be read, and which hold no point; points that were left out are counted."""
+    """Which files can be read, and which hold no point; points that were left out are counted.
+
+    All headers are read; decoded are all files of a small folder, and some of a large one: a drive is looked at in
+    seconds, and clouds are decoded when they are asked for.
+    """
     good, empty = np.ones(len(files), np.bool_), np.zeros(len(files), np.bool_)
+    decoded = {int(k) for k in np.linspace(0, len(files) - 1, min(len(files), MOST_DECODED)).round()}
     lost = zero = 0
     first: GraphSlamError | None = None
     for k, p in enumerate(files):
         try:
+            if k not in decoded:
+                empty[k] = count_points(p, columns=columns) == 0
+                continue
             c = read_cloud(p, columns=columns)
         except MissingDataError:
             raise
@@ -382,8 +392,9 @@ def _good_files(
         )
     if empty.all():
         raise DataError("all clouds are empty", where=str(files[0].parent), got=f"{lost} points not finite")
-    counter.drop("clouds", "point not finite", lost)
-    counter.drop("clouds", "point at the origin (no return)", zero)
+    some = "" if len(decoded) == len(files) else f", in {len(decoded)} clouds that were looked at"
+    counter.drop("clouds", f"point not finite{some}", lost)
+    counter.drop("clouds", f"point at the origin (no return){some}", zero)
     return good, empty
 
 

@@ -7,7 +7,9 @@ last. Nothing heavy is imported here.
 from __future__ import annotations
 
 import json
+import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,15 +44,14 @@ def rows_of(look: Look, path: Path, most: int = 20) -> list[list[float]]:
 def is_tum(look: Look, path: Path) -> bool:
     """Rows of stamp, position and a unit quaternion?"""
     rows = rows_of(look, path)
-    return bool(rows) and all(len(r) == 8 and abs(sum(q * q for q in r[4:]) - 1.0) < 0.05 for r in rows)
+    return bool(rows) and all(len(r) == 8 and abs(math.hypot(*r[4:]) - 1.0) < 0.025 for r in rows)
 
 
 def is_kitti_poses(look: Look, path: Path) -> bool:
     """Rows of a 3×4 matrix with a rotation in it?"""
     rows = rows_of(look, path)
     return bool(rows) and all(
-        len(r) == 12 and all(abs(r[a] ** 2 + r[a + 1] ** 2 + r[a + 2] ** 2 - 1.0) < 0.05 for a in (0, 4, 8))
-        for r in rows
+        len(r) == 12 and all(abs(math.hypot(*r[a : a + 3]) - 1.0) < 0.025 for a in (0, 4, 8)) for r in rows
     )
 
 
@@ -262,6 +263,13 @@ def _clouds(look: Look) -> Claim | None:
         return Claim(f"{said}, a surface", "scans, one file each")
     if len(found) == 1:
         return Claim(said, "a folder with one cloud a scan, in the order of their names: one cloud is no log")
+    folders = Counter(p.parent for p in look.by_ending[e])
+    alike = sorted(f for f, n in folders.items() if 2 * n >= len(found))
+    if len(alike) > 1:
+        names = ", ".join(look.relative(f) for f in alike[:4])
+        return Claim(
+            f"folders of {e[1:].upper()} clouds: {len(alike)}", f"one of them, for they are no one log: {names}"
+        )
     poses = pose_file(look)
     return Claim(f"{said}, poses in {look.relative(poses)}" if poses else f"{said}, no poses")
 

@@ -54,12 +54,16 @@ from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.frontends.odometry.lasting import LEAST
+from graphslam.io.bags import read_bag
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
+from graphslam.io.catalog import load
+from graphslam.io.cloud_logs import read_clouds, read_kitti
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
 from graphslam.io.joined_map import read_joined, write_joined
 from graphslam.io.kitti_gps import read_kitti_gps
+from graphslam.io.landmark_tables import read_landmark_tables
 from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.io.log_folder import read_log_mesh, write_log_folder
 from graphslam.io.log_store import load_log, save_log
@@ -71,7 +75,7 @@ from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.io.smartloc import read_smartloc
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tuc import read_tuc
-from graphslam.io.tum import read_tum, write_tum
+from graphslam.io.tum import read_tum, read_tum_log, write_tum
 from graphslam.io.victoria_park import read_victoria_park
 from graphslam.io.victoria_park_published import (
     read_slsjf_network,
@@ -80,6 +84,8 @@ from graphslam.io.victoria_park_published import (
 )
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
+from tests.io import small_sources as small
+from tests.io.bag_worlds import Messages, write_mcap, write_ros1, write_ros2
 
 
 @dataclass(frozen=True)
@@ -648,6 +654,55 @@ def mesh(root: Path) -> None:
     write_mesh(root / "mesh.ply", rng().normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]]))
 
 
+def clouds_of(ending: str, table: str) -> Callable[[Path], None]:
+    """A folder of a few clouds of one format."""
+
+    def make(root: Path) -> None:
+        small.cloud_folder(root, ending, table=table, n=5, spacing=1.0)
+
+    return make
+
+
+def with_points(read: Callable[[Path], SensorLog]) -> Callable[[Path], Any]:
+    """A log, and all its points and their times."""
+
+    def used(root: Path) -> Any:
+        log = read(root)
+        clouds = [s for s in log.streams.values() if isinstance(s, PointClouds)]
+        return log, [(s.cloud(k), s.ages(k)) for s in clouds for k in range(len(s))]
+
+    return used
+
+
+def bag(form: str) -> Callable[[Path], None]:
+    """Laser or clouds, odometry, IMU, fixes and transforms."""
+
+    def make(root: Path) -> None:
+        m = Messages(ros1=form == "ros1")
+        place = np.array([0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+        pairs = [("base_link", f, place) for f in ("lidar", "laser", "imu")]
+        messages = [("/tf_static", "tf2_msgs/msg/TFMessage", small.T0, m.transforms(small.T0, pairs))]
+        for k, (t, pose) in enumerate(zip(small.stamps(6), small.poses(6))):
+            messages += [
+                ("/odom", "nav_msgs/msg/Odometry", t, m.odometry(t, pose)),
+                ("/imu", "sensor_msgs/msg/Imu", t, m.imu(t, [0, 0, 0.2], [0, 0, 9.8])),
+                ("/fix", "sensor_msgs/msg/NavSatFix", t, m.fix(t, (50 + 1e-5 * k, 8.0, 100.0))),
+            ]
+            if form == "ros2":
+                messages.append(("/scan", "sensor_msgs/msg/LaserScan", t, m.scan(t, np.full(20, 3.0), -1.0, 0.1)))
+            else:
+                xyz = rng().uniform(-9, 9, (30, 3))
+                messages.append(("/points", "sensor_msgs/msg/PointCloud2", t, m.cloud(t, xyz, frame="lidar")))
+        write = {"ros1": write_ros1, "ros2": write_ros2, "mcap": write_mcap}[form]
+        write(root / {"ros1": "a.bag", "ros2": "a", "mcap": "a.mcap"}[form], messages)
+
+    return make
+
+
+def csv_tables(root: Path) -> None:
+    small.tables(root, seconds=12.0)
+
+
 NO_FIGURE = frozenset({"value", "metrics", "gates"})  # a metric or a figure of a loop may be no number, which is said
 LOOPS = frozenset(
     {"score", "gain", "chi2", "weight", "effect", "effect_predicted", "effect_earlier", "fitness", "support"}
@@ -691,4 +746,21 @@ READERS: dict[str, Reader] = {
     "octomap-bt": Reader(octomap("bt"), read_octree("bt")),
     "octomap-ot": Reader(octomap("ot"), read_octree("ot")),
     "mesh": Reader(mesh, lambda p: read_mesh(p / "mesh.ply")),
+    "tum-log": Reader(tum, read_tum_log),
+    "carmen-robotlaser": Reader(lambda p: small.carmen(p / "a.log", mixed=True) and None, read_carmen, RANGES),
+    "carmen-rawlaser": Reader(lambda p: small.carmen(p / "a.log", "RAWLASER1") and None, read_carmen, RANGES),
+    "euroc-folder": Reader(lambda p: small.euroc(p) and None, read_euroc),
+    "landmark-tables": Reader(csv_tables, read_landmark_tables, RANGES),
+    "clouds-bin": Reader(clouds_of("bin", "tum"), with_points(read_clouds)),
+    "clouds-ply": Reader(clouds_of("ply-times", "kitti"), with_points(read_clouds)),
+    "clouds-ply-text": Reader(clouds_of("ply-ascii", ""), with_points(read_clouds)),
+    "clouds-pcd": Reader(clouds_of("pcd-lzf", ""), with_points(read_clouds)),
+    "clouds-las": Reader(clouds_of("las", ""), with_points(read_clouds), slow=3),
+    "clouds-laz": Reader(clouds_of("laz", ""), with_points(read_clouds), slow=3),
+    "kitti-odometry": Reader(lambda p: small.kitti_odometry(p, 5) and None, with_points(read_kitti)),
+    "kitti-raw": Reader(lambda p: small.kitti_raw(p, 5) and None, with_points(read_kitti)),
+    "bag-ros1": Reader(bag("ros1"), with_points(read_bag), RANGES, slow=3),
+    "bag-ros2": Reader(bag("ros2"), with_points(read_bag), RANGES, slow=3),
+    "bag-mcap": Reader(bag("mcap"), with_points(read_bag), RANGES, slow=3),
+    "recognised": Reader(clouds_of("bin", "tum"), with_points(lambda p: load(p))),
 }
