@@ -1,0 +1,1 @@
+"""Where a vehicle can drive: obstacles, edges, holes and free ground, with probabilities."""

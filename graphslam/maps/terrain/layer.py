@@ -1,0 +1,261 @@
+"""The terrain of a run as pieces that move with the nodes of the graph: after a loop closure no scan is read again.
+
+What was seen while a node was the last one is summed up in that node's level frame (place and yaw), in the cells of
+each range band. A world cell takes what the piece says of the cell that its middle lies in; all sums are of whole
+numbers. So a map whose pieces were moved one by one is, bit for bit, the map that is made anew at the same poses.
+
+Statements are relative to the ground of their own line and do not feel a change of tilt; how far nodes were tilted
+since their pieces were made is told by :meth:`TerrainLayer.most_tilt`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import DataError, GridError
+from graphslam.core.geometry import Array
+from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT
+from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
+from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
+from graphslam.maps.terrain.tables import Tables
+from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
+
+PieceId: TypeAlias = Hashable
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TerrainPiece:
+    """What lines said of the cells around a node.
+
+    Parameters
+    ----------
+    cells : (n, 3) int64
+        Band, ix, iy in the node's level frame, sorted, each once.
+    ratios : (2, n) int32
+    counts : (4, n) int32
+    heights : (3, n) int64
+        Heights above the node; see :func:`~graphslam.maps.terrain.line_kernels.add_rows`.
+    pose : (7,)
+        Of the node when the piece was made.
+    """
+
+    cells: Ints
+    ratios: npt.NDArray[np.int32]
+    counts: npt.NDArray[np.int32]
+    heights: Ints
+    pose: Array
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+
+def piece_of(rows: Rows, tables: Tables, pose: Array) -> TerrainPiece:
+    """Sum up statements ``(k, 6)`` that were made in the level frame of a node."""
+    keys = rows[:, 1:4].astype(np.int64)
+    cells, back = np.unique(keys, axis=0, return_inverse=True)
+    back = back.ravel()
+    n = len(cells)
+    ratios, counts, heights = np.zeros((2, n), np.int32), np.zeros((4, n), np.int32), np.zeros((3, n), np.int64)
+    channel, value = rows[:, 4], rows[:, 5]
+    bins = tables.ratios.shape[2]
+    for k in range(4):
+        mine = channel == k
+        np.add.at(counts[k], back[mine], 1)
+        if k < 2:
+            np.add.at(ratios[k], back[mine], tables.ratios[k, rows[mine, 1], np.minimum(value[mine], bins - 1)])
+    ground, rough = channel == 4, channel == 5
+    np.add.at(heights[0], back[ground], 1)
+    np.add.at(heights[1], back[ground], value[ground])
+    np.add.at(heights[2], back[rough], value[rough])
+    return TerrainPiece(cells, ratios, counts, heights, np.asarray(pose, dtype=np.float64))
+
+
+class TerrainLayer:
+    """Pieces at poses, and the map that they make.
+
+    Parameters
+    ----------
+    tables : Tables
+    vehicle : Vehicle
+    sensor : LineSensor
+    cells : tuple of float, optional
+        Widths of the cells of the bands [m].
+    """
+
+    def __init__(self, tables: Tables, vehicle: Vehicle, sensor: LineSensor, cells: tuple[float, ...] = CELLS) -> None:
+        self.tables, self.vehicle, self.sensor, self.cells = tables, vehicle, sensor, cells
+        self.pieces: dict[PieceId, TerrainPiece] = {}
+        self.poses: dict[PieceId, Array] = {}
+        self._made: Pyramid | None = None
+
+    def read(
+        self, name: PieceId, lines: Iterable[ScanLines], pose: Array, config: DetectorConfig | None = None
+    ) -> TerrainPiece:
+        """Make the piece of a node of lines in the world frame, the node at ``pose`` ``(7,)``.
+
+        Raises
+        ------
+        DataError
+            The piece is there already.
+        """
+        if name in self.pieces:
+            raise DataError(f"the terrain of node {name!r} is there already")
+        edges = self.sensor.band_edges(self.cells)
+        parts: list[Rows] = [np.zeros((0, 6), np.int32)]
+        for of in lines:
+            parts += list(observe(_in_frame(of, pose), edges, np.array(self.cells), self.vehicle, config))
+        piece = piece_of(np.concatenate(parts), self.tables, pose)
+        self.pieces[name], self.poses[name] = piece, piece.pose
+        self._made = None
+        return piece
+
+    def move(self, poses: Mapping[PieceId, Array]) -> int:
+        """Put pieces at other poses ``(7,)``; number of those that moved.
+
+        Only what the moved ones say is taken out of the map and put in at its new place.
+
+        Raises
+        ------
+        DataError
+            A node without a piece.
+        """
+        strange = [name for name in poses if name not in self.pieces]
+        if strange:
+            raise DataError("no terrain was read at this node", got=strange[0])
+        moved = {
+            n: np.asarray(T, dtype=np.float64)
+            for n, T in poses.items()
+            if _placed(np.asarray(T, dtype=np.float64)) != _placed(self.poses[n])
+        }
+        made = self._made
+        if made is not None and not _inside(self._box(moved), made):
+            made = self._made = None
+        for name, T in moved.items():
+            if made is not None:
+                _add(made, self.pieces[name], self.poses[name], -1)
+                _add(made, self.pieces[name], T, 1)
+            self.poses[name] = T
+        return len(moved)
+
+    def most_tilt(self) -> float:
+        """Largest change of roll and pitch of a node since its piece was made [rad]."""
+        tilts = [
+            math.acos(float(np.clip(_up(self.poses[n]) @ _up(piece.pose), -1.0, 1.0)))
+            for n, piece in self.pieces.items()
+        ]
+        return max(tilts, default=0.0)
+
+    def pyramid(self) -> Pyramid:
+        """All pieces at their poses.
+
+        Raises
+        ------
+        GridError
+            No piece says anything, or they lie too far apart.
+        """
+        if self._made is None:
+            box = self._box({})
+            if box is None:
+                raise GridError("a map of the terrain without any piece that says something")
+            margin = 4.0  # a loop moves pieces by some metres: no new box each time
+            grown = (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
+            self._made = Pyramid(grown, self.tables, self.vehicle, self.sensor, self.cells)
+            for name, piece in self.pieces.items():
+                _add(self._made, piece, self.poses[name], 1)
+        return self._made
+
+    def classify(self, threshold: float | None = None) -> TerrainMap:
+        """See :meth:`Pyramid.classify`."""
+        return self.pyramid().classify(threshold)
+
+    def _box(self, moved: Mapping[PieceId, Array]) -> Box | None:
+        boxes = []
+        for name, piece in self.pieces.items():
+            if len(piece):
+                low, high = _extent(piece, self.cells, moved.get(name, self.poses[name]))
+                boxes.append((*low, *high))
+        if not boxes:
+            return None
+        b = np.array(boxes)
+        return (*(float(v) for v in b[:, :2].min(axis=0)), *(float(v) for v in b[:, 2:].max(axis=0)))  # type: ignore[return-value]
+
+
+def _placed(T: Array) -> tuple[float, float, float, int]:
+    """Place, yaw, and height in whole millimetres: what a piece is put by."""
+    return (float(T[0]), float(T[1]), _yaw(T), round(1000.0 * float(T[2])))
+
+
+def _yaw(T: Array) -> float:
+    x = se3.quat_rotate(T[None, 3:], np.array([[1.0, 0.0, 0.0]]))[0]
+    return math.atan2(x[1], x[0])
+
+
+def _up(T: Array) -> Array:
+    return np.asarray(se3.quat_rotate(T[None, 3:], np.array([[0.0, 0.0, 1.0]]))[0])
+
+
+def _in_frame(lines: ScanLines, pose: Array) -> ScanLines:
+    """Lines in the level frame of a node."""
+    c, s = math.cos(_yaw(pose)), math.sin(_yaw(pose))
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return ScanLines((lines.points - pose[:3]) @ R, (lines.origins - pose[:3]) @ R, lines.feet - pose[2])
+
+
+def _extent(piece: TerrainPiece, cells: tuple[float, ...], T: Array) -> tuple[Array, Array]:
+    """Lower left and upper right corner of a piece in the world [m]."""
+    width = np.asarray(cells)[piece.cells[:, 0]][:, None]
+    low, high = (piece.cells[:, 1:] * width).min(axis=0), ((piece.cells[:, 1:] + 1) * width).max(axis=0)
+    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    c, s = math.cos(_yaw(T)), math.sin(_yaw(T))
+    at = corners @ np.array([[c, s], [-s, c]]) + T[:2]
+    return at.min(axis=0), at.max(axis=0)
+
+
+def _inside(box: Box | None, made: Pyramid) -> bool:
+    if box is None:
+        return True
+    low = made.first[0] * made.cells[0]
+    high = low + made.shapes[0][::-1] * made.cells[0]
+    return bool(np.all(np.asarray(box[:2]) >= low) and np.all(np.asarray(box[2:]) <= high))
+
+
+def _add(made: Pyramid, piece: TerrainPiece, T: Array, sign: int) -> None:
+    """Add a piece at a pose, or take it away."""
+    yaw, height = _yaw(T), round(1000.0 * float(T[2]))
+    c, s = math.cos(yaw), math.sin(yaw)
+    for b, width in enumerate(made.cells.tolist()):
+        mine = np.flatnonzero(piece.cells[:, 0] == b)
+        if not len(mine):
+            continue
+        own = piece.cells[mine, 1:]
+        first = own.min(axis=0)
+        shape = own.max(axis=0) - first + 1
+        table = np.full((shape[1], shape[0]), -1, np.int64)
+        table[own[:, 1] - first[1], own[:, 0] - first[0]] = mine
+        part = replace(piece, cells=piece.cells[mine])
+        low, high = _extent(part, tuple(made.cells.tolist()), T)
+        ix0, iy0 = np.maximum(np.floor(low / width).astype(np.int64), made.first[b])
+        ix1, iy1 = np.minimum(np.floor(high / width).astype(np.int64) + 1, made.first[b] + made.shapes[b][::-1])
+        x, y = np.meshgrid(width * (np.arange(ix0, ix1) + 0.5) - T[0], width * (np.arange(iy0, iy1) + 0.5) - T[1])
+        jx = np.floor((c * x + s * y) / width).astype(np.int64) - first[0]
+        jy = np.floor((-s * x + c * y) / width).astype(np.int64) - first[1]
+        inside = (jx >= 0) & (jy >= 0) & (jx < shape[0]) & (jy < shape[1])
+        taken = np.where(inside, table[np.clip(jy, 0, shape[1] - 1), np.clip(jx, 0, shape[0] - 1)], -1)
+        iy, ix = np.nonzero(taken >= 0)
+        source = taken[iy, ix]
+        cell = made.offsets[b] + (iy + iy0 - made.first[b, 1]) * made.shapes[b, 1] + (ix + ix0 - made.first[b, 0])
+        made.ratios[:, cell] += sign * piece.ratios[:, source]
+        made.counts[:, cell] += sign * piece.counts[:, source]
+        made.heights[:, cell] += sign * piece.heights[:, source]
+        hung = piece.counts[OVERHANG, source] > 0
+        made.votes[0, cell] += sign * hung
+        made.votes[1, cell] += sign * (~hung & (piece.counts[SUPPORT, source] > 0))
+        made.heights[1, cell] += sign * height * piece.heights[0, source]

@@ -1,0 +1,85 @@
+"""Learns the tables of the terrain from statements whose cells are known to be hazards or free."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.maps.terrain.lines import Rows
+from graphslam.maps.terrain.tables import BINS, SCALE, noisy_or
+
+Ints = npt.NDArray[np.int64]
+_CLIP = 4.0
+_LEAST = 20
+
+
+def count_values(rows: Rows, labels: npt.NDArray[np.int8], bands: int) -> Ints:
+    """Histograms ``(2, 2, bands, 48)`` of a channel's values: of free cells, and of hazards.
+
+    Parameters
+    ----------
+    rows : (k, 6)
+        Statements.
+    labels : (2, k)
+        For steps and for support, of the cell of each statement: 0 free, 1 a hazard, −1 neither.
+    bands : int
+    """
+    out = np.zeros((2, 2, bands, BINS), np.int64)
+    for channel in (0, 1):
+        for hazard in (0, 1):
+            mine = rows[(rows[:, 4] == channel) & (labels[channel] == hazard)]
+            np.add.at(out[channel, hazard], (mine[:, 1], np.minimum(mine[:, 5], BINS - 1)), 1)
+    return out
+
+
+def ratios_of(histograms: Ints) -> npt.NDArray[np.int32]:
+    """Log-likelihood ratios ``(2, bands, 48)`` [1/256] of histograms: smoothed, at most ±4, 0 where none was seen."""
+    h = histograms.astype(np.float64)
+    # a triangle over neighbouring bins, so that a sparse bin does not stand alone
+    wide = np.pad(h, ((0, 0), (0, 0), (0, 0), (1, 1)), mode="edge")
+    h = 0.25 * wide[..., :-2] + 0.5 * wide[..., 1:-1] + 0.25 * wide[..., 2:]
+    share = (h + 0.5) / (h.sum(axis=-1, keepdims=True) + 0.5 * BINS)
+    ratio = np.clip(np.log(share[:, 1]) - np.log(share[:, 0]), -_CLIP, _CLIP)
+    return np.round(SCALE * np.where(h.sum(axis=1) >= 1.0, ratio, 0.0)).astype(np.int32)
+
+
+def fit_weights(ratios: Array, counts: Array, hazard: npt.NDArray[np.bool_]) -> Array:
+    """Weights ``(7,)`` of one band by maximum likelihood.
+
+    Parameters
+    ----------
+    ratios : (2, k)
+    counts : (3, k)
+        Of cells; see :func:`~graphslam.maps.terrain.tables.hazard_factors`.
+    hazard : (k,) bool
+        The truth.
+
+    Raises
+    ------
+    DataError
+        Fewer than 20 cells of either kind.
+    """
+    if min(int(hazard.sum()), int((~hazard).sum())) < _LEAST:
+        raise DataError(
+            "too few cells to learn from",
+            got=f"{int(hazard.sum())} hazards, {int((~hazard).sum())} free",
+            wanted=f"at least {_LEAST} of each",
+        )
+
+    def weights(x: Array) -> Array:
+        return np.array([x[0], x[1], np.exp(x[2]), x[3], x[4], np.exp(x[5]), np.exp(x[6])])
+
+    def cost(x: Array) -> float:
+        p = np.clip(noisy_or(ratios, counts, weights(x)), 1e-6, 1.0 - 1e-6)
+        prior = 1e-6 * float(np.sum((x - start) ** 2))  # keeps a weight that no cell tells of where it began
+        return -float(np.mean(np.where(hazard, np.log(p), np.log1p(-p)))) + prior
+
+    start = np.array([-3.0, 0.0, 0.0, -3.0, 0.0, 0.0, 0.0])
+    # a single line that saw something hang is never certain of it
+    bounds = [(-8, -1), (-3, 3), (-4, 2), (-8, -1), (-3, 3), (-4, 2), (-4, math.log(2.0))]
+    return weights(minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10, "gtol": 1e-8}).x)

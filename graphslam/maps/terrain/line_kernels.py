@@ -1,0 +1,314 @@
+"""Compiled detectors: what one scan line says of the ground, cell by cell.
+
+A line is read from its lowest beam upwards. Each statement is one row
+``(line, band, ix, iy, channel, value)`` int32; of the channels below `GROUND`, a line makes one statement a cell, the
+largest value.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.evidence.kernels import kernel
+
+STEP, SUPPORT, OVERHANG, ABOVE, GROUND, ROUGH = 0, 1, 2, 3, 4, 5
+"""Channels: height of a step [cm], depth of missing support [cm], something at the height of the vehicle [1], something
+above its reach [1], height of the ground [mm], roughness of the ground [mm]."""
+
+
+class Lattice(NamedTuple):
+    """Cells of the bands."""
+
+    edges: Array
+    """Ranges at which the bands end ``(b,)`` [m]."""
+    cells: Array
+    """Widths of their cells ``(b,)`` [m]."""
+    nearest: float
+    """Nothing is said of what is nearer to the sensor than this [m]."""
+
+
+class Figures(NamedTuple):
+    """Settings of the detectors [m, or m per m]; see `lines.DetectorConfig`."""
+
+    smooth: float
+    window: float
+    slack: float
+    residual: float
+    residual_rate: float
+    memory: float
+    support_reach: float
+    support_slack: float
+    most_slope: float
+    clearance: float
+    height: float
+    above_limit: float
+
+
+@kernel()
+def put_row(out, key, value, where, lattice):
+    """Write a statement, or raise the value of the one that this line made of the same cell.
+
+    ``out``: rows, the slots of this line's statements, and the number of rows so far ``(1,)``; ``key``: line and
+    channel; ``where``: x, y and range from the sensor. Beyond the last band and
+    nearer than the first nothing is written.
+    """
+    rows, slots, total = out
+    x, y, r = where
+    band = 0
+    while band < lattice.edges.shape[0] and r > lattice.edges[band]:
+        band += 1
+    if r < lattice.nearest or band == lattice.edges.shape[0] or total[0] == rows.shape[0]:
+        return
+    width = lattice.cells[band]
+    ix, iy = math.floor(x / width), math.floor(y / width)
+    line, channel = key
+    count = total[0]
+    if channel < 4:
+        slot = (ix * 73856093 ^ iy * 19349663 ^ (4 * band + channel) * 83492791) % slots.shape[0]
+        while slots[slot] >= 0:
+            k = slots[slot]
+            if rows[k, 2] == ix and rows[k, 3] == iy and rows[k, 4] == channel and rows[k, 1] == band:
+                rows[k, 5] = max(rows[k, 5], value)
+                return
+            slot = (slot + 1) % slots.shape[0]
+        slots[slot] = count
+    rows[count, 0], rows[count, 1], rows[count, 2], rows[count, 3] = line, band, ix, iy
+    rows[count, 4], rows[count, 5] = channel, value
+    total[0] = count + 1
+
+
+@kernel()
+def smooth_heights(s, z, n, reach, out):
+    """``out``: mean height of each point and of those before and after it until one is ``reach`` farther or nearer.
+
+    Neighbours whose height differs by more than that are on something else: a curb stays sharp.
+    """
+    for i in range(n):
+        total, many = z[i], 1
+        for side in (-1, 1):
+            j = i + side
+            while 0 <= j < n and abs(s[j] - s[i]) <= reach and abs(z[j] - z[i]) <= reach:
+                total += z[j]
+                many += 1
+                j += side
+        out[i] = total / many
+
+
+@kernel()
+def follow_ground(s, z, n, foot, f, ground, chain):
+    """Which points ``ground (n,)`` are on the ground, 1 where it led there and 2 on another level, and what each found
+    before it: ``chain (n, 4)``.
+
+    ``chain``: place and height of the last ground point before, the slope of the ground there, and 1 where something
+    stands in between. A point is on the ground if it lies where the ground leads within ``residual + residual_rate ·
+    way``; a level that goes on for three points above (at most ``clearance``) or six below becomes the ground.
+    """
+    last_s, last_z, slope = 0.0, foot, 0.0
+    from_s, from_z = 0.0, foot  # of the slope: half a metre back
+    first = 0  # of the ground points that the slope may be taken from
+    run, side, blocked = 0, 0, 0.0
+    for i in range(n):
+        chain[i, 0], chain[i, 1], chain[i, 2], chain[i, 3] = last_s, last_z, slope, blocked
+        ground[i] = 0
+        way = s[i] - last_s
+        off = z[i] - (last_z + slope * way)
+        if way > -0.05 and abs(off) < f.residual + f.residual_rate * max(way, 0.0) and way < 2.0 * f.memory:
+            accept = 1
+            run = 0
+        else:
+            accept = 0
+            now = 1 if off > 0.0 else -1
+            level = False
+            if i > 0 and not ground[i - 1] and side == now:
+                ahead = s[i] - s[i - 1]
+                level = ahead > 0.0 and abs(z[i] - z[i - 1]) < 0.02 + 0.3 * ahead
+            run = run + 1 if level else 1
+            side = now
+            if off > f.clearance:
+                blocked = 1.0
+                run = 0
+            elif (now > 0 and run >= 3) or (now < 0 and run >= 6):
+                accept = 2
+        if accept == 0:
+            continue
+        if accept == 2:
+            for j in range(i - run + 1, i):
+                ground[j] = 2
+            first = i - run + 1
+            from_s, from_z, slope = s[first], z[first], 0.0
+            run = 0
+        ground[i] = accept
+        if accept == 1 and abs(way) < 0.03:
+            continue  # the foot of a wall is not climbed point by point
+        last_s, last_z, blocked = s[i], z[i], 0.0
+        while first < i and (not ground[first] or s[i] - s[first] >= 0.5):
+            if ground[first] and s[i] - s[first] >= 0.5:
+                from_s, from_z = s[first], z[first]
+            first += 1
+        if last_s - from_s >= 0.3:
+            slope = min(max((last_z - from_z) / (last_s - from_s), -f.most_slope), f.most_slope)
+
+
+@kernel()
+def heights_above(s, z, n, ground, reach, out):
+    """``out``: height of each point above the nearest ground point of the line; NaN where none is within ``reach``."""
+    for i in range(n):
+        best, height = reach, 0.0 if ground[i] else np.nan
+        if not ground[i]:
+            for j in range(n):
+                if ground[j] and abs(s[j] - s[i]) <= best:
+                    best = abs(s[j] - s[i])
+                    height = z[i] - z[j]
+        out[i] = height
+
+
+@kernel()
+def observe_line(line, points, origin, foot, lattice, f, out):
+    """Statements of one line; ``out``: see `put_row`."""
+    m = points.shape[0]
+    p, s = np.empty((m, 3)), np.empty(m)
+    n = 0
+    for i in range(m):
+        if not math.isnan(points[i, 0]):
+            r = math.hypot(points[i, 0] - origin[0], points[i, 1] - origin[1])
+            if r > 0.2:
+                p[n], s[n] = points[i], r
+                n += 1
+    z, height = np.empty(m), np.empty(m)
+    ground, chain = np.zeros(m, np.int8), np.empty((m, 4))
+    smooth_heights(s, p[:, 2], n, f.smooth, z)
+    follow_ground(s, z, n, foot, f, ground, chain)
+    heights_above(s, z, n, ground, f.memory, height)
+    out[1][:] = -1
+    for i in range(n):
+        where = (p[i, 0], p[i, 1], s[i])
+        if ground[i]:
+            put_row(out, (line, SUPPORT), 0, where, lattice)
+            put_row(out, (line, GROUND), round(1000.0 * z[i]), where, lattice)
+            if 0 < i < n - 1 and ground[i - 1] and ground[i + 1] and s[i + 1] - s[i - 1] < 2.0 * f.window:
+                share = (s[i] - s[i - 1]) / max(s[i + 1] - s[i - 1], 1e-6)
+                bend = p[i, 2] - (1.0 - share) * p[i - 1, 2] - share * p[i + 1, 2]
+                put_row(out, (line, ROUGH), round(1000.0 * abs(bend)), where, lattice)
+        elif height[i] > f.clearance:
+            channel = OVERHANG if height[i] <= f.height else ABOVE
+            if height[i] <= f.above_limit:
+                put_row(out, (line, channel), 1, where, lattice)
+        # missing support: the beam went below the ground before it came back
+        last_s, last_z, slope, blocked = chain[i]
+        slope = min(slope, 0.0)  # behind the top of a ramp the ground is level
+        fall = (p[i, 2] - origin[2]) / s[i]
+        if ground[i] != 1 and fall < slope - 1e-6 and blocked == 0.0:
+            pierced = (last_z - slope * last_s - origin[2]) / (fall - slope)
+            if pierced > 0.0 and s[i] > pierced + 0.1 and pierced - last_s < f.memory:
+                end, at = min(s[i], pierced + f.support_reach), pierced
+                while at <= end:
+                    band = 0
+                    while band < lattice.edges.shape[0] - 1 and at > lattice.edges[band]:
+                        band += 1
+                    depth = (slope - fall) * (at - pierced) - f.support_slack * (at - pierced)
+                    share = at / s[i]
+                    x = origin[0] + share * (p[i, 0] - origin[0])
+                    y = origin[1] + share * (p[i, 1] - origin[1])
+                    value = min(max(round(100.0 * depth), 0), 1000)
+                    put_row(out, (line, SUPPORT), value, (x, y, at), lattice)
+                    at += 0.5 * lattice.cells[band]
+    book_steps(line, (p, s, z, height, n), lattice, f, out)
+
+
+@kernel()
+def book_steps(line, profile, lattice, f, out):
+    """Steps between points of a profile ``(points, ranges, heights, heights above the ground, number)``.
+
+    Of every point: the largest rise or fall to a later one within ``window``, less what a slope that may be driven
+    gives (``slack`` per metre), booked where the line is steepest between the two; and its rise to the next point,
+    booked at itself, so that every cell that a point lies in hears something.
+    """
+    p, s, z, height, n = profile
+    for i in range(n):
+        if not (height[i] <= f.clearance):
+            continue
+        best, at, end = -1.0, i, i
+        before = i
+        own = 0.0
+        for j in range(i + 1, n):
+            if not (height[j] <= f.clearance):
+                continue
+            ahead, rise = abs(s[j] - s[i]), abs(z[j] - z[i])
+            if ahead > f.window:
+                if before == i:  # neighbours that are farther apart: the middle between them
+                    value = max(round(100.0 * (rise - f.slack * ahead)), 0)
+                    where = (0.5 * (p[i, 0] + p[j, 0]), 0.5 * (p[i, 1] + p[j, 1]), 0.5 * (s[i] + s[j]))
+                    if ahead < 2.0:
+                        put_row(out, (line, STEP), value, where, lattice)
+                break
+            value = rise - f.slack * ahead
+            if before == i:
+                own = value
+            if value > best:
+                best, end = value, j
+            before = j
+        if end > i:
+            steepest = -1.0
+            before = i
+            for j in range(i + 1, end + 1):
+                if not (height[j] <= f.clearance):
+                    continue
+                rise = abs(z[j] - z[before]) - f.slack * abs(s[j] - s[before])
+                if rise > steepest:
+                    steepest, at = rise, j
+                before = j
+            before = at - 1
+            while before > i and not (height[before] <= f.clearance):
+                before -= 1
+            where = (0.5 * (p[at, 0] + p[before, 0]), 0.5 * (p[at, 1] + p[before, 1]), 0.5 * (s[at] + s[before]))
+            put_row(out, (line, STEP), max(round(100.0 * best), 0), where, lattice)
+        where = (p[i, 0], p[i, 1], s[i])
+        put_row(out, (line, STEP), max(round(100.0 * own), 0), where, lattice)
+
+
+@kernel()
+def observe_lines(points, origins, feet, lattice, figures, rows, counts):
+    """Statements of all lines ``points (n, m, 3)`` (NaN: no return), lowest beam first; number of rows written.
+
+    ``counts (n,)``: rows after each line. Writing stops where ``rows`` is full.
+    """
+    total = np.zeros(1, np.int64)
+    out = (rows, np.empty(32 * points.shape[1] + 1024, np.int64), total)
+    for k in range(points.shape[0]):
+        observe_line(k, points[k], origins[k], feet[k], lattice, figures, out)
+        counts[k] = total[0]
+    return total[0]
+
+
+@kernel()
+def add_rows(rows, first, shapes, offsets, tables, llr, counts, ground):
+    """Add statements to cells; number of those outside the box.
+
+    ``first (b, 2)``: ix and iy of the first cell of every band; ``shapes (b, 2)``: ny and nx; ``offsets (b,)`` into the
+    flat cells. ``tables (2, b, bins)`` int32; ``llr (2, c)`` int32: sums of the table; ``counts (4, c)`` int32:
+    statements of `STEP`, `SUPPORT`, `OVERHANG`, `ABOVE`; ``ground (3, c)`` int64: number and sum of heights [mm], sum
+    of roughness [mm].
+    """
+    outside = 0
+    bins = tables.shape[2]
+    for k in range(rows.shape[0]):
+        b, channel, value = rows[k, 1], rows[k, 4], rows[k, 5]
+        ix, iy = rows[k, 2] - first[b, 0], rows[k, 3] - first[b, 1]
+        if ix < 0 or iy < 0 or ix >= shapes[b, 1] or iy >= shapes[b, 0]:
+            outside += 1
+            continue
+        cell = offsets[b] + iy * shapes[b, 1] + ix
+        if channel < 4:
+            counts[channel, cell] += 1
+            if channel < 2:
+                llr[channel, cell] += tables[channel, b, min(value, bins - 1)]
+        elif channel == 4:
+            ground[0, cell] += 1
+            ground[1, cell] += value
+        else:
+            ground[2, cell] += value
+    return outside

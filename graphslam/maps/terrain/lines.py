@@ -1,0 +1,231 @@
+"""Scan lines: beams in one upright plane, from the lowest up, and what they say of the ground.
+
+The detectors look along each line by itself. What two points of one line differ by does not feel an error of the pose
+that both share, so a map is not spoilt by the pose noise between lines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, DataError, GeometryError
+from graphslam.core.geometry import Array
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.trajectory import Trajectory
+from graphslam.maps.terrain.line_kernels import Figures, Lattice, observe_lines
+from graphslam.maps.terrain.vehicle import Vehicle
+
+Rows = npt.NDArray[np.int32]
+_LINES_AT_ONCE = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorConfig:
+    """How lines are read. Lengths in metres."""
+
+    smooth: float = 0.05
+    """Heights are means over neighbours within this: of close beams, the ranges are noisier than the ground."""
+    nearest: float = 0.8
+    """Nothing is said of ground nearer than this: seen from straight above, heights are as noisy as ranges."""
+    window: float = 0.3
+    """Points within this of each other make a step, or neighbouring ones that are farther apart."""
+    residual: float = 0.06
+    """A point so near to where the ground leads is on the ground …"""
+    residual_rate: float = 0.08
+    """… and so much more per metre since the last one."""
+    memory: float = 2.0
+    """The ground is not led on farther than this."""
+    support_reach: float = 2.5
+    """Cells so far behind the place where a beam went below the ground are said to lack support."""
+    support_slack: float = 0.1
+    """Depth per metre that is not counted as missing."""
+    above_limit: float = 6.0
+    """What is higher above the ground than this is not booked."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+                raise ConfigError(f"terrain: {f.name} = {value}; wanted a number above 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanLines:
+    """Lines of points in a level frame (z up).
+
+    Parameters
+    ----------
+    points : (n, m, 3)
+        Lowest beam of each line first; NaN: no return [m].
+    origins : (n, 3)
+        Of the sensor [m].
+    feet : (n,)
+        Height of the ground under the sensor [m].
+
+    Raises
+    ------
+    GeometryError, DataError
+    """
+
+    points: Array
+    origins: Array
+    feet: Array
+
+    def __post_init__(self) -> None:
+        points = np.ascontiguousarray(self.points, dtype=np.float64)
+        if points.ndim != 3 or points.shape[2] != 3:
+            raise GeometryError("points of lines have the wrong shape", got=points.shape, wanted="(n, m, 3)")
+        n = len(points)
+        if np.any(np.isinf(points)):
+            raise DataError("a point of a line is infinite", wanted="finite numbers, or NaN: no return")
+        points[np.isnan(points).any(axis=2)] = np.nan
+        object.__setattr__(self, "points", points)
+        for name, shape in (("origins", (n, 3)), ("feet", (n,))):
+            a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if a.shape != shape:
+                raise GeometryError(f"{name} of lines have the wrong shape", got=a.shape, wanted=shape)
+            if not np.all(np.isfinite(a)):
+                raise DataError(f"{name} of lines are not finite", got=a[~np.isfinite(a)][0])
+            object.__setattr__(self, name, a)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: slice | npt.NDArray[np.bool_]) -> ScanLines:
+        """Some of the lines."""
+        return ScanLines(self.points[index], self.origins[index], self.feet[index])
+
+
+def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLines:
+    """The lines of a scanner that looks at an upright plane, its points where the path has them.
+
+    Parameters
+    ----------
+    scans : RangeScans
+        Of beams from the lowest to the highest, or the other way round.
+    path : Trajectory
+        ``T_world_base`` in space, z up; each beam has the pose of its own time.
+    height : float
+        Of the sensor above the ground it drives on [m].
+
+    Raises
+    ------
+    DataError
+        A path in the plane, or one that does not cover the scans.
+    """
+    if path.dim != 3:
+        raise DataError("terrain is read along a path in space", got=f"{path.dim}-D", wanted="3-D, z up")
+    n, m = scans.ranges.shape
+    times = scans.times[:, None] + scans.beam_times
+    if n and (times[0, 0] < path.times[0] or times[-1, -1] > path.times[-1]):
+        raise DataError(
+            "scans lie outside the path in time",
+            got=f"{times[0, 0]:.3f} … {times[-1, -1]:.3f} s",
+            wanted=f"{path.times[0]:.3f} … {path.times[-1]:.3f} s",
+        )
+    origin, directions = scans.head_rays()
+    sign = np.sign(np.diff(directions[..., 2], axis=1))
+    across = np.cross(directions[:, 0], directions[:, m // 2])
+    upright = np.all(sign == sign[:, :1], axis=1) & (np.abs(across[:, 2]) < 0.35 * np.linalg.norm(across, axis=1))
+    if n and np.mean(upright) < 0.5:
+        raise DataError(
+            "the beams of these scans are no upright lines",
+            got=f"{np.mean(upright):.0%} of them upright",
+            wanted="beams in an upright plane, from the lowest to the highest",
+        )
+    met = np.isfinite(scans.ranges) & (scans.ranges < scans.max_range)
+    local = origin + np.where(met, scans.ranges, np.nan).astype(np.float64)[..., None] * directions
+    begin, end = (path.interpolate(times[:, k]) for k in (0, -1))  # within a line the body moves evenly
+    share = (scans.beam_times - scans.beam_times[0]) / max(float(scans.beam_times[-1] - scans.beam_times[0]), 1e-12)
+    points, rising, origins = np.zeros((n, m, 3)), 0.0, np.zeros((n, 3))
+    for T, part in ((begin, 1.0 - share), (end, share)):
+        R = se3.quat_to_matrix(T[:, 3:])
+        points += part[:, None] * (local @ np.swapaxes(R, 1, 2) + T[:, None, :3])
+        origins += 0.5 * (np.asarray(R @ origin) + T[:, :3])
+        rising += float(np.sum(np.einsum("nj,nj->n", R[:, 2], directions[:, -1] - directions[:, 0])))
+    if rising < 0.0:
+        points = points[:, ::-1]
+    return ScanLines(points, origins, origins[:, 2] - height)
+
+
+def lines_of_clouds(points: Array, origin: Array, foot: float, *, columns: int = 900, beams: int = 64) -> ScanLines:
+    """Lines of one turn of a spinning scanner: its points by azimuth, in each column from the lowest up.
+
+    Parameters
+    ----------
+    points : (k, 3)
+        In a level frame [m].
+    origin : (3,)
+        Of the scanner [m].
+    foot : float
+        Height of the ground under it [m].
+    columns : int
+        Of a turn.
+    beams : int
+        Most points of a column; of more, the lowest ones stay.
+    """
+    d = np.asarray(points, dtype=np.float64) - origin
+    azimuth = np.floor((np.arctan2(d[:, 1], d[:, 0]) / (2.0 * np.pi) + 0.5) * columns).astype(np.int64) % columns
+    elevation = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1]))
+    order = np.lexsort((elevation, azimuth))
+    column = azimuth[order]
+    place = np.arange(len(order)) - np.searchsorted(column, column, side="left")
+    kept = place < beams
+    lines = np.full((columns, beams, 3), np.nan)
+    lines[column[kept], place[kept]] = np.asarray(points, dtype=np.float64)[order[kept]]
+    return ScanLines(lines, np.broadcast_to(origin, (columns, 3)), np.full(columns, float(foot)))
+
+
+def lines_of_turns(clouds: PointClouds, path: Trajectory, height: float, **options: int) -> Iterator[ScanLines]:
+    """Lines of every scan of a spinning scanner, posed at the stamp of each scan; see :func:`lines_of_clouds`."""
+    for k, t in enumerate(clouds.times):
+        T = path.interpolate(np.array([t]))[0]
+        points = se3.se3_transform(T[None], np.asarray(clouds.cloud(k), dtype=np.float64))
+        yield lines_of_clouds(points, T[:3], float(T[2]) - height, **options)
+
+
+def observe(
+    lines: ScanLines, edges: Array, cells: Array, vehicle: Vehicle, config: DetectorConfig | None = None
+) -> Iterator[Rows]:
+    """Statements of lines, some lines at a time; see :mod:`graphslam.maps.terrain.line_kernels`.
+
+    Parameters
+    ----------
+    lines : ScanLines
+    edges, cells : (b,)
+        Ranges at which the bands end, and widths of their cells [m].
+    vehicle : Vehicle
+        Its clearance and height tell steps, obstacles and what is above reach apart; its slope is no step.
+    config : DetectorConfig, optional
+
+    Yields
+    ------
+    (k, 6) int32
+        Line, band, ix, iy, channel, value.
+    """
+    c = config or DetectorConfig()
+    figures = Figures(
+        *(c.smooth, c.window, math.tan(vehicle.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach),
+        *(c.support_slack, math.tan(min(vehicle.max_slope + math.radians(5.0), 1.2)), vehicle.clearance),
+        *(vehicle.height, c.above_limit),
+    )
+    lattice = Lattice(np.ascontiguousarray(edges, np.float64), np.ascontiguousarray(cells, np.float64), c.nearest)
+    per_line = 8 * lines.points.shape[1] + 4 * int(lattice.edges[-1] / lattice.cells[0])
+    for k in range(0, len(lines), _LINES_AT_ONCE):
+        part = slice(k, k + _LINES_AT_ONCE)
+        points = lines.points[part]
+        rows = np.empty((per_line * len(points), 6), np.int32)
+        counts = np.empty(len(points), np.int64)
+        count = observe_lines(points, lines.origins[part], lines.feet[part], lattice, figures, rows, counts)
+        if count == len(rows):
+            raise DataError("lines say more than there is room for", got=count, wanted=f"fewer than {len(rows)} rows")
+        made = rows[:count]
+        made[:, 0] += k
+        yield made

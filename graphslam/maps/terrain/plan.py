@@ -1,0 +1,206 @@
+"""Ways over a terrain map, and its cost map as a file: the search itself is a library's."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from graphslam.core.atomic import atomic_open
+from graphslam.core.errors import ConfigError, DataError, FormatError
+from graphslam.core.geometry import Array
+from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
+from graphslam.maps.terrain.vehicle import Vehicle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostConfig:
+    """What a metre of way costs besides its length."""
+
+    hazard: float = 20.0
+    """Times the probability of a hazard."""
+    unknown: float = 3.0
+    """Where nothing is known; infinity forbids it."""
+    provisional: float = 0.2
+    """Where a hole is not yet excluded."""
+    margin: float = 0.3
+    """Cost falls off over this distance from where the vehicle just fits [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("hazard", "unknown", "provisional", "margin"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"cost of terrain: {name} = {getattr(self, name)}; wanted ≥ 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostMap:
+    """Cost of a metre of way at every cell; infinite where the vehicle's middle may not be.
+
+    Parameters
+    ----------
+    origin : (2,)
+        Lower left corner [m].
+    cell : float
+        [m]
+    cost : (ny, nx)
+    lethal : (ny, nx) bool
+        Hazards themselves.
+    known : (ny, nx) bool
+    """
+
+    origin: Array
+    cell: float
+    cost: Array
+    lethal: npt.NDArray[np.bool_]
+    known: npt.NDArray[np.bool_]
+
+    def index(self, point: Array) -> tuple[int, int]:
+        """Row and column of the cell of a point ``(2,)``.
+
+        Raises
+        ------
+        DataError
+            Outside the map.
+        """
+        ix, iy = (math.floor(v) for v in (np.asarray(point, dtype=np.float64) - self.origin) / self.cell)
+        ny, nx = self.cost.shape
+        if not (0 <= ix < nx and 0 <= iy < ny):
+            raise DataError("a place lies outside the terrain map", got=np.asarray(point).tolist())
+        return iy, ix
+
+
+def cost_map(found: TerrainMap, vehicle: Vehicle, config: CostConfig | None = None) -> CostMap:
+    """Costs of a terrain map: hazards grown by half the width of the vehicle are closed."""
+    c = config or CostConfig()
+    lethal = np.isin(found.classes, [int(k) for k in HAZARDS])
+    known = found.known
+    cost = 1.0 + c.hazard * np.nan_to_num(found.probability) + c.provisional * found.provisional
+    cost = np.where(known, cost, 1.0 + c.unknown)
+    if lethal.any():
+        away = distance_transform_edt(~lethal) * found.cell - 0.5 * vehicle.width
+        if c.margin > 0:
+            cost = cost + c.hazard * 0.1 * np.clip(1.0 - away / c.margin, 0.0, 1.0)
+        cost = np.where(away < 0.0, np.inf, cost)
+    return CostMap(found.origin, found.cell, cost, lethal, known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedWay:
+    """A way ``(k, 2)`` [m] from cell to cell, what it costs, and how long it is [m]."""
+
+    points: Array
+    cost: float
+    length: float
+
+
+def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
+    """The cheapest way between two places; None where there is none.
+
+    Moves go to the eight neighbours; the cost of a move is its length times the mean cost of both cells.
+
+    Parameters
+    ----------
+    costs : CostMap
+    start, goal : (2,)
+        [m]. The start may lie in closed cells: a vehicle stands where it stands.
+
+    Raises
+    ------
+    DataError
+        A place outside the map.
+    """
+    a, b = costs.index(start), costs.index(goal)
+    ny, nx = costs.cost.shape
+    cost = costs.cost.copy()
+    cost[a] = min(cost[a], 1.0 + 1e3)
+    if not np.isfinite(cost[b]):
+        return None
+    rows, columns, weights = [], [], []
+    number = np.arange(ny * nx).reshape(ny, nx)
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        p = (slice(0, ny - dy), slice(max(-dx, 0), nx - max(dx, 0)))
+        q = (slice(dy, ny), slice(max(dx, 0), nx - max(-dx, 0)))
+        w = 0.5 * (cost[p] + cost[q]) * math.hypot(dx, dy) * costs.cell
+        open_ = np.isfinite(w)
+        rows.append(number[p][open_])
+        columns.append(number[q][open_])
+        weights.append(w[open_])
+    graph = coo_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(ny * nx, ny * nx)
+    ).tocsr()
+    first, last = int(number[a]), int(number[b])
+    distance, before = dijkstra(graph, directed=False, indices=first, return_predecessors=True)
+    if not np.isfinite(distance[last]):
+        return None
+    cells = [last]
+    while cells[-1] != first:
+        cells.append(int(before[cells[-1]]))
+    iy, ix = np.divmod(np.array(cells[::-1]), nx)
+    points = costs.origin + costs.cell * (np.column_stack([ix, iy]) + 0.5)
+    length = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return PlannedWay(points, float(distance[last]), length)
+
+
+def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "scale") -> tuple[Path, Path]:
+    """Write a cost map as ``path`` (``.yaml``) and the image beside it (``.pgm``), as nav2's map server reads them.
+
+    Parameters
+    ----------
+    costs : CostMap
+    path : path
+        Ending in ``.yaml``.
+    mode : {"scale", "raw"}
+        ``scale``: a grey a cost, which the server turns into 0 to 100; unknown cells have the grey 205, which it takes
+        for a cost of its own, because an image without transparency cannot say that nothing is known. ``raw``: the
+        bytes are the values of the server's grid, 0 to 100, and 255, unknown.
+
+    Returns
+    -------
+    (yaml, image) : paths
+
+    Raises
+    ------
+    FormatError
+        Another ending or mode.
+    """
+    target = Path(path)
+    if target.suffix != ".yaml":
+        raise FormatError("unknown ending of a cost map", where=str(path), got=target.suffix, wanted=".yaml")
+    if mode not in ("scale", "raw"):
+        raise FormatError("unknown mode of a cost map", where=str(path), got=mode, wanted="scale or raw")
+    values = occupancy_values(costs)
+    if mode == "raw":
+        pixels = np.where(values < 0, 255, values).astype(np.uint8)
+    else:
+        pixels = np.where(values < 0, 205, np.round(254.0 * (1.0 - values / 100.0))).astype(np.uint8)
+    rows = np.ascontiguousarray(pixels[::-1])  # the first row of an image is its top
+    image = target.with_suffix(".pgm")
+    with atomic_open(image) as stream:
+        stream.write(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii"))
+        stream.write(rows.tobytes())
+    x, y = (float(v) for v in costs.origin)
+    name = image.name.replace("'", "''")
+    with atomic_open(target, "w") as stream:
+        stream.write(
+            f"image: '{name}'\nmode: {mode}\nresolution: {costs.cell:.6f}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
+            "negate: 0\noccupied_thresh: 0.99\nfree_thresh: 0.01\n"
+        )
+    return target, image
+
+
+def occupancy_values(costs: CostMap) -> npt.NDArray[np.int16]:
+    """Values ``(ny, nx)`` of an occupancy grid: 100 hazards, 99 too near to one, 0 to 98 by cost, −1 unknown."""
+    finite = np.isfinite(costs.cost)
+    extra = np.where(finite, costs.cost, 1.0) - 1.0
+    values = np.clip(np.round(98.0 * extra / (extra + 5.0)), 0, 98).astype(np.int16)
+    values[~finite] = 99
+    values[costs.lethal] = 100
+    values[~costs.known & finite] = -1
+    return values

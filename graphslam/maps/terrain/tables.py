@@ -1,0 +1,160 @@
+"""What a statement is worth: log-likelihood ratios by band and channel, and how the channels make a probability.
+
+The file of a table says what it was learnt on. Tables belong to a sensor and to a vehicle: its climbable step decides
+which cells were taught as hazards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.atomic import read_json, write_json
+from graphslam.core.errors import ConfigError, FormatError
+from graphslam.core.geometry import Array
+
+FORMAT = "graphslam.terrain-tables/1"
+BINS = 48
+"""Of 1 cm; the last one holds all that is more."""
+SCALE = 256
+"""Ratios are stored as whole numbers in units of 1/256, so that sums do not depend on their order."""
+WEIGHTS = 7
+"""Of a band."""
+DEFAULT = Path(__file__).with_name("tables.json")
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tables:
+    """Learnt weights.
+
+    Parameters
+    ----------
+    ratios : (2, b, 48) int32
+        Log-likelihood ratios of a step [cm] and of missing support [cm], hazard against free, in units of 1/256.
+    weights : (b, 7)
+        Of every band ``p, a0, a1, q, b0, b1, c``; see `hazard_factors`.
+    single : (7,)
+        The same for a map of a single resolution.
+    threshold : float
+        Probability above which a cell is not driven, fixed on the drives that the tables were learnt on.
+    provenance : dict
+        What they were learnt on.
+
+    Raises
+    ------
+    ConfigError
+    """
+
+    ratios: npt.NDArray[np.int32]
+    weights: Array
+    single: Array
+    threshold: float
+    provenance: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        ratios = np.ascontiguousarray(self.ratios, dtype=np.int32)
+        weights = np.ascontiguousarray(self.weights, dtype=np.float64)
+        if ratios.ndim != 3 or ratios.shape[0] != 2 or ratios.shape[2] != BINS:
+            raise ConfigError(f"terrain tables have the shape {ratios.shape}; wanted (2, bands, {BINS})")
+        if weights.shape != (ratios.shape[1], WEIGHTS) or not np.all(np.isfinite(weights)):
+            raise ConfigError(
+                f"weights of terrain tables: shape {weights.shape}; wanted ({ratios.shape[1]}, {WEIGHTS}), finite"
+            )
+        single = np.ascontiguousarray(self.single, dtype=np.float64)
+        if single.shape != (WEIGHTS,) or not np.all(np.isfinite(single)):
+            raise ConfigError(f"weights of a single resolution: shape {single.shape}; wanted ({WEIGHTS},), finite")
+        if not 0.0 < self.threshold < 1.0:
+            raise ConfigError(f"threshold of terrain tables: {self.threshold}; wanted between 0 and 1")
+        object.__setattr__(self, "ratios", ratios)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "single", single)
+
+    @property
+    def bands(self) -> int:
+        """Number of range bands."""
+        return self.ratios.shape[1]
+
+    def write(self, path: str | Path) -> None:
+        """Write them as JSON."""
+        write_json(
+            path,
+            {
+                "format": FORMAT,
+                "provenance": self.provenance,
+                "threshold": self.threshold,
+                "step": self.ratios[0].tolist(),
+                "support": self.ratios[1].tolist(),
+                "weights": np.round(self.weights, 6).tolist(),
+                "single": np.round(self.single, 6).tolist(),
+            },
+        )
+
+
+def read_tables(path: str | Path = DEFAULT) -> Tables:
+    """Tables of a file; default those of the package, learnt for the panning line laser of the simulated streets.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+    """
+    shape = {
+        "provenance": object, "threshold": float, "step": [[int]], "support": [[int]], "weights": [(float,) * WEIGHTS],
+        "single": (float,) * WEIGHTS,
+    }  # fmt: skip
+    found = read_json(path, fmt=FORMAT, shape=shape)
+    if not isinstance(found["provenance"], dict):
+        raise FormatError("provenance is no mapping", where=str(path))
+    try:
+        ratios = np.array([found["step"], found["support"]], dtype=np.int32)
+        weights, single = np.array(found["weights"]), np.array(found["single"])
+        return Tables(ratios, weights, single, float(found["threshold"]), found["provenance"])
+    except (ValueError, OverflowError, ConfigError) as error:
+        raise FormatError(f"terrain tables that do not fit ({error})", where=str(path)) from None
+
+
+def fixed_tables(bands: int, hit: float, miss: float, *, step: int = 6, depth: int = 6) -> npt.NDArray[np.int32]:
+    """Ratios ``(2, bands, 48)`` of a plain occupancy update: ``+hit`` from a value on [cm], ``−miss`` below it."""
+    value = np.arange(BINS)
+    rows = [np.where(value >= least, hit, -miss) for least in (step, depth)]
+    return np.repeat(np.round(SCALE * np.array(rows))[:, None], bands, axis=1).astype(np.int32)
+
+
+def dampened(count: Array) -> Array:
+    """What ``count`` statements are worth, 5 at most: lines in one cell are not independent."""
+    return count / (1.0 + count / 5.0)
+
+
+def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
+    """Probabilities ``(3, ...)`` that there is no step, that no support is missing and that nothing hangs in cells.
+
+    With ``n`` statements about steps whose ratios sum to ``L``, and ``m(n) = n / (1 + n/5)``, the first one is
+    ``σ(−p − m (a0 + a1 L / n))``; the second one is ``σ(−q − m (b0 + b1 L / n))`` with the statements about support;
+    the third one is ``exp(−c n)`` with the number of lines that saw something at the height of the vehicle. Where
+    nothing was said, it is 1.
+
+    Parameters
+    ----------
+    ratios : (2, ...)
+        Sums of log-likelihood ratios of steps and of support.
+    counts : (3, ...)
+        Statements about steps, about support, and lines that saw something at the height of the vehicle.
+    weights : (7,)
+    """
+    p, a0, a1, q, b0, b1, c = weights
+    out = np.ones(counts.shape)
+    for k, (prior, shift, slope) in enumerate(((p, a0, a1), (q, b0, b1))):
+        n = counts[k].astype(np.float64)
+        x = prior + dampened(n) * (shift + slope * ratios[k] / np.maximum(n, 1.0))
+        out[k] = np.where(n > 0, 0.5 * (1.0 - np.tanh(0.5 * x)), 1.0)
+    out[2] = np.exp(-c * counts[2])
+    return out
+
+
+def noisy_or(ratios: Array, counts: Array, weights: Array) -> Array:
+    """Probability ``(...)`` of a hazard: that not all of `hazard_factors` hold."""
+    return np.asarray(1.0 - hazard_factors(ratios, counts, weights).prod(axis=0))

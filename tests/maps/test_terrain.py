@@ -1,0 +1,418 @@
+"""Terrain: detectors against their plain twins, range bands, what outvotes what, and tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryError, GridError
+from graphslam.core.geometry import Array
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.trajectory import Trajectory
+from graphslam.maps.terrain.learning import fit_weights, ratios_of
+from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
+from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
+from graphslam.maps.terrain.plan import cost_map, plan_way, save_cost_map
+from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
+from graphslam.maps.terrain.tables import BINS, Tables, dampened, fixed_tables, noisy_or, read_tables
+from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
+from graphslam.sim.street import StreetRobot, draw_street, drive_street
+from tests.reference.plain_terrain import plain_rows
+
+H = 1.1
+ELEVATION = np.deg2rad(-65.0 + 0.5 * np.arange(181))
+SENSOR, VEHICLE = LineSensor(), Vehicle()
+BOX = (-2.0, -2.0, 14.0, 2.0)
+FIXED = np.array([-3.0, 0.0, 8.0, -3.0, 0.0, 8.0, 0.7])
+DRIVEN = Tables(fixed_tables(4, 0.85, 0.4), np.array([FIXED] * 4), FIXED, 0.5, {})
+
+
+def profile_line(solids: list[tuple[float, float, float, float]], floor: list[tuple[float, float]]) -> Array:
+    """Points ``(181, 3)`` of a line along x: a floor, level from each ``(x, z)`` on, and boxes x0, x1, z0, z1."""
+    faces = []
+    for (x, z), nxt in zip(floor, [*floor[1:], (40.0, floor[-1][1])]):
+        faces.append(((x, z), (nxt[0], z)))
+        faces.append(((nxt[0], z), (nxt[0], nxt[1])))
+    for x0, x1, z0, z1 in solids:
+        ring = [(x0, z0), (x1, z0), (x1, z1), (x0, z1), (x0, z0)]
+        faces += list(pairwise(ring))
+    a, b = (np.array([face[k] for face in faces]) - [0.0, H] for k in (0, 1))
+    d = np.column_stack([np.cos(ELEVATION), np.sin(ELEVATION)])[:, None]
+
+    def cross(u: Array, v: Array) -> Array:
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    with np.errstate(divide="ignore", invalid="ignore"):  # where a beam and a face are parallel
+        t, u = cross(a, b - a) / cross(d, b - a), cross(a, d) / cross(d, b - a)
+    best = np.where((t > 0) & (u >= -1e-9) & (u <= 1 + 1e-9), t, np.inf).min(axis=1)
+    best[best >= 30.0] = np.nan
+    return np.column_stack([best * d[:, 0, 0], np.full(len(best), 0.05), H + best * d[:, 0, 1]])
+
+
+def lines_of(points: Array, feet: float = 0.0) -> ScanLines:
+    p = np.atleast_3d(points) if points.ndim == 3 else points[None]
+    return ScanLines(p, np.tile([0.0, 0.05, H], (len(p), 1)), np.full(len(p), feet))
+
+
+def said(points: Array) -> dict[int, dict[int, int]]:
+    """Channel → ix of cells of 0.1 m → value, in one band of 0.1 m up to 20 m."""
+    rows = np.concatenate(list(observe(lines_of(points), np.array([20.0]), np.array([0.1]), VEHICLE)))
+    out: dict[int, dict[int, int]] = {k: {} for k in range(4)}
+    for row in rows[rows[:, 4] < 4]:
+        out[int(row[4])][int(row[2])] = int(row[5])
+    return out
+
+
+LEVEL = [(-1.0, 0.0)]
+
+
+def test_a_curb_is_a_step_where_it_is_and_nowhere_else() -> None:
+    steps = said(profile_line([], [(-1.0, 0.0), (3.02, 0.1)]))[STEP]
+    high = [ix for ix, value in steps.items() if value >= 6]
+    assert high
+    assert all(29 <= ix <= 31 for ix in high)
+    assert max(steps.values()) in (7, 8, 9, 10)
+    assert max(said(profile_line([], LEVEL))[STEP].values()) == 0
+
+
+def test_a_hole_lacks_support_and_the_ground_before_and_behind_it_does_not() -> None:
+    found = said(profile_line([], [(-1.0, 0.0), (2.5, -0.6), (3.5, 0.0)]))
+    support = found[SUPPORT]
+    assert max(support[ix] for ix in range(27, 34)) >= 20
+    assert all(value == 0 for ix, value in support.items() if ix < 24 or ix > 37)
+    assert all(ix in support for ix in range(8, 24))
+
+
+def test_stairs_down_lack_support() -> None:
+    floor = [(-1.0, 0.0), *((2.0 + 0.28 * k, -0.17 * (k + 1)) for k in range(8))]
+    support = said(profile_line([], floor))[SUPPORT]
+    assert max(value for ix, value in support.items() if 20 <= ix <= 30) >= 15
+
+
+def test_what_an_obstacle_hides_is_unknown_not_missing() -> None:
+    found = said(profile_line([(3.0, 4.0, 0.0, 0.9)], LEVEL))
+    assert any(28 <= ix <= 31 for ix in found[OVERHANG])
+    hidden = [ix for ix in found[SUPPORT] if 41 <= ix <= 100]
+    assert not hidden
+    assert all(value == 0 for value in found[SUPPORT].values())
+
+
+@pytest.mark.parametrize(("height", "channel"), [(1.2, OVERHANG), (2.5, ABOVE)])
+def test_a_wire_is_an_obstacle_only_within_the_height_of_the_vehicle(height: float, channel: int) -> None:
+    found = said(profile_line([(3.2, 3.3, height - 0.05, height)], LEVEL))
+    other = ABOVE if channel == OVERHANG else OVERHANG
+    assert set(found[channel])
+    assert set(found[channel]) <= {31, 32, 33}
+    assert not found[other]
+    assert max(found[STEP].values()) == 0  # it is no step of the ground below it
+
+
+def test_a_legal_ramp_is_ground_and_a_steep_one_is_a_step() -> None:
+    def ramp(angle: float) -> dict[int, int]:
+        steps = [(3.0 + 0.01 * k, 0.01 * k * math.tan(math.radians(angle))) for k in range(300)]
+        return said(profile_line([], [(-1.0, 0.0), *steps]))[STEP]
+
+    assert max(ramp(10.0).values()) <= 3
+    assert max(value for ix, value in ramp(25.0).items() if ix > 32) >= 6
+
+
+def test_detectors_are_those_of_the_plain_twin() -> None:
+    rng = np.random.default_rng(5)
+    scenes = [
+        ([(4.0, 4.3, 2.3, 2.5)], LEVEL),
+        ([], [(-1.0, 0.0), (2.4, 0.15), (6.0, -0.4)]),
+        ([(3.0, 5.0, 0.0, 1.4), (2.0, 2.05, 1.2, 1.25)], [(-1.0, 0.0), (1.5, -0.5), (2.2, 0.0)]),
+        ([(1.2, 1.25, 2.4, 2.5)], [(-1.0, 0.0), *((2.0 + 0.28 * k, 0.17 * (k + 1)) for k in range(8))]),
+    ]
+    points = []
+    for solids, floor in scenes:
+        for sigma in (0.0, 0.02, 0.05):
+            line = profile_line(solids, floor)
+            line[:, 2] += sigma * rng.standard_normal(len(line))
+            line[rng.random(len(line)) < 2.0 * sigma] = np.nan
+            points.append(line)
+    lines = lines_of(np.array(points), 0.01)
+    edges, cells = SENSOR.band_edges(), np.array(CELLS)
+    made = np.concatenate(list(observe(lines, edges, cells, VEHICLE)))
+    c = DetectorConfig()
+    f = Figures(
+        c.smooth, c.window, math.tan(VEHICLE.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach,
+        c.support_slack, math.tan(VEHICLE.max_slope + math.radians(5.0)), VEHICLE.clearance, VEHICLE.height,
+        c.above_limit,
+    )  # fmt: skip
+    wanted = plain_rows(lines, edges, cells, f, c.nearest)
+    assert np.array_equal(made[np.lexsort(made.T[::-1])], wanted)
+    assert {int(k) for k in np.unique(made[:, 4])} == {0, 1, 2, 3, 4, 5}
+
+
+def row(band: int, x: float, channel: int, value: int, many: int = 1) -> Array:
+    ix = math.floor(x / CELLS[band])
+    return np.tile(np.array([0, band, ix, 0, channel, value], np.int32), (many, 1))
+
+
+def at(p: Pyramid, x: float) -> float:
+    found = p.classify()
+    return float(found.probability[math.floor((0.05 - found.origin[1]) / 0.1), math.floor((x - found.origin[0]) / 0.1)])
+
+
+@pytest.mark.parametrize("channel", [STEP, SUPPORT])
+@pytest.mark.parametrize(("near", "far"), [(0, 30), (30, 0)])
+def test_long_range_evidence_never_overrides_short_range(channel: int, near: int, far: int) -> None:
+    alone, both = (Pyramid(BOX, DRIVEN, VEHICLE, SENSOR) for _ in range(2))
+    alone.add(row(0, 2.05, channel, near))
+    both.add(row(0, 2.05, channel, near))
+    both.add(row(3, 2.05, channel, far, many=1000))
+    assert at(both, 2.05) == at(alone, 2.05)
+    assert (at(both, 2.05) > 0.5) is (near > 0)
+    assert (at(both, 2.25) > 0.5) is (far > 0)  # only the far band knows this one
+    single = Pyramid(BOX, DRIVEN, VEHICLE, SENSOR, (0.2,) * 4)
+    for made in (row(0, 2.05, channel, near), row(3, 2.05, channel, far, many=1000)):
+        made[:, 2] = 10
+        single.add(made)
+    found = single.classify()
+    k = math.floor((0.05 - found.origin[1]) / 0.2), math.floor((2.05 - found.origin[0]) / 0.2)
+    assert (found.probability[k] > 0.5) is np.bool_(far > 0)  # in a single map it does
+
+
+def test_something_hanging_is_kept_where_the_ground_below_is_known_from_near() -> None:
+    p = Pyramid(BOX, DRIVEN, VEHICLE, SENSOR)
+    p.add(row(0, 2.05, STEP, 0, many=50))
+    p.add(row(1, 2.05, OVERHANG, 1, many=5))
+    assert at(p, 2.05) > 0.9
+    p.add(row(0, 2.15, OVERHANG, 1, many=5))  # the near band says in which of the cells
+    assert at(p, 2.05) < 0.5 < at(p, 2.15)
+
+
+def test_classes() -> None:
+    p = Pyramid(BOX, DRIVEN, VEHICLE, SENSOR)
+    wall = profile_line([(5.0, 5.4, 0.0, 2.0)], [(-1.0, 0.0), (3.0, 0.12)])
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        line = wall.copy()
+        line[:, 2] += 0.003 * rng.standard_normal(len(line))
+        p.insert(lines_of(line))
+    found = p.classify()
+    iy = math.floor((0.05 - found.origin[1]) / 0.1)
+    classes = {round(x, 2): TerrainClass(k) for x, k in zip(found.centres()[0].tolist(), found.classes[iy].tolist())}
+    assert classes[2.05] is TerrainClass.FREE
+    assert classes[3.05] is TerrainClass.STEP or classes[2.95] is TerrainClass.STEP
+    assert classes[5.05] is TerrainClass.OBSTACLE
+    assert classes[7.05] is TerrainClass.UNKNOWN
+    assert abs(found.ground[iy, math.floor((4.05 - found.origin[0]) / 0.1)] - 0.12) < 0.01
+    assert found.provisional[iy, math.floor((4.55 - found.origin[0]) / 0.1)] == (SENSOR.hole_reach(VEHICLE) <= 3.55)
+
+
+def test_sums_do_not_depend_on_the_order_and_pyramids_add() -> None:
+    rng = np.random.default_rng(1)
+    places, values = rng.integers(-4, 9, (2, 500)), rng.integers(0, 60, 500)
+    rows = np.column_stack([np.zeros(500), rng.integers(0, 4, 500), *places, rng.integers(0, 6, 500), values])
+    rows = rows.astype(np.int32)
+    a, b, c = (Pyramid(BOX, DRIVEN, VEHICLE, SENSOR) for _ in range(3))
+    a.add(rows)
+    b.add(rows[200:])
+    c.add(rows[:200])
+    b.merge(c)
+    for name in ("ratios", "counts", "heights"):
+        assert np.array_equal(getattr(a, name), getattr(b, name))
+    assert a.outside == b.outside
+    with pytest.raises(GridError, match="different boxes"):
+        a.merge(Pyramid((0.0, 0.0, 3.0, 3.0), DRIVEN, VEHICLE, SENSOR))
+
+
+def test_statements_outside_the_box_are_counted() -> None:
+    p = Pyramid((0.0, 0.0, 2.0, 2.0), DRIVEN, VEHICLE, SENSOR)
+    p.add(np.concatenate([row(0, 1.05, STEP, 3), row(0, 5.05, STEP, 3)]))
+    assert p.outside == 1
+    assert p.counts[STEP].sum() == 1
+
+
+def test_bands_end_where_beams_are_a_cell_apart() -> None:
+    edges = SENSOR.band_edges()
+    assert np.allclose(edges[:3] ** 2 * SENSOR.beam_step / SENSOR.height, CELLS[:3])
+    assert edges[3] == pytest.approx(12.05, abs=0.01)
+    assert SENSOR.hole_reach(VEHICLE) == pytest.approx(4.105, abs=1e-3)
+    speed = SENSOR.speed_bound(VEHICLE)
+    assert speed * SENSOR.sweep_time + VEHICLE.braking_distance(speed) == pytest.approx(SENSOR.hole_reach(VEHICLE))
+    assert VEHICLE.braking_distance(VEHICLE.safe_speed(3.0)) == pytest.approx(3.0)
+
+
+def test_probability_is_a_noisy_or() -> None:
+    w = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.5])
+    zero = np.zeros((2, 1))
+
+    def p(ratios: Array, *counts: int) -> float:
+        return float(noisy_or(ratios, np.array(counts)[:, None], w)[0])
+
+    assert p(zero, 1, 1, 0) == pytest.approx(0.75)
+    assert p(zero, 0, 0, 0) == 0.0
+    assert p(zero - 500.0, 1, 1, 2) == pytest.approx(1.0 - math.exp(-1.0))
+    assert p(zero + [[2.0], [0.0]], 1, 0, 0) == pytest.approx(1.0 / (1.0 + math.exp(-2.0 / 1.2)))
+    assert dampened(np.array(1e6)) == pytest.approx(5.0, rel=1e-4)  # many lines count as five
+
+
+def test_weights_are_found_again() -> None:
+    rng = np.random.default_rng(2)
+    w = np.array([-2.0, 0.3, 0.8, -3.0, -0.2, 1.2, 0.6])
+    counts = np.stack([*rng.poisson(2.0, (2, 40_000)), rng.poisson(0.3, 40_000)])
+    ratios = rng.normal(0, 2, (2, 40_000)) * counts[:2]
+    hazard = rng.random(40_000) < noisy_or(ratios, counts, w)
+    assert np.allclose(fit_weights(ratios, counts, hazard), w, atol=0.25)
+    with pytest.raises(DataError, match="too few cells"):
+        fit_weights(ratios, counts, np.zeros(40_000, bool))
+
+
+def test_ratios_of_histograms() -> None:
+    h = np.zeros((2, 2, 1, BINS), np.int64)
+    h[0, 0, 0, :5], h[0, 1, 0, 10:] = 1000, 100
+    ratios = ratios_of(h) / 256
+    assert np.all(ratios[0, 0, :5] < -2.0)
+    assert np.all(ratios[0, 0, 10:] > 2.0)
+    assert np.all(ratios[1] == 0.0)
+
+
+def test_tables_of_the_package_and_their_file(tmp_path: Path) -> None:
+    tables = read_tables()
+    assert tables.bands == 4
+    assert tables.provenance["seeds"]
+    assert tables.provenance["vehicle"]["climbable_step"] == VEHICLE.climbable_step
+    tables.write(tmp_path / "t.json")
+    again = read_tables(tmp_path / "t.json")
+    assert np.array_equal(again.ratios, tables.ratios)
+    text = (tmp_path / "t.json").read_text()
+    for old, new, said_ in (
+        ('"graphslam.terrain-tables/1"', '"other/1"', "unknown format"),
+        (f'"threshold": {tables.threshold}', '"threshold": 2.0', "do not fit"),
+        ('"support"', '"supports"', "missing"),
+    ):
+        assert old in text
+        (tmp_path / "bad.json").write_text(text.replace(old, new))
+        with pytest.raises(FormatError, match=said_):
+            read_tables(tmp_path / "bad.json")
+
+
+def test_impossible_input_is_refused() -> None:
+    with pytest.raises(ConfigError, match="climbable"):
+        Vehicle(climbable_step=0.4)
+    with pytest.raises(ConfigError, match="height"):
+        LineSensor(height=0.0)
+    with pytest.raises(ConfigError, match="window"):
+        DetectorConfig(window=float("nan"))
+    with pytest.raises(GridError, match="impossible box"):
+        Pyramid((0, 0, 0, 1), DRIVEN, VEHICLE, SENSOR)
+    with pytest.raises(GridError, match="too many cells"):
+        Pyramid((0, 0, 1e4, 1e4), DRIVEN, VEHICLE, SENSOR)
+    with pytest.raises(ConfigError, match="widths"):
+        Pyramid(BOX, DRIVEN, VEHICLE, SENSOR, (0.1, 0.2))
+    with pytest.raises(GeometryError, match="wrong shape"):
+        ScanLines(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2))
+    with pytest.raises(DataError, match="infinite"):
+        ScanLines(np.full((1, 4, 3), np.inf), np.zeros((1, 3)), np.zeros(1))
+
+
+def test_lines_of_scans_follow_the_pose_of_each_beam() -> None:
+    down = np.deg2rad([10.0, -30.0])  # highest first: turned round
+    scans = RangeScans(
+        times=np.array([0.1]),
+        ranges=np.array([[2.0, 2.2]]),
+        directions=np.column_stack([np.cos(down), np.zeros(2), np.sin(down)]),
+        beam_times=np.array([0.0, 0.1]),
+        max_range=10.0,
+        sigma=0.01,
+        T_base_mount=np.array([0.0, 0, 1.1, 0, 0, 0, 1]),
+    )
+    path = Trajectory(np.array([0.0, 1.0]), np.array([[0.0, 0, 0, 0, 0, 0, 1], [1.0, 0, 0, 0, 0, 0, 1]]))
+    lines = lines_of_scans(scans, path, 1.1)
+    assert np.allclose(lines.points[0, 0], [0.2 + 2.2 * np.cos(down[1]), 0, 1.1 - 1.1])
+    assert np.allclose(lines.points[0, 1, 0], 0.1 + 2.0 * np.cos(down[0]))
+    assert lines.feet[0] == pytest.approx(0.0)
+    with pytest.raises(DataError, match="outside the path"):
+        lines_of_scans(dataclasses.replace(scans, times=np.array([0.95])), path, 1.1)
+    level = np.column_stack([np.cos(down), np.sin(down), np.zeros(2)])
+    with pytest.raises(DataError, match="no upright lines"):
+        lines_of_scans(dataclasses.replace(scans, directions=level), path, 1.1)
+
+
+def test_lines_of_a_spinning_scanner_are_its_columns() -> None:
+    azimuth = np.deg2rad(np.repeat([0.2, 90.2], 3))
+    elevation = np.deg2rad(np.tile([-5.0, -20.0, -10.0], 2))
+    r = 5.0
+    points = r * np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    lines = lines_of_clouds(points, np.zeros(3), -1.7, beams=2)
+    filled = np.flatnonzero(np.isfinite(lines.points[:, 0, 0]))
+    assert len(filled) == 2
+    assert np.allclose(lines.points[filled, :, 2], r * np.sin(np.deg2rad([[-20.0, -10.0]] * 2)))
+
+
+@pytest.mark.parametrize(
+    ("target", "kind"), [("curb-15", TerrainClass.STEP), ("hole-1.0", TerrainClass.HOLE), ("nothing", None)]
+)
+def test_what_lies_ahead_on_a_simulated_street(target: str, kind: TerrainClass | None) -> None:
+    street = draw_street(target, 3)
+    drive = drive_street(street, 3, StreetRobot(), start=6.0, until=2.5)
+    lines = lines_of_scans(drive.scans, drive.believed, drive.robot.height)
+    p = Pyramid((8.0, -3.2, 22.4, 3.2), read_tables(), VEHICLE, SENSOR)
+    assert p.insert(lines) > 1000
+    found = p.classify()
+    x, y = found.centres()
+    lane = np.abs(y) < 0.5
+    ahead = found.classes[lane][:, (x > 15.5) & (x < 17.2)]
+    before = found.classes[lane][:, (x > 12.0) & (x < 15.0)]
+    assert np.mean(before != TerrainClass.UNKNOWN) > 0.85
+    assert np.mean(before > TerrainClass.ABOVE_REACH) < 0.01
+    if kind is None:
+        assert not np.any(ahead > TerrainClass.ABOVE_REACH)
+    else:
+        assert np.mean(np.any(ahead == kind, axis=1)) > 0.9  # over its whole width
+    truth = street.labels(
+        found.origin, found.cell, found.classes.shape,
+        step=VEHICLE.climbable_step, slope=VEHICLE.max_slope, height=VEHICLE.height,
+    )  # fmt: skip
+    assert np.any(truth[lane][:, (x > 15.5) & (x < 17.2)] > 0) == (kind is not None)
+
+
+def test_ways_lead_round_hazards_and_never_through_them() -> None:
+    p = Pyramid(BOX, DRIVEN, VEHICLE, SENSOR)
+    for band in (0, 1):
+        for iy in range(-20, 20):
+            made = np.concatenate([row(band, 0.05 + 0.1 * k, STEP, 0, many=3) for k in range(60)])
+            made[:, 3] = iy
+            p.add(made)
+    wall = np.concatenate([row(0, 3.05, STEP, 30, many=20)] * 24)
+    wall[:, 3] = np.repeat(np.arange(-20, 4), 20)
+    p.add(wall)
+    costs = cost_map(p.classify(), VEHICLE)
+    way = plan_way(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
+    assert way is not None
+    off = np.hypot(way.points[:, 0] - 3.05, np.maximum(way.points[:, 1] - 0.35, 0.0))
+    assert off.min() >= 0.5 * VEHICLE.width - 0.06
+    assert way.length == pytest.approx(np.sum(np.linalg.norm(np.diff(way.points, axis=0), axis=1)))
+    assert plan_way(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
+    with pytest.raises(DataError, match="outside the terrain map"):
+        plan_way(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
+
+
+def test_cost_maps_are_files_of_a_map_server(tmp_path: Path) -> None:
+    p = Pyramid((0.0, 0.0, 1.6, 0.8), DRIVEN, VEHICLE, SENSOR)
+    p.add(np.concatenate([row(0, 0.05, STEP, 0, many=5), row(0, 1.45, STEP, 30, many=20)]))
+    costs = cost_map(p.classify(), Vehicle(width=0.1))
+    for mode in ("raw", "scale"):
+        yaml, image = save_cost_map(costs, tmp_path / f"{mode}.yaml", mode=mode)
+        data = image.read_bytes()
+        assert data.startswith(b"P5\n16 8\n255\n")
+        pixels = np.frombuffer(data[-128:], np.uint8).reshape(8, 16)[::-1]
+        assert pixels[0, 14] == (100 if mode == "raw" else 0)
+        assert pixels[5, 5] == (255 if mode == "raw" else 205)
+        assert pixels[0, 0] < 10 if mode == "raw" else pixels[0, 0] > 240
+        assert "resolution: 0.100000" in yaml.read_text()
+        assert f"mode: {mode}" in yaml.read_text()
+    with pytest.raises(FormatError, match="mode"):
+        save_cost_map(costs, tmp_path / "x.yaml", mode="trinary")
+    with pytest.raises(FormatError, match="ending"):
+        save_cost_map(costs, tmp_path / "x.pgm")
