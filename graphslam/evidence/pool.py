@@ -98,6 +98,11 @@ class GridPool:
             self._scratches.append(Scratch())
         return self._scratches[thread]
 
+    def release_scratch(self) -> None:
+        """Let go of the scratch memory of updates, some 20 MB; it is made again where a grid is written to."""
+        with self.lock:
+            self._scratches.clear()
+
     # --- room ------------------------------------------------------------------------------------------------
 
     def reserve(self, nodes: int, bricks: int) -> None:

@@ -197,6 +197,11 @@ class FusedMap:
         twin._uncounted, twin._empty = list(self._uncounted), self._empty
         return twin
 
+    def release_scratch(self) -> None:
+        """Let go of what only the making of the map needed; the next change makes it again."""
+        for poser in self._posers:
+            poser.release()
+
     # --- changing --------------------------------------------------------------------------------------------
 
     def add(self, pieces: Mapping[PieceId, Piece], poses: Mapping[PieceId, Any]) -> Change:

@@ -59,6 +59,10 @@ class Poser:
 
     def __init__(self, voxel_size: float, dim: int, half: int) -> None:
         self.voxel_size, self.dim, self.half = voxel_size, dim, half
+        self.release()
+
+    def release(self) -> None:
+        """Let go of the scratch memory; it is made again when it is needed."""
         self._entries = np.empty(0, np.uint32)
         self._sources = np.empty(0, np.uint32)
         self._sums = np.empty((0, BRICK_VOXELS), np.int16)

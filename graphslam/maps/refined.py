@@ -177,6 +177,7 @@ def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> Evid
         points, origins, returns = scans.scan(k)
         if len(points):
             drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
+    drawn.pool.release_scratch()
     return drawn
 
 

@@ -200,6 +200,7 @@ def make_run_map(
     open_entropy, open_volume = fused.entropy(), fused.known_volume()
     begin = time.perf_counter()
     fused.move(solved_poses(divided, nodes))
+    fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
     knows_space = all(view_of(s).knows_space for s in submaps)

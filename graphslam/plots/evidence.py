@@ -81,6 +81,10 @@ def plot_section(
     return ax
 
 
+BLOCK = 4096
+"""Bricks that are looked at together: their heights in double precision take eight times their own memory."""
+
+
 def plot_heights(
     grid: EvidenceGrid, ax: Axes | None = None, *, below: float | None = None, title: str | None = None
 ) -> Axes:
@@ -103,18 +107,20 @@ def plot_heights(
     size = grid.voxel_size
     top = np.full((shape[1], shape[0]), -np.inf)
     known = np.zeros((shape[1], shape[0]), bool)
-    coordinates, values = grid.brick_coordinates(), grid.brick_values().reshape(-1, 8, 8, 8)
-    occupied = (values >= grid.model.threshold_step) & (values != UNKNOWN)
-    z = (BRICK_EDGE * coordinates[:, 2, None] + np.arange(BRICK_EDGE) + 0.5) * size  # (n, 8)
-    if below is not None:
-        occupied &= (z <= below)[:, :, None, None]
-    heights = np.where(occupied, z[:, :, None, None], -np.inf).max(axis=1)  # (n, 8 y, 8 x)
-    seen = (values != UNKNOWN).any(axis=1)
-    for (bx, by, _), h, s in zip(coordinates, heights, seen):
-        i, j = BRICK_EDGE * by - first[1], BRICK_EDGE * bx - first[0]
-        block = (slice(i, i + BRICK_EDGE), slice(j, j + BRICK_EDGE))
-        top[block] = np.maximum(top[block], h)
-        known[block] |= s
+    every, bricks = grid.brick_coordinates(), grid.brick_values().reshape(-1, 8, 8, 8)
+    for part in range(0, len(every), BLOCK):
+        coordinates, values = every[part : part + BLOCK], bricks[part : part + BLOCK]
+        occupied = (values >= grid.model.threshold_step) & (values != UNKNOWN)
+        z = (BRICK_EDGE * coordinates[:, 2, None] + np.arange(BRICK_EDGE) + 0.5) * size  # (n, 8)
+        if below is not None:
+            occupied &= (z <= below)[:, :, None, None]
+        heights = np.where(occupied, z[:, :, None, None], -np.inf).max(axis=1)  # (n, 8 y, 8 x)
+        seen = (values != UNKNOWN).any(axis=1)
+        for (bx, by, _), h, s in zip(coordinates, heights, seen):
+            i, j = BRICK_EDGE * by - first[1], BRICK_EDGE * bx - first[0]
+            block = (slice(i, i + BRICK_EDGE), slice(j, j + BRICK_EDGE))
+            top[block] = np.maximum(top[block], h)
+            known[block] |= s
     extent = (first[0] * size, last[0] * size, first[1] * size, last[1] * size)
     if known.any():
         ax.imshow(np.where(known, 0.88, np.nan), cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent)

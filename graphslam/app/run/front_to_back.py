@@ -17,6 +17,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
+from graphslam.evidence.grid import EvidenceGrid
 from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
@@ -93,6 +94,8 @@ def front_to_back(
         front_s += spent
         if submap is None:
             break
+        if isinstance(submap.grid, EvidenceGrid):
+            submap.grid.pool.release_scratch()
         if store is not None:
             store.append(submap)
         back.add(submap)
