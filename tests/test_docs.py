@@ -44,6 +44,7 @@ PAGES = [
     "skeleton.md",
     "steps.md",
     "without-truth.md",
+    "your-log.md",
 ]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 every_page = pytest.mark.parametrize("name", PAGES)

@@ -65,7 +65,9 @@ class Estimate:
 
     @property
     def contradiction(self) -> bool:
-        """Is it too large for an error of a sensor that works?"""
+        """Is it too large for an error of a sensor that works, and told exactly enough to say so?"""
+        if self.name.endswith("_scale") and self.sigma > VAGUE:
+            return False
         return abs(self.value) - SURE * self.sigma > LARGEST.get(self.name, math.inf)
 
     def gated(self) -> Estimate:

@@ -150,3 +150,5 @@ def test_a_scale_that_is_hardly_told_is_left() -> None:
     assert sure.gated().applied
     assert not vague.gated().applied
     assert "20 %" in vague.gated().why_not
+    assert not vague.contradiction
+    assert dataclasses.replace(vague, sigma=0.02).contradiction
