@@ -9,6 +9,7 @@ import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
 from graphslam.app.cli.terminal import emit, table
+from graphslam.core.errors import ConfigError
 
 CANDIDATES = (
     *("verdict", "choice", "support", "withdrawn", "submaps", "matches", "loops", "objective", "chi2", "dof"),
@@ -37,7 +38,15 @@ def make_map(
         "the clearest map and the others are kept in the same way.",
     ),
     log: str | None = typer.Option(
-        None, help="With --hypotheses: card or folder of the log of the run, if it was moved."
+        None, help="With --hypotheses, --terrain: card or folder of the log of the run, if it was moved."
+    ),
+    terrain: bool = typer.Option(
+        False,
+        "--terrain",
+        help="Only the terrain: where a vehicle can drive. The log of the run is read once more along its solved path.",
+    ),
+    sensor_height: float | None = typer.Option(
+        None, help="With --terrain: height of the scanner above the ground [m]. Default: found from the ground itself."
     ),
     low: float | None = typer.Option(
         None, help="Lower bound of the floor plans above the path [m]. Default: that of the run."
@@ -51,6 +60,11 @@ def make_map(
     """Make the fused map of a run again from its folder, with other choices if asked."""
     from graphslam.app.run.remake_map import remake_map
 
+    if terrain:
+        if grid or minimum_entropy or hypotheses:
+            raise ConfigError("--terrain makes the terrain alone: leave --grid, --minimum-entropy and --hypotheses out")
+        _make_terrain(run, log, sensor_height, as_json)
+        return
     made = remake_map(
         run, grid=grid, minimum_entropy=minimum_entropy, hypotheses=hypotheses, log=log, low=low, high=high,
         progress=not as_json,
@@ -78,3 +92,14 @@ def make_map(
     value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
     text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; figures: {', '.join(p.name for p in made.figures)}"
     emit(value, text, as_json=as_json)
+
+
+def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_json: bool) -> None:
+    from graphslam.app.run.remake_map import remake_terrain
+
+    found, files, figures = remake_terrain(run, log=log, sensor_height=sensor_height, progress=not as_json)
+    facts = found.facts()
+    rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
+    rows += [{"what": f"cells {k}", "value": v} for k, v in facts["cells"].items()]
+    facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
+    emit(facts, f"{table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json)

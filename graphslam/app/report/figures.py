@@ -24,6 +24,8 @@ CAPTIONS = {
     "fused.png": "Fused evidence grid at the solved poses",
     "fused_above.png": "Fused evidence grid from above",
     "fused_cut.png": "Fused evidence grid, cut from the side",
+    "terrain.png": "Terrain: what a vehicle can drive over, and what it cannot",
+    "terrain_plain.png": "Terrain: free, hazard, unknown",
     "gps_residuals.png": "Distances to the GPS fixes",
     "gps_innovations.png": "Withheld GPS fixes against their prediction",
     "loops.png": "Loops of landmark submaps against each other",

@@ -13,6 +13,7 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.run.run import Run
+from graphslam.app.run.terrain import RunTerrain, draw_terrain, terrain_of_run, write_terrain
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
@@ -20,6 +21,7 @@ from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
+from graphslam.maps.terrain.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,46 @@ def remake_map(
             report_beside(new)  # the page of the run shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
+
+
+def remake_terrain(
+    folder: str | Path,
+    *,
+    log: str | Path | SensorLog | None = None,
+    vehicle: Vehicle | None = None,
+    sensor_height: float | None = None,
+    progress: bool = True,
+) -> tuple[RunTerrain, list[Path], list[Path]]:
+    """Find where a vehicle can drive, and write it with its pictures and the page of the run.
+
+    Parameters
+    ----------
+    folder : path
+        Of a finished run in space.
+    log, vehicle, sensor_height, progress
+        See :func:`graphslam.app.run.terrain.terrain_of_run`.
+
+    Returns
+    -------
+    RunTerrain, files, figures
+
+    Raises
+    ------
+    RunFolderError, MissingDataError, FormatError, DataError
+    """
+    home = Path(folder)
+    if not (outputs(home) / "run.json").is_file():
+        open_run(home)  # says what is wrong
+    with locked(home):
+        run = open_run(home)
+        made = terrain_of_run(run, log=log, vehicle=vehicle, sensor_height=sensor_height, progress=progress)
+        with new_generation(home) as new:
+            files = write_terrain(new, made, generation=run.report.get("generation"))
+            figures = draw_terrain(made, new.figures, name=run.name)
+            new.adopt(drop=["terrain*", "figures/terrain*.png"])
+            report_beside(new)
+    files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
+    return made, files, figures
 
 
 def map_of_folder(path: str | Path, *, low: float | None = None, high: float | None = None) -> tuple[Run, RunMap]:

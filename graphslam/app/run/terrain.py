@@ -1,0 +1,311 @@
+"""The terrain of a finished run: its log is read once more along the solved path."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.files import read_options
+from graphslam.app.run.run import Run
+from graphslam.app.run.source import load_log_source
+from graphslam.core import se3
+from graphslam.core.atomic import write_npz
+from graphslam.core.errors import DataError, MissingDataError, RunFolderError
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.log_digest import log_digest
+from graphslam.maps.terrain.ground import GroundPlane, common_up, ground_plane, heights_along, level_rotation
+from graphslam.maps.terrain.layer import TerrainLayer
+from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
+from graphslam.maps.terrain.plan import cost_map, save_cost_map
+from graphslam.maps.terrain.pyramid import TerrainClass, TerrainMap
+from graphslam.maps.terrain.tables import Tables, read_tables
+from graphslam.maps.terrain.vehicle import LineSensor, Vehicle
+
+FORMAT = "graphslam.terrain/1"
+Ints = npt.NDArray[np.int64]
+_EVERY_POINT = 7
+"""Of which one is enough to find the ground."""
+
+
+@dataclass(frozen=True)
+class RunTerrain:
+    """What was found.
+
+    Parameters
+    ----------
+    layer : TerrainLayer
+        A piece for each node of the graph, in the level frame.
+    map : TerrainMap
+    rotation : (3, 3)
+        From the frame of the run to the level one.
+    path : (n, 3)
+        Places of the nodes in the level frame [m].
+    missing : int
+        Scans in which no ground was found: the height of their neighbours was taken.
+    read_s, seconds : float
+        CPU time to read the lines into pieces, and to make the map of the pieces.
+    scans, lines : int
+    stream : str
+    """
+
+    layer: TerrainLayer
+    map: TerrainMap
+    rotation: Array
+    path: Array
+    missing: int
+    read_s: float
+    seconds: float
+    scans: int
+    lines: int
+    stream: str
+
+    def facts(self) -> dict[str, Any]:
+        """What ``terrain.json`` holds."""
+        sensor, vehicle, tables = self.layer.sensor, self.layer.vehicle, self.layer.tables
+        cells = {k.name.lower(): int(np.count_nonzero(self.map.classes == k)) for k in TerrainClass}
+        return {
+            "format": FORMAT,
+            "stream": self.stream,
+            "scans": self.scans,
+            "lines": self.lines,
+            "scans_without_ground": self.missing,
+            "pieces": len(self.layer.pieces),
+            "rotation_level_run": self.rotation.tolist(),
+            "sensor": {**asdict(sensor), "band_edges": sensor.band_edges().tolist()},
+            "vehicle": asdict(vehicle),
+            "threshold": tables.threshold,
+            "tables": {k: tables.provenance.get(k) for k in ("made_by", "laser", "seeds")},
+            "cell": self.map.cell,
+            "cells": cells,
+            "holes_are_seen_up_to": sensor.hole_reach(vehicle),
+            "speed_bound": sensor.speed_bound(vehicle),
+            "read_s": self.read_s,
+            "map_s": self.seconds,
+        }
+
+
+def terrain_of_run(
+    run: Run,
+    *,
+    log: str | Path | SensorLog | None = None,
+    stream: str | None = None,
+    vehicle: Vehicle | None = None,
+    sensor_height: float | None = None,
+    tables: Tables | None = None,
+    progress: bool = True,
+) -> RunTerrain:
+    """Read the log of a run once more, along its solved path.
+
+    Parameters
+    ----------
+    run : Run
+        With a folder, in space.
+    log : card name, folder, or SensorLog; optional
+        Where the run's log is by now; default where it was.
+    stream : str, optional
+        Of point clouds or of an upright line laser; default the first of point clouds, else of lines.
+    vehicle : Vehicle, optional
+    sensor_height : float, optional
+        Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
+        is taken to drive on the ground.
+    tables : Tables, optional
+        Default those of the package.
+    progress : bool
+
+    Raises
+    ------
+    RunFolderError, MissingDataError
+        No folder, no such log or stream.
+    DataError
+        Another log, a run in the plane, or no ground in the scans.
+    """
+    if run.folder is None:
+        raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
+    if run.map.dim != 3:
+        raise DataError("terrain is read along a path in space", got="a run in the plane", wanted="a run in space")
+    said = read_options(run.folder)["run"]
+    source = load_log_source(said["source"] if log is None else log)
+    digest = log_digest(source)
+    if said.get("log", digest) != digest:
+        raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
+    name = stream or source.of_type(PointClouds) or source.of_type(RangeScans)
+    scans = source.streams.get(name) if name else None
+    if name is None or not isinstance(scans, PointClouds | RangeScans):
+        raise MissingDataError(
+            "no scans to read terrain from", where=source.name, got=stream or "no such stream",
+            wanted="a stream of point clouds, or of lines in space",
+        )  # fmt: skip
+    return read_terrain(
+        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
+        stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
+    )  # fmt: skip
+
+
+def read_terrain(
+    scans: PointClouds | RangeScans,
+    path: Trajectory,
+    node_times: Array,
+    node_poses: Array,
+    *,
+    stream: str = "scans",
+    vehicle: Vehicle | None = None,
+    sensor_height: float | None = None,
+    tables: Tables | None = None,
+    progress: bool = True,
+) -> RunTerrain:
+    """Terrain of scans along a path, a piece for each node.
+
+    Parameters
+    ----------
+    scans : PointClouds or RangeScans
+    path : Trajectory
+        ``T_world_base`` in space; the z axis of the world points upwards within 20°.
+    node_times, node_poses : (k,), (k, 7)
+        In time order; a scan goes with the last node before it.
+    stream, vehicle, sensor_height, tables, progress
+        See :func:`terrain_of_run`.
+
+    Raises
+    ------
+    DataError
+        No scan within the path, no ground in the scans, or lines that are not upright.
+    """
+    chosen = vehicle or Vehicle()
+    inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
+    if isinstance(scans, RangeScans):  # beams are read after the stamp of their line
+        inside &= scans.times + scans.beam_times.max() <= path.times[-1]
+    at: Ints = np.flatnonzero(inside).astype(np.int64)
+    if not len(at):
+        raise DataError("no scan lies within the solved path in time", where=stream)
+    used = tables or read_tables()
+    if isinstance(scans, PointClouds):
+        rotation, heights, missing, step = _ground_of_clouds(scans, at, path, sensor_height, progress)
+    else:
+        rotation, missing = np.eye(3), 0
+        _, rays = scans.head_rays()
+        step = float(np.median(np.arccos(np.clip(np.sum(rays[0, 1:] * rays[0, :-1], axis=-1), -1.0, 1.0))))
+        heights = np.full(len(scans.times), scans.T_base_mount[2] if sensor_height is None else sensor_height)
+    sensor = LineSensor(
+        height=float(np.median(heights[at])),
+        beam_step=step,
+        sweep_time=_sweep(scans, at),
+    )
+    layer = TerrainLayer(used, chosen, sensor)
+    turn = np.concatenate([np.zeros(3), se3.matrix_to_quat(rotation)])
+    level = Trajectory(path.times, se3.se3_compose(np.broadcast_to(turn, path.poses.shape), path.poses))
+    poses = se3.se3_compose(np.broadcast_to(turn, node_poses.shape), node_poses)
+    owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(poses) - 1)
+    begin, count = time.process_time(), 0
+    nodes = np.unique(owner)
+    for node in tqdm(nodes.tolist(), desc="terrain", unit="node", disable=not progress):
+        lines = list(_lines(scans, at[owner == node], level, heights))
+        count += sum(len(part) for part in lines)
+        layer.read(node, lines, poses[node])
+    read_s = time.process_time() - begin
+    begin = time.process_time()
+    found = layer.classify()
+    return RunTerrain(
+        layer, found, rotation, poses[:, :3], missing, read_s, time.process_time() - begin, len(at), count, stream
+    )
+
+
+def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
+    """Time until a scanner has looked everywhere once [s]; of a line that pans, until it turns back."""
+    if isinstance(scans, RangeScans) and scans.spin_rate is not None:
+        turns = np.flatnonzero(np.diff(np.sign(scans.spin_rate[at])) != 0)
+        if len(turns) > 1:
+            return float(np.median(np.diff(scans.times[at][turns])))
+    return float(np.median(np.diff(scans.times[at]))) if len(at) > 1 else 1.0
+
+
+def _posed(scans: PointClouds, k: int, path: Trajectory) -> tuple[Array, Array]:
+    """Points of a scan, and where the scanner was, in the frame of the path."""
+    T = se3.se3_compose(path.interpolate(scans.times[k : k + 1])[0], scans.T_base_sensor)
+    return se3.se3_transform(T, np.asarray(scans.cloud(k), dtype=np.float64)), T[:3]
+
+
+def _ground_of_clouds(
+    scans: PointClouds, at: Ints, path: Trajectory, height: float | None, progress: bool
+) -> tuple[Array, Array, int, float]:
+    """Rotation to a level frame, height of the scanner at every scan, scans without ground, and angle between beams."""
+    up, about = np.array([0.0, 0.0, 1.0]), height
+    planes: list[GroundPlane | None] = []
+    step = 0.0
+    for round_ in range(2):
+        planes = []
+        for k in tqdm(at.tolist(), desc="ground", unit="scan", disable=not progress or round_ > 0):
+            points, origin = _posed(scans, k, path)
+            planes.append(ground_plane(points[::_EVERY_POINT], origin, up, about))
+            if k == at[len(at) // 2]:
+                step = _beam_step(points, origin)
+        up = common_up(planes)
+        if about is None:
+            about = float(np.median([p.below for p in planes if p is not None]))
+    found, missing = heights_along(planes)
+    heights = np.full(len(scans.times), about)
+    heights[at] = found if height is None else height
+    return level_rotation(up), heights, missing, step
+
+
+def _beam_step(points: Array, origin: Array) -> float:
+    """Angle between neighbouring beams below the horizon, of columns half a degree wide [rad]."""
+    d = points - origin
+    column = np.floor(np.arctan2(d[:, 1], d[:, 0]) * 720.0 / (2.0 * np.pi)).astype(np.int64)
+    elevation = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1]))
+    low = elevation < -0.03
+    order = np.lexsort((elevation[low], column[low]))
+    gap = np.diff(elevation[low][order])[np.diff(column[low][order]) == 0]
+    gap = gap[gap > 1e-3]  # neighbours in azimuth lie side by side
+    return float(np.clip(np.median(gap), 2e-3, 0.1)) if len(gap) else 0.01
+
+
+def _lines(scans: PointClouds | RangeScans, at: Ints, level: Trajectory, heights: Array) -> Iterator[ScanLines]:
+    if isinstance(scans, RangeScans):
+        mine = np.zeros(len(scans.times), np.bool_)
+        mine[at] = True
+        yield lines_of_scans(scans.take(mine), level, float(heights[at[0]]))
+        return
+    for k in at.tolist():
+        points, origin = _posed(scans, k, level)
+        yield lines_of_clouds(points, origin, float(origin[2] - heights[k]))
+
+
+def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | None = None) -> list[Path]:
+    """Write ``terrain.npz`` (classes, probabilities, ground), ``terrain.json``, a cost map ``terrain_cost.yaml``."""
+    found = made.map
+    target = folder.path / "terrain.npz"
+    arrays = {
+        "classes": found.classes,
+        "probability": found.probability.astype(np.float32),
+        "ground": found.ground.astype(np.float32),
+        "roughness": found.roughness.astype(np.float32),
+        "band": found.band,
+        "provisional": found.provisional,
+    }
+    write_npz(target, {"format": FORMAT, "origin": found.origin, "cell": found.cell, **arrays})
+    folder.write_json("terrain.json", {**made.facts(), "generation": generation})
+    costs = save_cost_map(cost_map(found, made.layer.vehicle), folder.path / "terrain_cost.yaml")
+    return [target, folder.path / "terrain.json", *costs]
+
+
+def draw_terrain(made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
+    """Pictures of the classes, and in green, red and white."""
+    from graphslam.plots.save import save
+    from graphslam.plots.terrain import plot_terrain
+
+    path = made.path[:, :2]
+    out = [save(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
+    ax = plot_terrain(made.map, plain=True, title=f"{name}: free, hazard, unknown")
+    return [*out, save(ax, figures / "terrain_plain.png")]

@@ -1,0 +1,101 @@
+"""Terrain along a path: of clouds whose frame is not level, and what it cannot be made of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, write_terrain
+from graphslam.core import se3
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.trajectory import Trajectory
+from graphslam.maps.terrain.pyramid import TerrainClass
+
+HEIGHT, CURB_Y = 1.6, 4.0
+LEAN = se3.so3_exp(np.array([0.06, -0.04, 0.0]))
+
+
+def scan_from(x: float, rng: np.random.Generator) -> Array:
+    """A street along x: a curb of 15 cm on the left, a box on the right; 40 rings from −30° to 2°."""
+    azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(0.0, 360.0, 0.8)), np.deg2rad(np.linspace(-30.0, -4.0, 40)))
+    d = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    d = d.reshape(-1, 3)
+    r = -HEIGHT / d[:, 2]
+    raised = r * d[:, 1] > CURB_Y
+    r = np.where(raised, np.maximum(-(HEIGHT - 0.15) / d[:, 2], CURB_Y / np.where(raised, d[:, 1], 1.0)), r)
+    box_x = 6.0 - x
+    with np.errstate(divide="ignore"):
+        side = np.where(d[:, 1] < 0, -2.5 / d[:, 1], np.inf)  # its wall towards the street, 1 m high
+    met = (side < r) & (np.abs(side * d[:, 0] - box_x) < 1.0) & (side * d[:, 2] > -HEIGHT)
+    r = np.where(met, side, r) + 0.005 * rng.standard_normal(len(r))
+    return (r[:, None] * d)[r < 20.0]
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[RunTerrain, PointClouds, Trajectory]:
+    rng = np.random.default_rng(1)
+    x = np.arange(0.0, 6.0, 0.75)
+    times = 0.5 * np.arange(len(x))
+    clouds = [scan_from(v, rng) for v in x]
+    scans = PointClouds.from_arrays(times, np.concatenate(clouds), np.cumsum([0, *map(len, clouds)]))
+    level = np.column_stack([x, np.zeros((len(x), 2)), np.tile([0.0, 0, 0, 1], (len(x), 1))])
+    poses = se3.se3_compose(np.broadcast_to([0.0, 0, 0, *LEAN], level.shape), level)  # the world's z is not up
+    path = Trajectory(times, poses)
+    return read_terrain(scans, path, times[::3], poses[::3], progress=False), scans, path
+
+
+def classes_at(found: RunTerrain, x: float, y: float) -> set[TerrainClass]:
+    m = found.map
+    iy, ix = (int(np.floor((v - o) / m.cell)) for v, o in ((y, m.origin[1]), (x, m.origin[0])))
+    return {TerrainClass(int(k)) for k in m.classes[iy - 2 : iy + 3, ix - 2 : ix + 3].ravel()}
+
+
+def test_curb_box_and_street_in_a_frame_that_leans(made: tuple[RunTerrain, PointClouds, Trajectory]) -> None:
+    found = made[0]
+    up = se3.quat_rotate(LEAN, np.array([0.0, 0.0, 1.0]))
+    assert np.allclose(found.rotation @ up, [0, 0, 1], atol=0.02)  # the pavement lifts one side
+    assert found.layer.sensor.height == pytest.approx(HEIGHT, abs=0.03)
+    assert len(found.layer.pieces) == 3
+    assert found.missing == 0
+    for x in (4.0, 7.0):
+        assert TerrainClass.STEP in classes_at(found, x, CURB_Y)
+    assert classes_at(found, 6.0, 0.0) == {TerrainClass.FREE}
+    assert TerrainClass.OBSTACLE in classes_at(found, 6.0, -2.5)
+    assert TerrainClass.HOLE not in classes_at(found, 6.0, -4.0)  # behind the box
+
+
+def test_what_is_written(made: tuple[RunTerrain, PointClouds, Trajectory], tmp_path: Path) -> None:
+    folder = OutputFiles(tmp_path)
+    files = write_terrain(folder, made[0])
+    assert {p.name for p in files} == {"terrain.npz", "terrain.json", "terrain_cost.yaml", "terrain_cost.pgm"}
+    facts = json.loads((tmp_path / "terrain.json").read_text())
+    assert facts["cells"]["free"] > 1000
+    assert facts["scans"] == 8
+    with np.load(tmp_path / "terrain.npz") as arrays:
+        assert np.array_equal(arrays["classes"], made[0].map.classes)
+    drawn = draw_terrain(made[0], folder.figures, name="street")
+    assert [p.name for p in drawn] == ["terrain.png", "terrain_plain.png"]
+    assert all(p.stat().st_size > 5_000 for p in drawn)
+
+
+def test_it_moves_with_the_nodes(made: tuple[RunTerrain, PointClouds, Trajectory]) -> None:
+    layer = made[0].layer
+    poses = dict(layer.poses)
+    before = layer.pyramid().counts.copy()
+    assert layer.move({2: poses[2] + np.array([0.3, 0.1, 0, 0, 0, 0, 0])}) == 1
+    assert not np.array_equal(before, layer.pyramid().counts)
+    layer.move(poses)
+    assert np.array_equal(before, layer.pyramid().counts)
+
+
+def test_no_scan_on_the_path(made: tuple[RunTerrain, PointClouds, Trajectory]) -> None:
+    _, scans, path = made
+    late = Trajectory(path.times + 100.0, path.poses)
+    with pytest.raises(DataError, match="within the solved path"):
+        read_terrain(scans, late, late.times[:1], late.poses[:1], progress=False)
