@@ -107,6 +107,23 @@ def test_what_one_piece_of_four_saw_has_moved_away() -> None:
     assert at_post() < 0.2
 
 
+def test_what_was_seen_far_away_has_moved_where_others_saw_ground_from_near() -> None:
+    layer = TerrainLayer(TABLES, VEHICLE, SENSOR)
+    car = fans(0, 8.0, 0.0).points.copy()
+    car[20, 55] = 0.05, 0.05, 1.0  # 8 m behind a scanner: in the coarsest band
+    layer.read("far", [ScanLines(car, np.tile([8.0, 0.0, 1.1], (40, 1)), np.zeros(40))], pose(8.0, 0.0, 0.0))
+
+    def hazard() -> float:
+        found = layer.classify()
+        iy, ix = math.floor((0.05 - found.origin[1]) / 0.1), math.floor((0.05 - found.origin[0]) / 0.1)
+        return float(found.probability[iy, ix])
+
+    assert hazard() > 0.8
+    for k in range(3):
+        layer.read(k, [fans(k, -2.0, 0.0)], pose(-2.0, 0.0, 0.0))
+    assert hazard() < 0.25
+
+
 def test_a_piece_turns_and_rises_with_its_node() -> None:
     layer = TerrainLayer(TABLES, VEHICLE, SENSOR)
     layer.read("a", [fans(1, 0.0, 0.0)], pose(0.0, 0.0, 0.0))

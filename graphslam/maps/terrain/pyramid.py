@@ -205,7 +205,8 @@ class Pyramid:
         Of steps and of support the finest band that knows the cell speaks. Something hanging is believed of any band,
         because a near band that saw the ground may not have looked at the space above it; where a finer band saw
         something hang in the cell of a coarser one, the finer one says where. What pieces saw hang (see
-        :mod:`graphslam.maps.terrain.layer`) has moved away where more than twice as many saw ground alone.
+        :mod:`graphslam.maps.terrain.layer`) has moved away where more than twice as many, of all bands,
+        saw ground alone.
 
         Parameters
         ----------
@@ -220,6 +221,8 @@ class Pyramid:
         support_band = np.full((ny, nx), -1, np.int8)
         ground, rough = np.full((ny, nx), np.nan), np.full((ny, nx), np.nan)
         above = np.zeros((ny, nx), bool)
+        votes = np.sum([self._fine(self.votes, b) for b in range(self.bands)], axis=0)
+        stays = votes[1] <= 2 * votes[0]
         for b in range(self.bands):
             counts = self._fine(self.counts, b)
             ratios = self._fine(self.ratios, b) / SCALE
@@ -230,8 +233,7 @@ class Pyramid:
                 free[channel][fresh] = factors[channel][fresh]
                 known[channel] |= fresh
                 (band if channel == STEP else support_band)[fresh] = b
-            votes = self._fine(self.votes, b)
-            hanging = (counts[OVERHANG] > 0) & (votes[1] <= 2 * votes[0])
+            hanging = (counts[OVERHANG] > 0) & stays
             if b:  # where a finer band saw something hang within the cell, it says better where
                 k = round(float(self.cells[b] / self.cells[0]))
                 within = known[2].reshape(ny // k, k, nx // k, k).any(axis=(1, 3))
