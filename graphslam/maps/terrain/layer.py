@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GridError
 from graphslam.core.geometry import Array
-from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT
+from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT, add_rows
 from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
 from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
 from graphslam.maps.terrain.tables import Tables
@@ -38,7 +38,7 @@ class TerrainPiece:
     Parameters
     ----------
     cells : (n, 3) int64
-        Band, ix, iy in the node's level frame, sorted, each once.
+        Band, ix, iy in the node's level frame, each once.
     ratios : (2, n) int32
     counts : (4, n) int32
     heights : (3, n) int64
@@ -59,22 +59,22 @@ class TerrainPiece:
 
 def piece_of(rows: Rows, tables: Tables, pose: Array) -> TerrainPiece:
     """Sum up statements ``(k, 6)`` that were made in the level frame of a node."""
-    keys = rows[:, 1:4].astype(np.int64)
-    cells, back = np.unique(keys, axis=0, return_inverse=True)
-    back = back.ravel()
-    n = len(cells)
+    bands = tables.bands
+    first, shapes = np.zeros((bands, 2), np.int64), np.zeros((bands, 2), np.int64)
+    for b in range(bands):
+        own = rows[rows[:, 1] == b, 2:4]
+        if len(own):
+            first[b] = own.min(axis=0)
+            shapes[b] = (own.max(axis=0) - first[b] + 1)[::-1]
+    offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
+    n = int(offsets[-1])
     ratios, counts, heights = np.zeros((2, n), np.int32), np.zeros((4, n), np.int32), np.zeros((3, n), np.int64)
-    channel, value = rows[:, 4], rows[:, 5]
-    bins = tables.ratios.shape[2]
-    for k in range(4):
-        mine = channel == k
-        np.add.at(counts[k], back[mine], 1)
-        if k < 2:
-            np.add.at(ratios[k], back[mine], tables.ratios[k, rows[mine, 1], np.minimum(value[mine], bins - 1)])
-    ground, rough = channel == 4, channel == 5
-    np.add.at(heights[0], back[ground], 1)
-    np.add.at(heights[1], back[ground], value[ground])
-    np.add.at(heights[2], back[rough], value[rough])
+    add_rows(rows, first, shapes, offsets, tables.ratios, ratios, counts, heights)
+    said = np.flatnonzero(counts.any(axis=0))  # ground is always said to have support, too
+    band = np.searchsorted(offsets, said, side="right") - 1
+    iy, ix = np.divmod(said - offsets[band], shapes[band, 1])
+    cells = np.column_stack([band, ix + first[band, 0], iy + first[band, 1]])
+    ratios, counts, heights = ratios[:, said], counts[:, said], heights[:, said]
     return TerrainPiece(cells, ratios, counts, heights, np.asarray(pose, dtype=np.float64))
 
 
