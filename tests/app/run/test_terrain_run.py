@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, write_terrain
 from graphslam.core import se3
-from graphslam.core.errors import DataError
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
@@ -99,3 +101,10 @@ def test_no_scan_on_the_path(made: tuple[RunTerrain, PointClouds, Trajectory]) -
     late = Trajectory(path.times + 100.0, path.poses)
     with pytest.raises(DataError, match="within the solved path"):
         read_terrain(scans, late, late.times[:1], late.poses[:1], progress=False)
+
+
+def test_terrain_is_made_alone(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["map", str(tmp_path / "none"), "--terrain", "--grid"])
+    assert done.exit_code != 0
+    assert isinstance(done.exception, ConfigError)
+    assert "alone" in str(done.exception)
