@@ -470,6 +470,7 @@ def main() -> int:
     parser.add_argument("--tiles", default="", help="folder for tiles: also relax each size from disk")
     parser.add_argument("--workers", type=int, default=0, help="processes that relax a chain from disk")
     parser.add_argument("--cluster", default="", help="Dask scheduler whose workers do so")
+    parser.add_argument("--disk-only", action="store_true", help="not in memory: only from --tiles")
     parser.add_argument("--steps", type=int, default=30, help="most steps of a relaxation from disk")
     parser.add_argument(
         "--start",
@@ -497,7 +498,7 @@ def main() -> int:
     beside = 600 if args.quick else args.gtsam
     starts, solvers = (args.starts.split(","), SOLVERS) if not args.quick else (["odometry"], SOLVERS[:1])
     failed, runs = 0, {}
-    for n in sizes:
+    for n in [] if args.disk_only else sizes:
         r, why = child("ours", str(n), str(args.threads))
         if r is None:
             print(f"{n} poses: failed: {why}")
