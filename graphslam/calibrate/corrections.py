@@ -58,6 +58,9 @@ class Corrections:
     """σ of the heading after one radian turned [rad/√rad]."""
     heading_second: float = 0.0
     """σ of the heading after one second in motion [rad/√s]."""
+    widen_only: bool = False
+    """The noise of the motion is at least what the log or the front end states of it: matches of scans over a metre or
+    two do not see errors of wheels that come seldom or last."""
     range_sigma: float | None = None
     """σ of a range [m]; None: the log's own."""
     bearing_sigma: float | None = None
@@ -73,7 +76,7 @@ class Corrections:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
+            if value is not None and not isinstance(value, bool) and not math.isfinite(value):
                 raise ConfigError(f"calibration: {name} = {value}; wanted a finite number")
         for name in ("distance_scale", "turn_scale", "range_scale", "range_sigma", "bearing_sigma"):
             value = getattr(self, name)
@@ -91,7 +94,7 @@ class Corrections:
 
     def without_motion_noise(self) -> Corrections:
         """The same with the noise of the motion left as it is."""
-        return replace(self, along_metre=None, **dict.fromkeys(NOISE, 0.0))
+        return replace(self, along_metre=None, widen_only=False, **dict.fromkeys(NOISE, 0.0))
 
     def without_sensor_noise(self) -> Corrections:
         """The same with the σ of the sightings left as they are."""
@@ -212,7 +215,11 @@ def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
         increments[0] = odometry.increments[0]
     if c.along_metre is None:
         return replace(odometry, increments=increments)
-    return replace(odometry, increments=increments, covariances=walks(c, metres, turned, seconds, g.dof))
+    P = walks(c, metres, turned, seconds, g.dof)
+    if c.widen_only:
+        k = np.arange(g.dof)
+        P[:, k, k] = np.maximum(P[:, k, k], odometry.covariances[:, k, k])
+    return replace(odometry, increments=increments, covariances=P)
 
 
 def walks(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:

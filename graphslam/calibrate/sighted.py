@@ -334,7 +334,7 @@ def calibration_of(
     """A calibration with what is applied of it: nothing where streams contradict each other."""
     found = Calibration(
         kind=kind,
-        corrections=_corrections(estimates, noise),
+        corrections=replace(_corrections(estimates, noise), widen_only=kind == "scans"),
         estimates=tuple(estimates),
         noise={k: float(v) for k, v in noise.items()},
         notes=tuple(notes),
@@ -346,7 +346,7 @@ def calibration_of(
 def _corrections(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
     """What is applied: constants that passed the gates, and the noise."""
     applied = {e.name: e.value for e in estimates if e.applied}
-    values: dict[str, float] = {}
+    values: dict[str, Any] = {}
     for name, value in applied.items():
         if name == "distance_scale":
             values[name] = rounded(math.exp(value))
