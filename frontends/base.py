@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
+from graphslam.core.feed import Feed
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
@@ -22,6 +23,9 @@ class FrontEnd(Protocol):
     Classes inherit from it. A front end is built from its configuration alone. Everything it draws comes from
     ``seed.child(key of the submap)`` and a submap depends on nothing but the log and the end of the one before, so that
     a run resumed after submap k is the run that was never stopped.
+
+    It has one of two methods, and the other follows from it: :meth:`follow`, where submaps can be made while records
+    come, or :meth:`submaps`, where only the whole log says what they are.
     """
 
     name: ClassVar[str]
@@ -36,10 +40,12 @@ class FrontEnd(Protocol):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """Yield submaps in order.
+        """Yield the submaps of a log that is whole, in order.
 
         Parameters
         ----------
+        log : SensorLog
+        seed : SeedTree
         after : Submap or None
             The last submap that is already there; the next one starts at its end.
         drops : DropCounter or None
@@ -47,7 +53,36 @@ class FrontEnd(Protocol):
         watch : callable or None
             Called with the front end's own progress after every step that it can show; changes nothing.
         """
-        ...
+        found = self.follow(Feed(log), seed=seed, after=after, drops=drops, watch=watch)
+        return (submap for submap in found if submap is not None)
+
+    def follow(
+        self,
+        feed: Feed,
+        *,
+        seed: SeedTree,
+        after: Submap | None = None,
+        drops: DropCounter | None = None,
+        watch: Watch | None = None,
+    ) -> Iterator[Submap | None]:
+        """Yield submaps as soon as the records that have come make them; None: all of these are used, more are wanted.
+
+        The submaps are the same in whatever portions the records come, and those of :meth:`submaps`.
+
+        Parameters
+        ----------
+        feed : Feed
+        seed, after, drops, watch
+            As in :meth:`submaps`.
+        """
+        while not feed.ended:
+            yield None
+        yield from self.submaps(feed.log, seed=seed, after=after, drops=drops, watch=watch)
+
+    @classmethod
+    def incremental(cls) -> bool:
+        """Does it make submaps while records come?"""
+        return cls.follow is not FrontEnd.follow
 
     def steps(self, log: SensorLog) -> Steps | None:
         """The steps that it made of the log, for a refinement by scans; None where it works on no scans."""

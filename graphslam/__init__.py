@@ -44,6 +44,7 @@ _TYPES = {
     "Trajectory": "graphslam.core.trajectory",
     "PoseGraph": "graphslam.graph.pose_graph",
     "Run": "graphslam.app.run.run",
+    "Slam": "graphslam.app.run.slam",
     "Collapse": "graphslam.skeleton.collapse",
     "SkeletonProblem": "graphslam.skeleton.problem",
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
@@ -20,7 +21,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam.frontends.landmarks.ekf_filter import EkfMap
-from graphslam.frontends.landmarks.prepare import Prepared, known_slots, prepare
+from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
 from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.frontends.landmarks.stopping import Stopping
 from graphslam.frontends.landmarks.summarise import Smoothed, smooth
@@ -32,11 +33,15 @@ OnScan = Callable[[int], None]
 
 def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> Prepared:
     data = prepare(log, config, drops if drops is not None else DropCounter())
+    _require_bearings(data, log.name)
+    return data
+
+
+def _require_bearings(data: Prepared, where: str) -> None:
     if len(data.rows) and not np.any(np.isfinite(data.rows[:, 3])):
         raise MissingDataError(
-            "an EKF cannot start a landmark from ranges alone", where=log.name, wanted="bearings in some observations"
+            "an EKF cannot start a landmark from ranges alone", where=where, wanted="bearings in some observations"
         )
-    return data
 
 
 class _Run:
@@ -207,42 +212,48 @@ class Ekf(FrontEnd):
     config: EkfConfig = field(default_factory=EkfConfig)
     name: ClassVar[str] = "ekf"
 
-    def submaps(
+    def follow(
         self,
-        log: SensorLog,
+        feed: Feed,
         *,
         seed: SeedTree,
         after: Submap | None = None,
         drops: DropCounter | None = None,
         watch: Watch | None = None,
-    ) -> Iterator[Submap]:
+    ) -> Iterator[Submap | None]:
         """See :class:`graphslam.frontends.base.FrontEnd`."""
-        data = _prepare(log, self.config, drops)
-        times, epsilon = data.observations.times, _measurement_sigma(data)
-        key, scan, t_start = 0, 0, data.t_start
+        data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
+        yield from data.reach(0)
+        if data.done:
+            _require_bearings(data.prepared, feed.name)
+        key, scan, t_start = 0, 0, data.prepared.t_start
         if after is not None:
-            t_start = after.interval[1]
-            key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
-        while scan < len(times):
-            submap, scan = self._build(data, key, scan, t_start, epsilon)
+            t_start, key = after.interval[1], after.key + 1
+            while (yield from data.reach(scan)) and data.prepared.observations.times[scan] <= t_start:
+                scan += 1
+        while (yield from data.reach(scan)):
+            submap, scan = yield from self._build(data, key, scan, t_start)
             yield submap
             key, t_start = key + 1, submap.interval[1]
 
-    def _build(self, data: Prepared, key: int, first: int, t_start: float, epsilon: Array) -> tuple[Submap, int]:
+    def _build(
+        self, growing: Preparing, key: int, first: int, t_start: float
+    ) -> Generator[None, None, tuple[Submap, int]]:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
-        obs, run = data.observations, _Run(data, self.config, first, t_start)
-        stopping = Stopping(self.config.stopping, epsilon)
+        run = _Run(growing.prepared, self.config, first, t_start)
+        stopping = Stopping(self.config.stopping)
         ended, previous = None, t_start
-        while ended is None and run.next < len(data):
-            k = run.next
+        while ended is None and (yield from growing.reach(run.next)):
+            k, run.data = run.next, growing.prepared
+            obs = run.data.observations
             run.advance()
-            now = float(obs.times[k])
-            ended = stopping.reason(
-                run.map, now - previous, data.odometry.increments[k], int(obs.offsets[k + 1] - obs.offsets[k])
-            )
+            now, seen = float(obs.times[k]), int(obs.offsets[k + 1] - obs.offsets[k])
+            u, sigma = run.data.odometry.increments[k], run.data.usual_sigma(k)
+            ended = stopping.reason(run.map, now - previous, u, seen, sigma)
             previous = now
-            if data.splits(run.next):
+            if run.data.splits(run.next):
                 ended = "gap"
+        run.data = growing.prepared
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
         if self.config.handover == "filter":
             return run.submap(key, report), run.next
@@ -352,13 +363,3 @@ def _snapshots(run: _Run, cuts: list[int], joint: str, on_scan: OnScan | None) -
             landmark_covariances=covariances,
             gaussian=gaussian,
         )
-
-
-def _measurement_sigma(data: Prepared) -> Array:
-    """ε of the stopping rule: mean measurement noise as x, y [m] and heading [rad]."""
-    variances = data.rows[:, 2:]
-    if not len(variances):
-        return np.ones(3)
-    along = float(np.sqrt(variances[:, 0].mean()))
-    bearing = variances[np.isfinite(variances[:, 1]), 1]
-    return np.array([along, along, float(np.sqrt(bearing.mean())) if len(bearing) else np.inf])

@@ -1,24 +1,27 @@
 """A log made ready for a landmark filter: which observations count, their variances, and the motion between scans.
 
-Every landmark front end starts here, so that all of them work on the same observations and the same increments.
+Every landmark front end starts here, so that all of them work on the same observations and the same increments. A log
+that is still being recorded is made ready scan by scan: as soon as the motion until a scan has come.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Generator
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
 from graphslam.frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from graphslam.frontends.landmarks.config import RangeBearingNoise
-from graphslam.frontends.odometry.motion import MotionNoise, motion_stream
-from graphslam.frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning
+from graphslam.frontends.odometry.motion import Motion, MotionNoise, motion_stream, motion_stream_name
+from graphslam.frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning, certain_until
 
 Ints = npt.NDArray[np.int64]
 
@@ -90,6 +93,16 @@ class Prepared:
     uses: frozenset[str]
     gaps: tuple[MotionGap, ...] = ()
     """Gaps of the motion that were bridged."""
+    noise: Array = field(default_factory=lambda: np.zeros((1, 3)))
+    """Until each scan ``(n + 1, 3)``: sums of variances of ranges [m²] and bearings [rad²], number of bearings."""
+
+    def usual_sigma(self, scan: int) -> Array:
+        """Mean measurement noise until a scan, that one included, as x, y [m] and heading [rad]."""
+        n, (ranges, bearings, told) = int(self.observations.offsets[scan + 1]), self.noise[scan + 1]
+        if not n:
+            return np.ones(3)
+        along = np.sqrt(ranges / n)
+        return np.array([along, along, np.sqrt(bearings / told) if told else np.inf])
 
     def unseen_gap(self, scan: int) -> bool:
         """Does a gap of the motion end at a scan, with no scan in it? Then nothing tells where the robot went."""
@@ -159,51 +172,203 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
         If a stream is missing, identities are asked for and not there, or no scan is left; also where ranges without
         bearings are to be associated by likelihood alone, since a range cannot found a landmark without an identity.
     """
-    _, motion = motion_stream(log)
-    stream, observations = landmark_stream(log, config.detector)
-    where = f"{log.name}/{stream}"
-    if len(motion.times) == 0:
-        raise MissingDataError("motion stream is empty", where=log.name)
-    early = int(np.searchsorted(observations.times, motion.times[0] - config.control_hold, side="left"))
-    late = len(observations.times)
-    if isinstance(motion, Odometry):  # controls are held to the end; recorded odometry ends where it ends
-        late = int(np.searchsorted(observations.times, motion.times[-1] + config.control_hold, side="right"))
-    drops.drop(stream, "before the first control", early)
-    drops.drop(stream, "after the last odometry", len(observations.times) - late)
-    scans = observations.take(slice(early, late))
-    first_row = int(observations.offsets[early])
-    if config.noise is not None:
-        scans = replace(scans, ranges=config.noise.distances(scans.ranges))
-    positive = scans.ranges > 0.0
-    drops.drop(stream, "ranges not positive", int((~positive).sum()))
-    usable = positive & (scans.ranges <= config.max_range)
-    drops.drop(stream, f"observations beyond {config.max_range:g} m", int((positive & ~usable).sum()))
-    if config.association == "known":
-        if scans.ids is None:
-            raise MissingDataError("known association needs identities", where=where, wanted="ids")
-        unknown = usable & (scans.ids < 0)
-        drops.drop(stream, "observations without identity", int(unknown.sum()))
-        usable &= ~unknown
-    scans, kept = _only(scans, usable)
-    if len(scans.times) == 0:
-        raise MissingDataError("no scan to work on", where=where)
-    filter_var = _variances(scans, config.noise)
-    if config.association != "known" and len(filter_var) and np.all(np.isinf(filter_var[:, 1])):
-        raise MissingDataError(
-            "ranges alone cannot be associated by likelihood", where=where, wanted='association = "known"'
+    made = Preparing(Feed(log), config, drops)
+    made.advance()
+    return made.prepared
+
+
+class Preparing:
+    """What :func:`prepare` makes of a log, while its records come.
+
+    The streams that are worked on are those that are there when the first scan can be made ready.
+
+    Parameters
+    ----------
+    feed : Feed
+    config, drops
+        As in :func:`prepare`.
+    """
+
+    def __init__(self, feed: Feed, config: PrepareConfig, drops: DropCounter) -> None:
+        self.feed, self.config, self.drops = feed, config, drops
+        self.made: Prepared | None = None
+        self.done = False
+        """Is the log at its end, and all of it made ready?"""
+        self._streams: tuple[str, str] | None = None
+        self._taken, self._rows = 0, 0  # scans and observations of the stream
+
+    @property
+    def prepared(self) -> Prepared:
+        """All scans so far; there is one at least."""
+        assert self.made is not None
+        return self.made
+
+    def reach(self, scan: int) -> Generator[None, None, bool]:
+        """Wait until a scan is there, and known to be the last or not; False: the log ended before it."""
+        while not self.done and (self.made is None or len(self.made) <= scan + 1):
+            if not self.advance():
+                yield None
+        return scan < len(self.prepared)
+
+    def advance(self) -> bool:
+        """Make ready what has come; False: that was nothing.
+
+        Raises
+        ------
+        MissingDataError
+            See :func:`prepare`.
+        """
+        if self.done or not (self._named() or self.feed.ended):
+            return False
+        ended = self.feed.ended
+        motion_name, stream = self._streams or self._missing()
+        if not ended and self.feed.count(stream) == self._taken:
+            return False
+        part: Any = self.feed.part(stream, self._taken)
+        motion: Any = self.feed.part(motion_name)
+        if len(motion.times) == 0:
+            raise MissingDataError("motion stream is empty", where=self.feed.name)
+        if not ended:
+            n = int(np.searchsorted(part.times, certain_until(motion), side="right"))
+            if n == 0:
+                return False
+            part = part if n == len(part.times) else part.take(slice(0, n))
+        self._taken += len(part.times)
+        self._take(part, motion_name, motion, stream, ended)
+        self.feed.let_go(stream, self._taken)
+        self.done = ended
+        return True
+
+    def _named(self) -> bool:
+        """Are the streams there?"""
+        if self._streams is None:
+            motion = motion_stream_name(self.feed)
+            stream = self.feed.of_type(LandmarkObservations) or self.feed.of_type(LaserScans)
+            if motion is None or stream is None or not (self.feed.count(motion) > 1 and self.feed.count(stream)):
+                return False
+            self._streams = motion, stream
+        return True
+
+    def _missing(self) -> tuple[str, str]:
+        """The streams of a log that ended with hardly a record, or the error that names what is missing."""
+        motion, _ = motion_stream(self.feed.log)
+        stream = self.feed.of_type(LandmarkObservations) or self.feed.of_type(LaserScans)
+        if stream is None:
+            raise MissingDataError(
+                "no landmarks to map", where=self.feed.name, wanted="LandmarkObservations or LaserScans"
+            )
+        return motion, stream
+
+    def _take(self, part: Any, motion_name: str, motion: Motion, stream: str, last: bool) -> None:
+        """The scans of a part of the stream, behind those that are there."""
+        config, drops, where = self.config, self.drops, f"{self.feed.name}/{stream}"
+        observations = part if isinstance(part, LandmarkObservations) else detect_trees(part, config.detector)
+        early = int(np.searchsorted(observations.times, motion.times[0] - config.control_hold, side="left"))
+        late = len(observations.times)
+        if last and isinstance(motion, Odometry):  # controls are held to the end; recorded odometry ends where it ends
+            late = int(np.searchsorted(observations.times, motion.times[-1] + config.control_hold, side="right"))
+            late = max(late, early)
+        drops.drop(stream, "before the first control", early)
+        drops.drop(stream, "after the last odometry", len(observations.times) - late)
+        scans = observations.take(slice(early, late))
+        first_row = self._rows + int(observations.offsets[early])
+        self._rows += int(observations.offsets[-1])
+        if config.noise is not None:
+            scans = replace(scans, ranges=config.noise.distances(scans.ranges))
+        positive = scans.ranges > 0.0
+        drops.drop(stream, "ranges not positive", int((~positive).sum()))
+        usable = positive & (scans.ranges <= config.max_range)
+        drops.drop(stream, f"observations beyond {config.max_range:g} m", int((positive & ~usable).sum()))
+        if config.association == "known":
+            if scans.ids is None:
+                raise MissingDataError("known association needs identities", where=where, wanted="ids")
+            unknown = usable & (scans.ids < 0)
+            drops.drop(stream, "observations without identity", int(unknown.sum()))
+            usable &= ~unknown
+        scans, kept = _only(scans, usable)
+        if len(scans.times):
+            self._append(scans, kept + first_row, motion_name, motion, stream)
+        if not last:
+            return
+        if self.made is None:
+            raise MissingDataError("no scan to work on", where=where)
+        variances = self.made.rows[:, 2:]
+        if config.association != "known" and len(variances) and np.all(np.isinf(variances[:, 1])):
+            raise MissingDataError(
+                "ranges alone cannot be associated by likelihood", where=where, wanted='association = "known"'
+            )
+
+    def _append(
+        self, scans: LandmarkObservations, original: Ints, motion_name: str, motion: Motion, stream: str
+    ) -> None:
+        """Scans that count, with their variances and the motion into them."""
+        config, before, count = self.config, self.made, DropCounter()
+        filter_var = _variances(scans, config.noise)
+        smooth_var = filter_var.copy() if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
+        smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # the map is made of what the filter saw
+        t_start = (
+            float(min(motion.times[0], scans.times[0])) if before is None else float(before.observations.times[-1])
         )
-    smooth_var = filter_var.copy() if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
-    smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # the map is made of what the filter saw
-    t_start = float(min(motion.times[0], scans.times[0]))
-    stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
-    odometry, motion_name, gaps = bridged_reckoning(
-        log, stamps, config.motion, hold=config.control_hold, limit=config.longest_gap, drops=drops
+        stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
+        odometry, _, gaps = bridged_reckoning(
+            SensorLog(name=self.feed.name, streams={motion_name: motion}),
+            stamps,
+            config.motion,
+            hold=config.control_hold,
+            limit=config.longest_gap,
+            drops=count,
+        )
+        if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
+            odometry = odometry.take(slice(1, None))
+        rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
+        told = np.isfinite(filter_var[:, 1])
+        each = np.column_stack([filter_var[:, 0], np.where(told, filter_var[:, 1], 0.0), told])
+        sums = np.cumsum(np.concatenate([np.zeros((1, 3)) if before is None else before.noise[-1:], each]), axis=0)
+        new = Prepared(
+            scans,
+            original,
+            rows,
+            smooth_var,
+            odometry,
+            t_start,
+            frozenset({motion_name, stream}),
+            tuple(gaps),
+            sums[scans.offsets],
+        )
+        known = set() if before is None else {g.begin for g in before.gaps}
+        self.drops.drop(motion_name, "gaps bridged", len({g.begin for g in gaps} - known))
+        self.made = new if before is None else _behind(before, new)
+
+
+def _behind(a: Prepared, b: Prepared) -> Prepared:
+    """The scans of two, one behind the other."""
+    x, y = a.observations, b.observations
+    observations = replace(
+        x,
+        times=np.concatenate([x.times, y.times]),
+        offsets=np.concatenate([x.offsets, x.offsets[-1] + y.offsets[1:]]),
+        ranges=np.concatenate([x.ranges, y.ranges]),
+        bearings=np.concatenate([x.bearings, y.bearings]),
+        sigmas=np.concatenate([x.sigmas, y.sigmas]),
+        ids=None if x.ids is None or y.ids is None else np.concatenate([x.ids, y.ids]),
     )
-    if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
-        odometry = odometry.take(slice(1, None))
-    rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
-    uses = frozenset({motion_name, stream})
-    return Prepared(scans, kept + first_row, rows, smooth_var, odometry, t_start, uses, tuple(gaps))
+    odometry = Odometry(
+        times=np.concatenate([a.odometry.times, b.odometry.times]),
+        increments=np.concatenate([a.odometry.increments, b.odometry.increments]),
+        covariances=np.concatenate([a.odometry.covariances, b.odometry.covariances]),
+    )
+    known = {g.begin for g in a.gaps}
+    return Prepared(
+        observations,
+        np.concatenate([a.original, b.original]),
+        np.concatenate([a.rows, b.rows]),
+        np.concatenate([a.smoothing_variances, b.smoothing_variances]),
+        odometry,
+        a.t_start,
+        a.uses,
+        (*a.gaps, *(g for g in b.gaps if g.begin not in known)),
+        np.concatenate([a.noise, b.noise[1:]]),
+    )
 
 
 def _variances(scans: LandmarkObservations, noise: RangeBearingNoise | None) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError
+from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -20,7 +21,7 @@ from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 from graphslam.frontends.landmarks.filter import ParticleSet
 from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
-from graphslam.frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, landmark_stream
 from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from graphslam.frontends.landmarks.stopping import Stopping
 from graphslam.frontends.landmarks.summarise import Smoothed, winning_association
@@ -39,35 +40,37 @@ class RbpfEkf(FrontEnd):
     config: RbpfEkfConfig = field(default_factory=RbpfEkfConfig)
     name: ClassVar[str] = "rbpf-ekf"
 
-    def submaps(
+    def follow(
         self,
-        log: SensorLog,
+        feed: Feed,
         *,
         seed: SeedTree,
         after: Submap | None = None,
         drops: DropCounter | None = None,
         watch: Watch | None = None,
-    ) -> Iterator[Submap]:
+    ) -> Iterator[Submap | None]:
         """See :class:`graphslam.frontends.base.FrontEnd`."""
-        for submap, _ in self.with_particles(log, seed=seed, after=after, drops=drops):
-            yield submap
+        for found in self.with_particles(feed, seed=seed, after=after, drops=drops):
+            yield None if found is None else found[0]
 
     def with_particles(
-        self, log: SensorLog, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
-    ) -> Iterator[tuple[Submap, ParticleSet]]:
-        """The submaps of :meth:`submaps`, each with the particles it was made of as they stood at its last scan.
+        self, feed: Feed, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+    ) -> Iterator[tuple[Submap, ParticleSet] | None]:
+        """The submaps of :meth:`follow`, each with the particles it was made of as they stood at its last scan.
 
         To look at; with pooled filters those of the one that decides.
         """
-        prepared = prepare(log, self.config, drops if drops is not None else DropCounter())
-        times = prepared.observations.times
+        data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
+        yield from data.reach(0)
         if after is None:
-            key, scan, t_start = 0, 0, prepared.t_start
+            key, scan, t_start = 0, 0, data.prepared.t_start
         else:
-            t_start = after.interval[1]
-            key, scan = after.key + 1, int(np.searchsorted(times, t_start, side="right"))
-        while scan < len(times):
-            submap, particles, scan = self._build(prepared, key, scan, t_start, seed.child(key))
+            t_start, scan = after.interval[1], 0
+            while (yield from data.reach(scan)) and data.prepared.observations.times[scan] <= t_start:
+                scan += 1
+            key = after.key + 1
+        while (yield from data.reach(scan)):
+            submap, particles, scan = yield from self._build(data, key, scan, t_start, seed.child(key))
             yield submap, particles
             key, t_start = key + 1, submap.interval[1]
 
@@ -81,35 +84,36 @@ class RbpfEkf(FrontEnd):
         return landmark_stream(log, self.config.detector)
 
     def _build(
-        self, data: Prepared, key: int, first: int, t_start: float, seed: SeedTree
-    ) -> tuple[Submap, ParticleSet, int]:
+        self, growing: Preparing, key: int, first: int, t_start: float, seed: SeedTree
+    ) -> Generator[None, None, tuple[Submap, ParticleSet, int]]:
         """Filter from scan ``first`` until the submap ends; returns it, its particles and the next scan."""
-        c, obs = self.config, data.observations
+        c, obs = self.config, growing.prepared.observations
         miss_range = 0.9 * min(c.max_range, obs.max_range)
         branches = [seed, *(seed.child("pooled", k) for k in range(1, c.pooled))]
         filters = [
             ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, branch.generator()) for branch in branches
         ]
         particles = filters[0]  # it decides alone; the others only watch
-        mean_var = data.rows[:, 2:].mean(axis=0) if len(data.rows) else np.ones(2)
-        epsilon = np.sqrt([mean_var[0], mean_var[0], mean_var[1]])
-        stopping = Stopping(c.stopping, epsilon)
+        stopping = Stopping(c.stopping)
         slots: dict[int, int] = {}
         ended, scan = None, first
         previous = t_start
-        while ended is None and scan < len(obs.times):
-            rows = data.scan(scan)
+        while ended is None and (yield from growing.reach(scan)):
+            data = growing.prepared
+            obs, rows = data.observations, data.scan(scan)
             known = self._known(obs, rows, slots)
             u, Q = data.odometry.increments[scan], data.odometry.covariances[scan]
             for filter in filters:
                 filter.step(u, Q, data.rows[rows], known)
-            ended = stopping.reason(particles, float(obs.times[scan]) - previous, u, rows.stop - rows.start)
+            dt, sigma = float(obs.times[scan]) - previous, data.usual_sigma(scan)
+            ended = stopping.reason(particles, dt, u, rows.stop - rows.start, sigma)
             previous = float(obs.times[scan])
             scan += 1
             if data.splits(scan):
                 ended = "gap"
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        return self._summarise(data, filters, key, first, scan, t_start, slots, report), particles, scan
+        made = self._summarise(growing.prepared, filters, key, first, scan, t_start, slots, report)
+        return made, particles, scan
 
     def _known(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
         """Slot of every observation in known-association mode, else -1."""

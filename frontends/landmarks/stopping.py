@@ -39,16 +39,14 @@ class Stopping:
     Parameters
     ----------
     config : StoppingConfig
-    measurement_sigma : (3,)
-        ε: mean measurement noise as x, y [m] and heading [rad].
     """
 
-    def __init__(self, config: StoppingConfig, measurement_sigma: Array) -> None:
-        self.config, self.epsilon = config, measurement_sigma
+    def __init__(self, config: StoppingConfig) -> None:
+        self.config = config
         self.without_features = 0.0
         self.distance = 0.0
 
-    def reason(self, growing: GrowingMap, dt: float, u: Array, n_obs: int) -> str | None:
+    def reason(self, growing: GrowingMap, dt: float, u: Array, n_obs: int, epsilon: Array) -> str | None:
         """Why the submap ends after this scan, or None.
 
         Parameters
@@ -61,6 +59,8 @@ class Stopping:
             Motion since the last scan.
         n_obs : int
             Features seen in this scan.
+        epsilon : (3,)
+            ε: mean measurement noise as x, y [m] and heading [rad].
         """
         c = self.config
         self.distance += float(np.hypot(u[0], u[1]))
@@ -72,7 +72,7 @@ class Stopping:
         if self.without_features > 0.0:
             # (i) TIME = TIME_max · min(1, ε_x/σ_x, ε_y/σ_y, ε_θ/σ_θ)
             sigma = np.maximum(growing.pose_std(), 1e-12)
-            if self.without_features > c.time_max * min(1.0, float(np.min(self.epsilon / sigma))):
+            if self.without_features > c.time_max * min(1.0, float(np.min(epsilon / sigma))):
                 return "no-features"
         # (ii) diversity: only resampling can lose it
         if growing.resamplings > 0 and self._diversity_lost(growing):

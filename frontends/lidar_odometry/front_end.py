@@ -13,6 +13,7 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.dense import CloudMap
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -128,66 +129,83 @@ class LidarFrontEnd(FrontEnd):
     _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     name: ClassVar[str] = "kiss-icp"
 
-    def submaps(
+    def follow(
         self,
-        log: SensorLog,
+        feed: Feed,
         *,
         seed: SeedTree,
         after: Submap | None = None,
         drops: DropCounter | None = None,
         watch: Watch | None = None,
-    ) -> Iterator[Submap]:
-        """See :class:`~graphslam.frontends.base.FrontEnd`."""
+    ) -> Iterator[Submap | None]:
+        """See :class:`~graphslam.frontends.base.FrontEnd`. A scan is followed when the next one has come."""
         first = 0 if after is None else after.key + 1
-        name, clouds = self._clouds(log)
-        self._made[:] = [log, []]
-        config, origin = self.config.submap, se3.se3_transform(clouds.T_base_sensor, clouds.origin)
-        odometry, kept, key, way, told = LidarOdometry(self.config.odometry), [], 0, 0.0, False
-        for k in range(len(clouds)):
-            seen = self._follow(odometry, clouds, k)
+        while not feed.ended and self._stream(feed) is None:
+            yield None
+        name = self._named(feed.name, self._stream(feed))
+        seen: list[Follow] = []
+        self._made[:] = [feed, seen]
+        config, odometry = self.config.submap, LidarOdometry(self.config.odometry)
+        kept: list[Follow] = []
+        k, key, way, told = -1, 0, 0.0, False
+        while True:
+            while not feed.ended and feed.count(name) <= k + 2:
+                yield None
+            k, scans = k + 1, feed.count(name)  # only the end tells that a scan is the last
+            if k >= scans:
+                break
+            clouds = self._checked(name, feed.part(name, k, k + 1))
+            seen.append(self._follow(odometry, clouds, 0))
+            feed.let_go(name, k + 1)
             if k == 0:
                 odometry.errors.begin()
-            self._made[1].append(seen)
-            kept.append(seen)
+            kept.append(seen[-1])
             n = len(kept) - 1
             full = odometry.way - way >= config.length and n >= config.scans
-            if k == len(clouds) - 1 or full or n >= config.most_scans:
+            if k == scans - 1 or full or n >= config.most_scans:
                 bent = [] if told else _bent(key, kept)
                 told = told or bool(bent)
                 if n and key >= first:
-                    ended = "end-of-log" if k == len(clouds) - 1 else "length"
+                    ended = "end-of-log" if k == scans - 1 else "length"
+                    origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)
                     yield _submap(name, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
-                kept, key, way = [replace(seen, joint=odometry.errors.joint)], key + 1, odometry.way
+                kept, key, way = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
         if key == 0:
-            raise DataError(
-                "too few scans for a submap", where=f"{log.name}/{name}", got=len(clouds), wanted="at least 2"
-            )
+            raise DataError("too few scans for a submap", where=f"{feed.name}/{name}", got=scans, wanted="at least 2")
 
     def steps(self, log: SensorLog) -> Steps:
         """Scans and motion, for a refinement; the motion is only as sure as an even motion would be.
 
         The path of the odometry is made of the same scans. It is the start of a refinement and must not weigh in it.
         """
-        if not (self._made and self._made[0] is log and len(self._made[1]) == len(self._clouds(log)[1])):
-            name, clouds = self._clouds(log)
-            odometry = LidarOdometry(self.config.odometry)
-            self._made[:] = [log, [self._follow(odometry, clouds, k) for k in range(len(clouds))]]
         name, clouds = self._clouds(log)
+        made = bool(self._made) and self._made[0].ended and self._made[0].log is log
+        if not (made and len(self._made[1]) == len(clouds)):
+            odometry = LidarOdometry(self.config.odometry)
+            self._made[:] = [Feed(log), [self._follow(odometry, clouds, k) for k in range(len(clouds))]]
         return _steps(log, name, clouds, self._made[1], self.config)
 
     def forget(self) -> None:
         """Let go of the path and the scans of the last log."""
         self._made.clear()
 
-    def _clouds(self, log: SensorLog) -> tuple[str, PointClouds]:
-        name = self.config.stream or log.of_type(PointClouds)
+    def _stream(self, streams: SensorLog | Feed) -> str | None:
+        return self.config.stream or streams.of_type(PointClouds)
+
+    def _named(self, where: str, name: str | None) -> str:
         if name is None:
-            raise MissingDataError("no stream of point clouds", where=log.name, wanted="PointClouds")
-        stream = log[name]
+            raise MissingDataError("no stream of point clouds", where=where, wanted="PointClouds")
+        return name
+
+    def _checked(self, name: str, stream: Any) -> PointClouds:
         if not isinstance(stream, PointClouds):
             raise ConfigError(f"frontend.stream = {name!r} holds no point clouds; got {type(stream).__name__}")
-        return name, stream
+        return stream
+
+    def _clouds(self, log: SensorLog) -> tuple[str, PointClouds]:
+        name = self._named(log.name, self._stream(log))
+        return name, self._checked(name, log[name])
 
     def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> Follow:
         cloud, ages = clouds.cloud(k), clouds.ages(k)

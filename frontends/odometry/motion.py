@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
@@ -101,13 +102,18 @@ def motion_stream(log: SensorLog) -> tuple[str, Motion]:
     MissingDataError
         If the log has none of them.
     """
-    for kind in (SteeringControls, VelocityControls, Odometry):
-        name = log.of_type(kind)
-        if name is not None:
-            return name, log[name]
-    raise MissingDataError(
-        "no motion to dead-reckon from", where=log.name, wanted="SteeringControls, VelocityControls or Odometry"
-    )
+    name = motion_stream_name(log)
+    if name is None:
+        raise MissingDataError(
+            "no motion to dead-reckon from", where=log.name, wanted="SteeringControls, VelocityControls or Odometry"
+        )
+    return name, log[name]
+
+
+def motion_stream_name(log: SensorLog | Feed) -> str | None:
+    """Name of the stream to dead-reckon from; None: there is none."""
+    found = (log.of_type(kind) for kind in (SteeringControls, VelocityControls, Odometry))
+    return next((name for name in found if name is not None), None)
 
 
 def dead_reckoning(

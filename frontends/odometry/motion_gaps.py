@@ -2,7 +2,7 @@
 
 Nothing tells what a robot did while its wheels were not recorded. The model: it went on at the mean of the speed and
 the yaw rate just before and just after the gap, off by an error that is constant over the gap and as large as the
-spread of all its speeds and yaw rates in the log about that mean. So after a gap of T seconds the distance has
+spread of all its speeds and yaw rates until then about that mean. So after a gap of T seconds the distance has
 σ = T · spread, and the heading likewise, up to that of a heading of which nothing is known. Increments that share a
 gap divide its variance by their time: their sum is right, and each of them is less certain than it need be.
 """
@@ -41,6 +41,8 @@ class MotionGap:
         Taken for it [m/s, rad/s].
     speed_sigma, yaw_rate_sigma : float
         Of the error that is constant over it.
+    usual : float
+        Time from record to record elsewhere [s].
     """
 
     begin: float
@@ -49,10 +51,11 @@ class MotionGap:
     yaw_rate: float
     speed_sigma: float
     yaw_rate_sigma: float
+    usual: float = SHORTEST
 
     def as_row(self) -> dict[str, float]:
         """JSON object for a report."""
-        return {k: float(getattr(self, k)) for k in self.__dataclass_fields__}
+        return {k: float(getattr(self, k)) for k in self.__dataclass_fields__ if k != "usual"}
 
 
 def bridged_reckoning(
@@ -96,6 +99,8 @@ def bridged_reckoning(
 def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, where: str) -> list[MotionGap]:
     """Gaps of the motion between two times.
 
+    What is said of a gap rests on the records up to :data:`AROUND` after its end: later ones change nothing of it.
+
     Raises
     ------
     DataError
@@ -111,13 +116,27 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
                 wanted=f"records at least every {limit:g} s (frontend.longest_gap)",
             )
         return []
-    usual = float(np.median(np.diff(stamps)))
     if not isinstance(motion, Odometry) and end > stamps[-1]:
         stamps = np.append(stamps, end)  # the last control is held to the end
     spacing = np.diff(stamps)
-    k = np.flatnonzero((spacing > max(3.0 * usual, SHORTEST)) & (stamps[1:] > begin) & (stamps[:-1] < end))
-    refuse_long(stamps, k, limit, where, option="frontend.longest_gap")
-    return [_gap(motion, float(stamps[i]), float(stamps[i + 1])) for i in k]
+    out, gaps = [], []
+    for i in np.flatnonzero((spacing > SHORTEST) & (stamps[1:] > begin) & (stamps[:-1] < end)):
+        known = int(np.searchsorted(motion.times, stamps[i + 1] + AROUND, side="right"))
+        usual = float(np.median(np.diff(motion.times[:known])))
+        if spacing[i] > 3.0 * usual:
+            gaps.append(i)
+            out.append(_gap(motion.take(slice(0, known)), float(stamps[i]), float(stamps[i + 1]), usual))
+    refuse_long(stamps, np.array(gaps, dtype=np.int64), limit, where, option="frontend.longest_gap")
+    return out
+
+
+def certain_until(motion: Motion) -> float:
+    """Until when nothing that is still to come changes what :func:`find_motion_gaps` says of the motion [s]."""
+    stamps = motion.times
+    if len(stamps) < 2:
+        return -np.inf
+    open_gaps = np.flatnonzero((np.diff(stamps) > SHORTEST) & (stamps[1:] + AROUND >= stamps[-1]))
+    return float(stamps[open_gaps[0]] if len(open_gaps) else stamps[-1])
 
 
 def rates(motion: Motion) -> tuple[Array, Array, Array]:
@@ -135,7 +154,7 @@ def rates(motion: Motion) -> tuple[Array, Array, Array]:
     return xi[:, 0] / dt, xi[:, 2] / dt, motion.times[:-1]
 
 
-def _gap(motion: Motion, begin: float, end: float) -> MotionGap:
+def _gap(motion: Motion, begin: float, end: float, usual: float) -> MotionGap:
     speed, rate, since = rates(motion)
     known = np.ones(len(since), dtype=np.bool_)
     over = -1
@@ -149,10 +168,10 @@ def _gap(motion: Motion, begin: float, end: float) -> MotionGap:
     w = float(np.mean([np.mean(rate[m]) for m in sides]))
     if over >= 0 and abs(speed[over]) >= LOST * abs(v):  # it tells the whole way, not how it went
         v, w = float(speed[over]), float(rate[over])
-        return MotionGap(begin, end, v, w, BRIDGED * abs(v), BRIDGED * abs(w))
+        return MotionGap(begin, end, v, w, BRIDGED * abs(v), BRIDGED * abs(w), usual)
     spread_v = float(np.sqrt(np.mean((speed[known] - v) ** 2)))
     spread_w = float(np.sqrt(np.mean((rate[known] - w) ** 2)))
-    return MotionGap(begin, end, v, w, spread_v, spread_w)
+    return MotionGap(begin, end, v, w, spread_v, spread_w, usual)
 
 
 def _filled(motion: Motion, gap: MotionGap) -> Motion:
@@ -164,7 +183,7 @@ def _filled(motion: Motion, gap: MotionGap) -> Motion:
         increments[k] = se2_exp((gap.end - gap.begin) * np.array([v, 0.0, w]))
         return replace(motion, increments=increments)
     k = int(np.searchsorted(motion.times, gap.begin)) + 1
-    times = np.insert(motion.times, k, gap.begin + min(float(np.median(np.diff(motion.times))), SHORTEST))
+    times = np.insert(motion.times, k, gap.begin + min(gap.usual, SHORTEST))
     if isinstance(motion, VelocityControls):
         return replace(
             motion, times=times, speed=np.insert(motion.speed, k, v), yaw_rate=np.insert(motion.yaw_rate, k, w)

@@ -26,9 +26,10 @@ from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
 from graphslam.backend.refining import Refined, refine_run
-from graphslam.backend.streams import ImuPart, imus_of
+from graphslam.backend.streams import ImuPart
 from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, RunFolderError
+from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
@@ -225,14 +226,14 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
             wanted="fixes.npz, or a run with gps.use = none",
         )
     imu: ImuOptions = build(ImuOptions, values.get("imu", {}), "imu")
-    imus: dict[str, Imu] = {}
+    feed: Feed | None = None
     if imu.use != "none" and run.folder is not None:
         taken, generation = consistent(run.folder, read_taken)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
-        imus = imus_of(taken.log)
+        feed = Feed(taken.log)
 
     def streams() -> dict[str, Any]:
-        return {"fixes": run.fixes, "gps": gps, "imu": ImuPart(imus, imu) if imus else None}
+        return {"fixes": run.fixes, "gps": gps, "imu": ImuPart(feed, imu) if feed and feed.names(Imu) else None}
 
     return build(BackEndConfig, values.get("backend", {}), "backend"), streams
 

@@ -15,7 +15,7 @@ from graphslam.association.identity import doubtful_identities
 from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
-from graphslam.backend.streams import ImuPart, recentred
+from graphslam.backend.streams import FixPart, ImuPart, recentred
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
@@ -85,6 +85,8 @@ class BackEnd:
     """With their maps; kept only where loops are looked for."""
     imu: ImuPart | None = None
     """IMUs of the log; None where there is no log."""
+    fixes: FixPart | None = None
+    """Fixes of the log, where they are to be used as they come."""
     observers: Sequence[Observer] = ()
 
     def __post_init__(self) -> None:
@@ -168,10 +170,16 @@ class BackEnd:
         waiting, self._waiting = self._waiting, []
         for gps, config in waiting:
             self.add_gps(gps, config)
+        self._give_fixes(submap.interval[1])
         later, self._later = self._later, []
         for add in later:
             add(self.graph)
         return associated
+
+    def _give_fixes(self, until: float) -> None:
+        gps = None if self.fixes is None else self.fixes.next(until)
+        if gps is not None and self.fixes is not None:
+            self.add_gps(gps, self.fixes.config)
 
     def _add_matches(self, submap: Submap) -> None:
         """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""
@@ -210,6 +218,7 @@ class BackEnd:
             Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
+        self._give_fixes(np.inf)
         self.graph.finish_gps()
         self.graph.finish_readings()
         if self.imu is not None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from graphslam.backend.config import BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.core.errors import MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Compass, Gps, LandmarkObservations
@@ -53,9 +54,38 @@ def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
     return used.with_sigma(config.sigma), withheld
 
 
-def imus_of(log: SensorLog) -> dict[str, Imu]:
-    """The IMUs of a log by name."""
-    return {name: s for name, s in log.streams.items() if isinstance(s, Imu)}
+class FixPart:
+    """The fixes of a run: the graph is given them submap by submap, as they come.
+
+    Parameters
+    ----------
+    feed : Feed
+    config : GpsOptions
+    """
+
+    def __init__(self, feed: Feed, config: GpsOptions) -> None:
+        self.feed, self.config = feed, config
+        self._given = 0
+        self._all: Gps | None = None
+
+    def next(self, until: float) -> Gps | None:
+        """Fixes up to a time [s] that count and were not given before; None: there is none."""
+        name = self.feed.of_type(Gps)
+        if name is None or self.config.use == "none":
+            return None
+        used = self._all
+        if used is None:
+            whole: Gps = self.feed.part(name)  # type: ignore[assignment]
+            used = split(whole, self.config)[0]
+            self._all = used if self.feed.ended else None
+        last = int(np.searchsorted(used.times, until, side="right"))
+        first, self._given = self._given, max(self._given, last)
+        return used.take(slice(first, last)) if last > first else None
+
+
+def imus_of(feed: Feed) -> dict[str, Imu]:
+    """The IMUs of a log by name, as far as they have come."""
+    return {name: feed.part(name) for name in feed.names(Imu)}  # type: ignore[misc]
 
 
 def compasses_of(log: SensorLog, config: CompassOptions) -> dict[str, Compass]:
@@ -105,7 +135,7 @@ class ImuPart:
 
     Parameters
     ----------
-    imus : dict of str to Imu
+    feed : Feed
     config : ImuOptions
 
     Raises
@@ -114,16 +144,22 @@ class ImuPart:
         ``config.use`` names a stream that the log does not have.
     """
 
-    def __init__(self, imus: dict[str, Imu], config: ImuOptions) -> None:
-        self.imus, self.config = imus, config
+    def __init__(self, feed: Feed, config: ImuOptions) -> None:
+        self.feed, self.config = feed, config
         self._looked: set[str] = set()
         self._given: set[str] = set()
-        if config.use not in ("none", "auto") and config.use not in imus:
+        known = feed.names(Imu)
+        if config.use not in ("none", "auto") and config.use not in known:
             raise MissingDataError(
                 "imu.use names no IMU of the log",
                 got=config.use,
-                wanted=f"none, auto, {', '.join(imus) or '(it has none)'}",
+                wanted=f"none, auto, {', '.join(known) or '(it has none)'}",
             )
+
+    @property
+    def imus(self) -> dict[str, Imu]:
+        """Those of the log by name, as far as they have come."""
+        return imus_of(self.feed)
 
     def look(self, graph: PoseGraph) -> None:
         """Hold the axes of every IMU against the path, once, as soon as there is enough of it.

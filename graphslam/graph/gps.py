@@ -228,8 +228,10 @@ class GpsFixes:
             fixes.append(Fix(g.next_factor(), t, p, s, gps.lever, self.config, P))
             g.ledger.spend(fixes[-1].factor_id, f"GPS fix at {t:.3f} s", [stream], (t, t))
         self.waiting = sorted([*self.waiting, *fixes], key=lambda f: f.time)
+        first = min((f.time for f in fixes), default=np.inf)
         for s in g.submaps:
-            self.tie(s, more=s is not g.submaps[-1])
+            if s.interval[1] >= first or s is g.submaps[-1]:
+                self.tie(s, more=s is not g.submaps[-1])
         return [f.factor_id for f in fixes]
 
     def finish(self) -> None:

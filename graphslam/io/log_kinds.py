@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.errors import FormatError
 from graphslam.core.gnss import Pseudoranges
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.npz import Field, check_arrays, floats, ints, texts
@@ -230,3 +231,19 @@ KINDS: dict[str, Kind] = {
     ),
 }
 """By the name that ``log.json`` gives."""
+
+
+def kind_name(stream: Any, where: str | None = None) -> str:
+    """Name of the kind of a stream.
+
+    Raises
+    ------
+    FormatError
+        A stream of another class.
+    """
+    for name, kind in KINDS.items():
+        if type(stream) is kind.cls:
+            return name
+    raise FormatError(
+        "stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=", ".join(KINDS)
+    )

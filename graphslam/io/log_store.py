@@ -20,22 +20,13 @@ from graphslam.core.npz import check_arrays, floats, ints
 from graphslam.core.reading import inside
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.log_kinds import KINDS, Arrays
+from graphslam.io.log_kinds import KINDS, Arrays, kind_name
 
 LOG_FORMAT = "graphslam.log/1"
 STREAM_FORMAT = "graphslam.stream/1"
 TRUTH_FORMAT = "graphslam.truth/1"
 INDEX_NAME = "log.json"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-
-
-def _kind_of(stream: Any, where: str) -> str:
-    for name, kind in KINDS.items():
-        if type(stream) is kind.cls:
-            return name
-    raise FormatError(
-        "stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=", ".join(KINDS)
-    )
 
 
 def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
@@ -54,7 +45,7 @@ def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
         where = f"{root}, stream {name!r}"
         if not _SAFE_NAME.fullmatch(name) or name.lower() == "truth":
             raise FormatError("stream name is no file name", where=where, wanted="letters, digits, _ . - (not truth)")
-        kind = _kind_of(stream, where)
+        kind = kind_name(stream, where)
         header = {"format": STREAM_FORMAT, "kind": kind}
         write_npz(root / f"{name}.npz", {**header, **KINDS[kind].arrays(stream)})
         entries.append({"name": name, "kind": kind, "file": f"{name}.npz", "records": len(stream.times)})

@@ -22,7 +22,7 @@ STREAMS = {
     *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "RangeScans", "SteeringControls"),
     "VelocityControls",
 }
-TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Submap", "Trajectory"}
+TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
 
 
 def test_tab_completion_offers_these_and_no_more() -> None:

@@ -32,6 +32,10 @@ from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmar
 
 @pytest.fixture
 def full_log(rng: np.random.Generator) -> SensorLog:
+    return every_kind(rng)
+
+
+def every_kind(rng: np.random.Generator) -> SensorLog:
     """One stream of every kind, with awkward values: float32 ranges, nan, infinite limits, no ids, empty streams."""
     t = np.cumsum(rng.uniform(0.01, 0.3, 5))
     poses3 = np.column_stack([rng.normal(size=(5, 3)), np.tile([0, 0, 0, 1.0], (5, 1))])

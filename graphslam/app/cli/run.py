@@ -76,6 +76,12 @@ def run(
     saved: list[Path] = typer.Option(
         [], "--continue", help="Folder of an earlier run; both become one graph in OUT/continued. May be repeated."
     ),
+    live: bool = typer.Option(False, "--live", help="Show the map in the viewer Rerun while it is made."),
+    live_file: Path | None = typer.Option(
+        None,
+        "--live-file",
+        help="Record what the viewer would show; replay it with `rerun FILE`.",
+    ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
@@ -83,6 +89,11 @@ def run(
     from graphslam.app.run.pipeline import run as run_pipeline
 
     options = run_options(config, setting)
+    observers = []
+    if live or live_file is not None:
+        from graphslam.app.live import LiveView
+
+        observers = [LiveView(source, file) for file in ([None] if live else []) + ([live_file] if live_file else [])]
     result = run_pipeline(
         source,
         frontend=frontend,
@@ -95,6 +106,7 @@ def run(
         reader=reader,
         reader_options=reader_options(reader_option),
         preset=preset,
+        observers=observers,
     )
     rows = result.metrics.to_dict("records")
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}

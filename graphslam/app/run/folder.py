@@ -66,10 +66,14 @@ class RunFolder:
                     )
                 folder._check_same(old, config)
             else:
-                with atomic_open(old, "w") as stream:
-                    stream.write(dump_toml(config))
+                folder.describe(config)
             sweep(folder.path)
             yield folder
+
+    def describe(self, config: Mapping[str, Any]) -> None:
+        """Write the configuration anew, with what is known of the log at its end."""
+        with atomic_open(self.path / CONFIG, "w") as stream:
+            stream.write(dump_toml(config))
 
     def _begun(self) -> bool:
         """Is there a run with anything to lose?"""

@@ -48,6 +48,8 @@ def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
         raise ConfigError(
             f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam.frontends.base.FrontEnd"
         )
+    if not made.incremental() and type(made).submaps is FrontEnd.submaps:
+        raise ConfigError(f"front end {name!r} is none: {kind.__name__} has neither submaps nor follow")
     return made
 
 
@@ -69,13 +71,8 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
     UnknownNameError
         There is no such preset for the front end.
     """
-    if preset == "none":
-        return {}
     if preset is not None:
-        known = cfg.preset_names(frontend)
-        if preset not in known:
-            raise UnknownNameError(f"preset for front end {frontend!r}", preset, [*known, "none"])
-        return cfg.preset(f"{preset}.{frontend}")
+        return named_preset(frontend, preset)
     values = cfg.preset(f"{preset_of(log, frontend)[0]}.{frontend}")
     noise = log.meta.get("noise", {})
     simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
@@ -84,6 +81,22 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
         values = merge({"frontend": {"motion": motion}}, values)
     return values
+
+
+def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
+    """Settings of a preset for a front end; of ``none``, and of None, nothing.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such preset for the front end.
+    """
+    if preset is None or preset == "none":
+        return {}
+    known = cfg.preset_names(frontend)
+    if preset not in known:
+        raise UnknownNameError(f"preset for front end {frontend!r}", preset, [*known, "none"])
+    return cfg.preset(f"{preset}.{frontend}")
 
 
 def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from graphslam.app.run.folder import RunFolder
 from graphslam.backend.back_end import BackEnd, Observer
+from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
@@ -61,44 +62,61 @@ class FrontEndWork:
     per_scan: Array
 
 
-def front_to_back(
-    log: SensorLog,
-    front: FrontEnd,
-    back: BackEnd,
-    seed: SeedTree,
-    folder: RunFolder | None,
-    drops: DropCounter,
-    with_grids: bool,
-) -> tuple[list[Submap], FrontEndWork]:
-    """Feed every submap to the back end as soon as it is finished and stored."""
-    store = None if folder is None else folder.submaps_with(load_npz if with_grids else None)
-    submaps = store.complete_prefix() if store is not None else []
-    if store is not None:
-        store.truncate(len(submaps))
-    for s in submaps:
-        back.add(s)
-    if submaps:
-        logger.info("resumed after submap %d at %.2f s", submaps[-1].key, submaps[-1].interval[1])
-    front_s, resumed, cost = 0.0, len(submaps), []
+class FrontToBack:
+    """Feeds every submap to the back end as soon as the front end has made it of the records that have come.
 
-    def watch(at: Any) -> None:
-        for o in back.observers:
+    Parameters
+    ----------
+    feed : Feed
+    front : FrontEnd
+    back : BackEnd
+    seed : SeedTree
+    folder : RunFolder or None
+        Where submaps are stored; those that are there already are not made again.
+    with_grids : bool
+        The grids of stored submaps are needed.
+    """
+
+    def __init__(
+        self, feed: Feed, front: FrontEnd, back: BackEnd, seed: SeedTree, folder: RunFolder | None, with_grids: bool
+    ) -> None:
+        self.front, self.back, self.feed = front, back, feed
+        self.drops = DropCounter()
+        self.store = None if folder is None else folder.submaps_with(load_npz if with_grids else None)
+        self.submaps: list[Submap] = self.store.complete_prefix() if self.store is not None else []
+        if self.store is not None:
+            self.store.truncate(len(self.submaps))
+        for s in self.submaps:
+            back.add(s)
+        last = self.submaps[-1] if self.submaps else None
+        if last is not None:
+            logger.info("resumed after submap %d at %.2f s", last.key, last.interval[1])
+        self._resumed, self._seconds, self._since, self._cost = len(self.submaps), 0.0, 0.0, list[float]()
+        self._stream = front.follow(feed, seed=seed.child("frontend"), after=last, drops=self.drops, watch=self._watch)
+
+    def step(self) -> None:
+        """Use what has come; at the end of the log everything is used."""
+        while True:
+            start = time.perf_counter()
+            submap = next(self._stream, None)
+            spent = time.perf_counter() - start
+            self._seconds, self._since = self._seconds + spent, self._since + spent
+            if submap is None:  # more records are wanted, or there are none
+                return
+            if isinstance(submap.grid, EvidenceGrid):
+                submap.grid.pool.release_scratch()
+            if self.store is not None:
+                self.store.append(submap)
+            self.back.add(submap)
+            self.submaps.append(submap)
+            self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
+            self._since = 0.0
+
+    @property
+    def work(self) -> FrontEndWork:
+        """What the front end did so far."""
+        return FrontEndWork(self._seconds, self._resumed, np.array(self._cost[1:]))
+
+    def _watch(self, at: Any) -> None:
+        for o in self.back.observers:
             o.front_end_at(at)
-
-    last = submaps[-1] if submaps else None
-    stream = front.submaps(log, seed=seed.child("frontend"), after=last, drops=drops, watch=watch)
-    while True:
-        start = time.perf_counter()
-        submap = next(stream, None)
-        spent = time.perf_counter() - start
-        front_s += spent
-        if submap is None:
-            break
-        if isinstance(submap.grid, EvidenceGrid):
-            submap.grid.pool.release_scratch()
-        if store is not None:
-            store.append(submap)
-        back.add(submap)
-        submaps.append(submap)
-        cost.append(spent / max(int(submap.report.get("scans", 1)), 1))
-    return submaps, FrontEndWork(front_s, resumed, np.array(cost[1:]))

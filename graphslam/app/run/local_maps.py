@@ -14,6 +14,7 @@ from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.source import load_log_source
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError
+from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
@@ -97,4 +98,5 @@ def first_particles(
     if not isinstance(made, RbpfEkf):
         raise ConfigError(f"front end {frontend!r} makes no local maps of particles; wanted rbpf-ekf")
     with one_blas_thread():
-        return next(made.with_particles(log, seed=SeedTree(seed).child("frontend")))
+        found = made.with_particles(Feed(log), seed=SeedTree(seed).child("frontend"))
+        return next(x for x in found if x is not None)

@@ -22,7 +22,7 @@ from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import make_front_end, preset_of, recommended
-from graphslam.app.run.front_to_back import FrontEndWork, ProgressBar, front_to_back
+from graphslam.app.run.front_to_back import FrontEndWork, FrontToBack, ProgressBar
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_facts, write_outputs
 from graphslam.app.run.run import Run
@@ -33,9 +33,10 @@ from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.refining import refine_run, refined_ledger
-from graphslam.backend.streams import ImuPart, beacons_of, compasses_of, imus_of, split, used_fixes
+from graphslam.backend.streams import FixPart, ImuPart, beacons_of, compasses_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge
 from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.feed import Feed
 from graphslam.core.findings import verdict_json
 from graphslam.core.heap import give_back
 from graphslam.core.json_file import check_json
@@ -72,7 +73,6 @@ from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.formats import load_npz
-from graphslam.frontends.base import FrontEnd
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
@@ -198,43 +198,50 @@ def _run(
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]
     effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
-    back = _back_end(log, settings, solver, [ProgressBar(log, progress), *observers])
+    back = back_end(Feed(log), settings, solver, [ProgressBar(log, progress), *observers])
+
+    def finish(folder: RunFolder | None, undone: Sequence[int | Decision]) -> Run:
+        tree = SeedTree(seed)
+        work = FrontToBack(Feed(log), front, back, tree, folder, with_grids(settings))
+        work.step()
+        return finished(log, work, settings, effective, seconds, begin, undone, noticed)
+
     if out is None:
-        return _made(log, front, back, settings, effective, None, seconds, begin, undo or (), noticed)
-    effective["run"]["log"] = log_digest(recorded)
-    effective = tomllib.loads(dump_toml(effective))  # as it comes back from the folder, order and all
+        return finish(None, undo or ())
+    effective = with_digest(effective, recorded)
     with RunFolder.start(out, effective, resume=resume) as folder:
         if undo is None:  # what was taken out of a run stays out when it is gone on with
             undo = undone_of_run(folder.path) if resume else ()
-        result = _made(log, front, back, settings, effective, folder, seconds, begin, undo, noticed)
-        return write_outputs(folder.path, result)
+        return write_outputs(folder.path, finish(folder, undo))
 
 
-def _made(
+def with_digest(effective: dict[str, Any], log: SensorLog) -> dict[str, Any]:
+    """The options of a run and what tells its log from others, as they come back from the folder, order and all."""
+    effective = {**effective, "run": {**effective["run"], "log": log_digest(log)}}
+    return tomllib.loads(dump_toml(effective))
+
+
+def finished(
     log: SensorLog,
-    front: FrontEnd,
-    back: BackEnd,
+    work: FrontToBack,
     settings: cfg.RunConfig,
     effective: dict[str, Any],
-    folder: RunFolder | None,
     seconds: dict[str, float],
     begin: float,
     undo: Sequence[int | Decision],
     noticed: Sequence[Noticed],
 ) -> Run:
-    """Submaps of the front end, in the graph of the back end, solved and judged."""
-    drops = DropCounter()
-    tree, grids = SeedTree(effective["run"]["seed"]), _with_grids(settings)
-    submaps, work = front_to_back(log, front, back, tree, folder, drops, grids)
-    if not submaps:
+    """The run of a log whose submaps are all in the graph of the back end: solved and judged."""
+    if not work.submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
+    front = work.front
     steps = front.steps(log) if settings.refine.use else None
     scans = None if steps is None else Scans.of(steps)
     del steps
     front.forget()
     give_back()
-    taken = take(log, drops.counts, reference_identities(log, front), noticed, scans)
-    result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
+    taken = take(log, work.drops.counts, reference_identities(log, front), noticed, scans)
+    result = _solved(taken, settings, work.submaps, work.back, seconds, begin, work.work, effective, undo)
     return replace(result, log=log)
 
 
@@ -268,8 +275,8 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
         wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
         said = check_json(effective, wanted, str(root / CONFIG))["run"]
         settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-        back = _back_end(taken.log, settings, said["solver"], [ProgressBar(taken.log, progress)])
-        submaps = read_submaps(root, load_grid=load_npz if _with_grids(settings) else None)
+        back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
+        submaps = read_submaps(root, load_grid=load_npz if with_grids(settings) else None)
         seconds = {"load": time.perf_counter() - begin}
         for s in submaps:
             back.add(s)
@@ -278,20 +285,20 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
         return write_outputs(root, result)
 
 
-def _back_end(log: SensorLog, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
+def back_end(feed: Feed, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
     """A back end that has its IMUs, and the fixes that are to be used."""
-    back = BackEnd(settings.backend, solver, imu=ImuPart(imus_of(log), settings.imu), observers=observers)
-    gps = gps_stream(log)
-    if gps is not None and settings.gps.use != "none":
-        back.add_gps(split(gps, settings.gps)[0], settings.gps)
-    for name, compass in compasses_of(log, settings.compass).items():
+    fixes = FixPart(feed, settings.gps)
+    back = BackEnd(settings.backend, solver, imu=ImuPart(feed, settings.imu), observers=observers, fixes=fixes)
+    if not feed.ended:  # compasses and beacons are given whole
+        return back
+    for name, compass in compasses_of(feed.log, settings.compass).items():
         back.add_compass(name, compass, settings.compass)
-    for name, ranges in beacons_of(log, settings.beacons).items():
+    for name, ranges in beacons_of(feed.log, settings.beacons).items():
         back.add_beacons(name, ranges, settings.beacons)
     return back
 
 
-def _with_grids(settings: cfg.RunConfig) -> bool:
+def with_grids(settings: cfg.RunConfig) -> bool:
     """Are the grids of stored submaps needed?"""
     return bool(settings.backend.loops or settings.map.fuse)
 

@@ -20,9 +20,10 @@ from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.pipeline import again
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import solve_choice
-from graphslam.backend.streams import ImuPart, imus_of
+from graphslam.backend.streams import ImuPart
 from graphslam.core.config import build
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
+from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_store import load_log, save_log
@@ -82,7 +83,7 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert run.graph.imu.used
     remade(tmp_path / "run")
     settings = build(cfg.RunConfig, {"imu": {"use": "auto"}})
-    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(imus_of(short), settings.imu))
+    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(Feed(short), settings.imu))
     back.finish()
     assert back.graph.objective().total == pytest.approx(run.metric("objective"), rel=1e-6)
 
@@ -171,7 +172,7 @@ def test_a_run_that_failed_before_its_first_submap_does_not_block(
     log: SensorLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as m:
-        m.setattr(pipeline, "front_to_back", lambda *_: ([], None))
+        m.setattr(pipeline.FrontToBack, "step", lambda _: None)
         with pytest.raises(MissingDataError, match="no submap"):
             gs.run(log, seed=1, out=tmp_path / "run", progress=False)
     assert (tmp_path / "run" / "config.toml").is_file()

@@ -86,8 +86,11 @@ def test_moment_matching_equals_the_moments_of_a_large_sample(inflate):
     np.testing.assert_allclose(got.covariance / np.outer(s, s), expected / np.outer(s, s), atol=0.02)
 
 
+SIGMA = np.array([0.5, 0.5, 0.1])
+
+
 def stopping(**config):
-    return Stopping(StoppingConfig(min_scans=1, **config), np.array([0.5, 0.5, 0.1]))
+    return Stopping(StoppingConfig(min_scans=1, **config))
 
 
 def test_each_criterion_names_itself():
@@ -95,15 +98,15 @@ def test_each_criterion_names_itself():
     p.scans = 5
     u = np.array([1.0, 0.0, 0.0])
     p.hits[0, :4] = 3
-    assert stopping(num_features=4).reason(p, 0.2, u, 1) == "features"
-    assert stopping(num_features=5).reason(p, 0.2, u, 1) is None
+    assert stopping(num_features=4).reason(p, 0.2, u, 1, SIGMA) == "features"
+    assert stopping(num_features=5).reason(p, 0.2, u, 1, SIGMA) is None
     p.resamplings = 3
-    assert stopping(max_resamplings=3).reason(p, 0.2, u, 1) == "diversity"
+    assert stopping(max_resamplings=3).reason(p, 0.2, u, 1, SIGMA) == "diversity"
     p.ancestor[:] = 1
-    assert stopping(min_ancestors=1).reason(p, 0.2, u, 1) == "diversity"
-    assert stopping(max_distance=0.9).reason(p, 0.2, u, 1) == "distance"
-    assert stopping(max_scans=5).reason(p, 0.2, u, 1) == "scans"
-    assert Stopping(StoppingConfig(min_scans=6, max_scans=5), np.ones(3)).reason(p, 0.2, u, 1) is None
+    assert stopping(min_ancestors=1).reason(p, 0.2, u, 1, SIGMA) == "diversity"
+    assert stopping(max_distance=0.9).reason(p, 0.2, u, 1, SIGMA) == "distance"
+    assert stopping(max_scans=5).reason(p, 0.2, u, 1, SIGMA) == "scans"
+    assert Stopping(StoppingConfig(min_scans=6, max_scans=5)).reason(p, 0.2, u, 1, SIGMA) is None
 
 
 def test_a_fixed_number_of_scans_overrules_every_other_criterion():
@@ -111,10 +114,10 @@ def test_a_fixed_number_of_scans_overrules_every_other_criterion():
     p.hits[0, :9] = 3
     p.resamplings, p.ancestor[:] = 9, 0
     everything = {"num_features": 1, "max_resamplings": 1, "min_ancestors": 3, "max_distance": 0.1, "max_scans": 1}
-    s = Stopping(StoppingConfig(min_scans=1, scans=4, **everything), np.ones(3))
+    s = Stopping(StoppingConfig(min_scans=1, scans=4, **everything))
     reasons = []
     for p.scans in range(1, 5):
-        reasons.append(s.reason(p, 100.0, np.ones(3), 0))
+        reasons.append(s.reason(p, 100.0, np.ones(3), 0, SIGMA))
     assert reasons == [None, None, None, "scans"]
     with pytest.raises(ConfigError, match="scans"):
         StoppingConfig(scans=-1)
@@ -128,8 +131,8 @@ def test_a_filter_without_particles_can_be_watched():
             return np.ones(3)
 
     u = np.array([1.0, 0.0, 0.0])
-    assert stopping(min_ancestors=3, max_resamplings=1, num_features=6).reason(Plain(), 0.2, u, 1) is None
-    assert stopping(num_features=5).reason(Plain(), 0.2, u, 1) == "features"
+    assert stopping(min_ancestors=3, max_resamplings=1, num_features=6).reason(Plain(), 0.2, u, 1, SIGMA) is None
+    assert stopping(num_features=5).reason(Plain(), 0.2, u, 1, SIGMA) == "features"
 
 
 def test_time_without_features_shrinks_with_pose_uncertainty():
@@ -140,7 +143,7 @@ def test_time_without_features_shrinks_with_pose_uncertainty():
         p.pose[:, 0] = [-spread, spread]  # standard deviation = spread, ε_x = 0.5
         s = stopping(time_max=8.0, max_distance=1e9)
         waited = 0.0
-        while s.reason(p, 0.2, np.zeros(3), 0) is None:
+        while s.reason(p, 0.2, np.zeros(3), 0, SIGMA) is None:
             waited += 0.2
             assert waited < 20
         assert waited == pytest.approx(limit, abs=0.21)
@@ -151,7 +154,7 @@ def test_seeing_a_feature_starts_the_clock_anew():
     p.scans = 5
     s = stopping(time_max=1.0, max_distance=1e9)
     for k in range(40):
-        assert s.reason(p, 0.2, np.zeros(3), int(k % 4 == 0)) is None
+        assert s.reason(p, 0.2, np.zeros(3), int(k % 4 == 0), SIGMA) is None
 
 
 @pytest.fixture(scope="module")

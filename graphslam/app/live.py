@@ -1,0 +1,123 @@
+"""A run to look at while it goes on: path, map and loops in the viewer Rerun, or in a file that it replays."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphslam.backend.back_end import Observer
+from graphslam.core.errors import MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.core.submap import Submap
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.submap_node import SubmapNode
+from graphslam.loops.ledger import Decision
+from graphslam.solve.solution import Solution
+
+POINTS = 4000
+"""Points of a submap that are sent at most, about."""
+PATH, LANDMARKS, BELIEVED, DOUBTED = (31, 119, 180), (214, 39, 40), (44, 160, 44), (160, 160, 160)
+
+
+class LiveView(Observer):
+    """Shows a run as it goes on.
+
+    The timeline ``submap`` counts the submaps in the graph, ``seconds`` is the clock of the log. What a submap holds is
+    sent once, in its own frame, and its place anew whenever the graph is solved: what moves is the map, as in the run.
+    Under ``map``: ``submap-…`` with ``points``, ``path`` (nodes of the graph), ``landmarks``, ``loops/…``; what was
+    decided on, in words, under ``said``. A refinement by scans comes after all that and is not shown.
+
+    Parameters
+    ----------
+    name : str
+        Of the log.
+    file : path, optional
+        Recording that is written (``.rrd``) instead of opening a viewer.
+
+    Raises
+    ------
+    MissingDataError
+        Rerun is not installed.
+    """
+
+    def __init__(self, name: str, file: str | Path | None = None) -> None:
+        try:
+            self.rr: Any = importlib.import_module("rerun")
+        except ImportError as error:
+            raise MissingDataError(
+                "a live view needs Rerun, which is not installed",
+                got=error,
+                wanted='pip install "graphslam-submaps[live]"',
+            ) from error
+        self.stream = self.rr.RecordingStream(f"graphslam {name}")
+        if file is None:
+            self.stream.spawn()
+        else:
+            Path(file).parent.mkdir(parents=True, exist_ok=True)
+            self.stream.save(str(file))
+        self.stream.log("map", self.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+        """What it holds, and where everything is now."""
+        self.stream.set_time("submap", sequence=len(graph.submaps))
+        self.stream.set_time("seconds", duration=submap.interval[1])
+        points = shown_points(submap)
+        if len(points):
+            self.stream.log(f"map/submap-{submap.key}/points", self.rr.Points3D(points))
+        self._places(graph.submaps, np.asarray(graph.values.poses), np.asarray(graph.values.landmarks))
+
+    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+        """A line from base to base, green where it was believed; and why."""
+        nodes = {s.key: s.node for s in graph.submaps}
+        ends = graph.values.poses[[nodes[decision.submap_i], nodes[decision.submap_j]], : graph.dim]
+        colour = BELIEVED if decision.verdict == "accepted" else DOUBTED
+        line = self.rr.LineStrips3D([raised(ends)], colors=[colour], labels=[decision.verdict])
+        self.stream.log(f"map/loops/{decision.loop}", line)
+        said = f"loop {decision.loop}, submaps {decision.submap_i} and {decision.submap_j}: {decision.verdict}"
+        self.stream.log("said", self.rr.TextLog(f"{said}, {decision.why}" if decision.why else said))
+
+    def solved(self, solution: Solution) -> None:
+        """The end: everything where the optimum has it."""
+        self._places(solution.submaps, solution.poses, solution.landmarks)
+        self.stream.log("said", self.rr.TextLog("solved" if solution.converged else "not solved"))
+        self.stream.disconnect()  # the file is whole
+
+    def _places(self, submaps: Sequence[SubmapNode], poses: Array, landmarks: Array) -> None:
+        rr, dim = self.rr, group_of(poses).dim
+        for s in submaps:
+            x, q = in_space(poses[s.node])
+            self.stream.log(f"map/submap-{s.key}", rr.Transform3D(translation=x, quaternion=q))
+        self.stream.log("map/path", rr.LineStrips3D([raised(poses[:, :dim])], colors=[PATH]))
+        if len(landmarks):
+            self.stream.log("map/landmarks", rr.Points3D(raised(landmarks), radii=0.3, colors=LANDMARKS))
+
+
+def shown_points(submap: Submap) -> Array:
+    """Points ``(n, 3)`` of what is solid in a submap, in the frame of its base; few enough to be sent."""
+    if submap.cloud is not None:
+        points = submap.cloud.points
+    elif isinstance(submap.grid, EvidenceGrid):
+        points = submap.grid.occupied_cloud()
+    else:
+        return np.zeros((0, 3))
+    return raised(points[:: max(1, -(-len(points) // POINTS))])
+
+
+def raised(points: Array) -> Array:
+    """Points in space ``(n, 3)``: those of the plane at height 0."""
+    points = np.asarray(points, dtype=np.float64)
+    return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+
+
+def in_space(pose: Array) -> tuple[Array, Array]:
+    """Place ``(3,)`` and quaternion ``(4,)`` x y z w of a pose ``(3,)`` or ``(7,)``."""
+    if len(pose) == 7:
+        return pose[:3], pose[3:]
+    half = 0.5 * float(pose[2])
+    return np.array([pose[0], pose[1], 0.0]), np.array([0.0, 0.0, np.sin(half), np.cos(half)])

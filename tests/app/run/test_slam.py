@@ -1,0 +1,182 @@
+"""Records fed one by one give the run over the stored log, to the last byte; what is known on the way is there."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import graphslam as gs
+from graphslam.app.run.outputs import SAME_BYTES
+from graphslam.app.run.slam import Slam
+from graphslam.app.worlds import mesh_world
+from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
+from graphslam.core.log import SensorLog
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from tests.frontends.landmarks.test_preparing import in_portions
+
+QUIET = {"calibrate": {"use": "none"}}
+LANDMARKS: dict[str, Any] = {**QUIET, "gps": {"use": "every-second", "every": 2.0}}
+CLOUDS: dict[str, Any] = {"frontend": {"submap": {"length": 1.5, "points": 300, "reach": 15.0}}}
+BEAMS: dict[str, Any] = {**QUIET, "frontend": {"filter": {"particles": 4}, "steps": {"max_range": 8.0}}}
+
+
+def landmarks() -> SensorLog:
+    return gs.simulate("landmark-field", preset="quick", seed=3, gps_rate=1.0, gps_sigma=0.3)
+
+
+def clouds() -> SensorLog:
+    config = LidarConfig(rate=4.0, points=2000, lines=32)
+    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=6.0)
+
+
+def beams() -> SensorLog:
+    whole = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
+    begin, _ = whole.interval
+    return whole.slice(begin, begin + 15.0)
+
+
+def same_files(folder: Path) -> dict[str, bytes]:
+    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.is_file()}
+    return {n: p.read_bytes() for n, p in files.items() if any(fnmatch(n, like) for like in SAME_BYTES)}
+
+
+def fed(log: SensorLog, slam: Slam, seed: int = 0) -> None:
+    for name, part in in_portions(log, seed):
+        slam.add(part, name)
+
+
+@pytest.mark.parametrize(
+    ("frontend", "log", "config"),
+    [
+        ("ekf", landmarks, LANDMARKS),
+        ("rbpf-ekf", landmarks, {**LANDMARKS, "frontend": {"particles": 10}}),
+        ("kiss-icp", clouds, CLOUDS),
+        ("segslam", beams, BEAMS),
+    ],
+    ids=["ekf", "rbpf-ekf", "kiss-icp", "segslam"],
+)
+def test_a_fed_run_is_the_run_over_the_stored_log(
+    frontend: str, log: Any, config: dict[str, Any], tmp_path: Path
+) -> None:
+    log = log()
+    with gs.Slam(frontend, name=log.name, seed=4, out=tmp_path / "fed", config=config) as slam:
+        fed(log, slam)
+        before = len(slam.submaps)
+        assert (before > 0) == (not slam.waits_for)
+        run = slam.finish()
+    stored = gs.run(
+        slam.log, frontend=frontend, seed=4, out=tmp_path / "stored", config=config, preset="none", progress=False
+    )
+    a, b = same_files(tmp_path / "fed"), same_files(tmp_path / "stored")
+    assert len([n for n in a if n.startswith("submaps/")]) > len(run.submaps) >= max(before, 1)
+    assert {"run.json", "config.toml", "graph.g2o", "trajectory.tum"} <= set(a)
+    assert set(a) == set(b)
+    assert [n for n in a if a[n] != b[n]] == []
+    if frontend not in ("ekf", "kiss-icp"):
+        return
+    # the records themselves are those that were given
+    gs.run(log, frontend=frontend, seed=4, out=tmp_path / "own", config=config, preset="none", progress=False)
+    own = same_files(tmp_path / "own")
+    unnamed = [n for n in a if fnmatch(n, "submaps/*.npz") or n in ("graph.g2o", "trajectory.tum", "landmarks.csv")]
+    assert [n for n in unnamed if a[n] != own[n]] == []
+    assert stored.metric("submaps") == run.metric("submaps")
+
+
+def test_what_was_fed_is_on_the_map_before_the_end_and_looking_at_it_changes_nothing() -> None:
+    log, ends = landmarks(), []
+    looked, blind = (gs.Slam("ekf", config=LANDMARKS) for _ in range(2))
+    with pytest.raises(MissingDataError, match="no submap is finished"):
+        _ = looked.map
+    for name, part in in_portions(log, 1):
+        looked.add(part, name)
+        blind.add(part, name)
+        if len(looked.submaps) > len(ends):
+            ends.append(looked.path.times[-1])
+            assert ends[-1] == looked.submaps[-1].interval[1] <= part.times[-1]
+            assert len(looked.map.landmarks)
+    assert len(ends) > 1
+    truth = log.truth
+    assert truth is not None
+    here = truth.trajectory.interpolate(np.array([ends[-1]]))[0]
+    assert np.hypot(*(looked.path.poses[-1] - here)[:2]) < 0.5
+    a, b = looked.finish(), blind.finish()
+    assert a.map.trajectory.poses.tobytes() == b.map.trajectory.poses.tobytes()
+    assert looked.map is a.map
+    assert looked.finish() is a
+
+
+def test_beams_that_were_used_leave_the_memory() -> None:
+    log = clouds()
+    bytes_of_all = sum(c.nbytes for c in log["clouds"])
+    most, slam = 0, gs.Slam("kiss-icp", config=CLOUDS)
+    tracemalloc.start()
+    for name, part in in_portions(log, 0, most=1):
+        slam.add(part, name)
+        held = slam._feed.held_records
+        most = max(most, held["clouds"])
+    kept = sum(t.size for t in tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/io/*")]).traces)
+    tracemalloc.stop()
+    assert most <= 2
+    assert kept < 0.1 * bytes_of_all
+    run = slam.finish()  # and they are all there where the end asks for them
+    assert all(np.array_equal(a, b) for a, b in zip(run.log["clouds"], log["clouds"], strict=True))
+
+
+def test_a_record_that_cannot_be_used_is_refused_and_others_follow() -> None:
+    log, slam = landmarks(), gs.Slam("ekf", config=QUIET)
+    first, second = (log["controls"].take(slice(k, k + 1)) for k in (0, 1))
+    slam.add(second, "controls")
+    with pytest.raises(DataError, match="time does not increase"):
+        slam.add(first, "controls")
+    with pytest.raises(DataError, match="another kind"):
+        slam.add(log["landmarks"].take(slice(3, 4)), "controls")
+    other = replace(log["controls"].take(slice(2, 3)), geometry=gs_geometry(3.3))
+    with pytest.raises(DataError, match="wheelbase"):
+        slam.add(other, "controls")
+    slam.add(log["controls"].take(slice(2, None)), "controls")
+    slam.add(log["landmarks"])
+    run = slam.finish()
+    assert set(run.log.streams) == {"controls", "landmark-observations"}
+    assert len(run.log["controls"].times) == len(log["controls"].times) - 1
+    with pytest.raises(DataError, match="after the end"):
+        slam.add(second, "controls")
+
+
+def gs_geometry(wheelbase: float) -> Any:
+    from graphslam.core.records import AckermannGeometry
+
+    return AckermannGeometry(wheelbase=wheelbase)
+
+
+def test_a_front_end_that_fails_closes_it(tmp_path: Path) -> None:
+    log = landmarks()
+    nameless = replace(log["landmarks"], ids=None)
+    slam = gs.Slam("ekf", out=tmp_path / "run", config={**QUIET, "frontend": {"association": "known"}})
+    slam.add(nameless, "landmarks")
+    with pytest.raises(MissingDataError, match="identities"):
+        slam.add(log["controls"], "controls")
+    with pytest.raises(DataError, match="closed"):
+        slam.finish()
+    gs.Slam("ekf", out=tmp_path / "run", config=QUIET).close()  # the lock was given back
+
+
+def test_what_needs_the_whole_log_is_named() -> None:
+    assert "ekf-slam" in gs.Slam("ekf-slam").waits_for
+    assert "imu" in gs.Slam("kiss-icp", config={"imu": {"use": "auto"}}).waits_for
+    assert "calibration" in gs.Slam("ekf", config={"calibrate": {"use": "always"}}).waits_for
+    assert gs.Slam("ekf").waits_for == ""
+    with pytest.raises(UnknownNameError):
+        gs.Slam("kis-icp")
+    with pytest.raises(UnknownNameError):
+        gs.Slam("ekf", preset="nowhere")
+    with pytest.raises(ConfigError):
+        gs.Slam("ekf", config={"frontend": {"particle": 3}})
