@@ -38,6 +38,8 @@ BEGIN, END = -5.0, 30.0
 """Of the street along x [m]."""
 WIRE = 0.012
 """Thickness of a wire [m]."""
+RAMP_LENGTH = 3.0
+"""Of a ramp along the street [m]."""
 FALL = 0.4
 """Beyond the edge of a drop or of stairs down so much of the ground counts as the hazard [m]."""
 _FINE = 0.025
@@ -110,7 +112,7 @@ class Street:
         elif self.kind == "stairs":
             out = out + f["height"] * np.clip(np.ceil(u / 0.28), 0, 8)
         elif self.kind == "ramp":
-            out = out + np.tan(np.deg2rad(f["angle"])) * np.clip(u, 0.0, 3.0)
+            out = out + np.tan(np.deg2rad(f["angle"])) * np.clip(u, 0.0, RAMP_LENGTH)
         elif self.kind == "hole":
             out = out - np.where((u > 0) & (u < f["length"]) & (np.abs(y) < 0.8), f["depth"], 0.0)
         return np.asarray(out)
@@ -134,7 +136,7 @@ class Street:
         if self.kind == "stairs":
             x += [self.target_at + 0.28 * k for k in range(1, 8)]
         if self.kind == "ramp":
-            x.append(self.target_at + 3.0)
+            x.append(self.target_at + RAMP_LENGTH)
         if self.kind == "hole":
             x.append(self.target_at + f["length"])
         y = [self.side * self.side_at] + ([-0.8, 0.8] if self.kind == "hole" else [])
@@ -212,7 +214,7 @@ class Street:
             inside = (u > 0) & (u < self.figures["length"]) & (np.abs(Y) < 0.8)
             fine[(maximum_filter(inside.astype(np.int8), 3) > 0) & (self.figures["depth"] > step)] = HOLE
         if self.kind == "ramp" and abs(np.deg2rad(self.figures["angle"])) > slope:
-            fine[(u > 0) & (u < 3.0)] = STEEP
+            fine[(u > 0) & (u < RAMP_LENGTH)] = STEEP
         if self.kind == "wire" and self.figures["height"] < height:
             fine[np.abs(u) < 0.5 * WIRE + 0.5 * _FINE] = OBSTACLE
         for cx, cy, yaw in self.cars():

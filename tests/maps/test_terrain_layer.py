@@ -10,7 +10,7 @@ import pytest
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GridError
 from graphslam.core.geometry import Array
-from graphslam.maps.terrain.ground import common_up, ground_plane, heights_along, level_rotation
+from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines
 from graphslam.maps.terrain.pyramid import Pyramid
@@ -178,10 +178,5 @@ def test_up_and_height_are_found_from_the_ground() -> None:
     sky = np.abs(rng.standard_normal((100, 3)))
     nothing = ground_plane(sky, np.zeros(3), np.array([0.0, 0.0, 1.0]))
     assert nothing is None
-    heights, missing = heights_along([nothing, *planes])
-    assert missing == 1
-    assert np.allclose(heights, 1.6, atol=0.03)
     with pytest.raises(DataError, match="where up is"):
         common_up([nothing, planes[0]])
-    with pytest.raises(DataError, match="not found in any scan"):
-        heights_along([nothing])

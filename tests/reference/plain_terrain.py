@@ -125,19 +125,17 @@ class PlainLine:
                     self.say(5, round(1000 * abs(bend)), x, y, s[i])
             elif f.clearance < above[i] <= f.above_limit:
                 self.say(2 if above[i] <= f.height else 3, 1, x, y, s[i])
-            place, height, slope, hidden = before[i]
-            slope = min(slope, 0.0)
-            fall = (p[i][2] - self.origin[2]) / s[i]
-            if on[i] != 1 and fall < slope - 1e-6 and not hidden:
-                pierced = (height - slope * place - self.origin[2]) / (fall - slope)
-                if 0 < pierced < s[i] - 0.1 and pierced - place < f.memory:
+            place, height, _, hidden = before[i]
+            o = self.origin
+            depth = height - f.slack * (s[i] - place) - p[i][2]
+            if on[i] != 1 and depth > 0 and not hidden and o[2] > height > p[i][2]:
+                pierced = s[i] * (o[2] - height) / (o[2] - p[i][2])
+                if pierced < s[i] - 0.1 and pierced - place < f.memory:
                     at = pierced
                     while at <= min(s[i], pierced + f.support_reach):
-                        depth = (slope - fall) * (at - pierced) - f.support_slack * (at - pierced)
                         share = at / s[i]
-                        o = self.origin
                         where = (o[0] + share * (x - o[0]), o[1] + share * (y - o[1]), at)
-                        self.say(1, min(max(round(100 * depth), 0), 1000), *where)
+                        self.say(1, min(round(100 * depth), 1000), *where)
                         b = next((k for k, edge in enumerate(self.edges[:-1]) if at <= edge), len(self.edges) - 1)
                         at += 0.5 * self.cells[b]
         self._steps(above)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import deque
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.log_digest import log_digest
-from graphslam.maps.terrain.ground import GroundPlane, common_up, ground_plane, heights_along, level_rotation
+from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
 from graphslam.maps.terrain.plan import cost_map, save_cost_map
@@ -37,6 +37,10 @@ FORMAT = "graphslam.terrain/1"
 Ints = npt.NDArray[np.int64]
 _EVERY_POINT = 7
 """Of which one is enough to find the ground."""
+_SAMPLE = 60
+"""Scans that tell where up is, and how high the scanner stands about."""
+_AROUND, _LOOK = 6, 3
+"""The height of a scanner is the median of what the ground says in every so many scans so far before and after."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class RunTerrain:
     path : (n, 3)
         Places of the nodes in the level frame [m].
     missing : int
-        Scans in which no ground was found: the height of their neighbours was taken.
+        Scans in which the ground was looked for and not found: the height of their neighbours was taken.
     read_s, seconds : float
         CPU time to read the lines into pieces, and to make the map of the pieces.
     scans, lines : int
@@ -191,17 +195,13 @@ def read_terrain(
         raise DataError("no scan lies within the solved path in time", where=stream)
     used = tables or read_tables()
     if isinstance(scans, PointClouds):
-        rotation, heights, missing, step = _ground_of_clouds(scans, at, path, sensor_height, progress)
+        rotation, height, step = _ground_of_clouds(scans, at, path, sensor_height)
     else:
-        rotation, missing = np.eye(3), 0
+        rotation = np.eye(3)
         _, rays = scans.head_rays()
         step = float(np.median(np.arccos(np.clip(np.sum(rays[0, 1:] * rays[0, :-1], axis=-1), -1.0, 1.0))))
-        heights = np.full(len(scans.times), scans.T_base_mount[2] if sensor_height is None else sensor_height)
-    sensor = LineSensor(
-        height=float(np.median(heights[at])),
-        beam_step=step,
-        sweep_time=_sweep(scans, at),
-    )
+        height = float(scans.T_base_mount[2] if sensor_height is None else sensor_height)
+    sensor = LineSensor(height=height, beam_step=step, sweep_time=_sweep(scans, at))
     layer = TerrainLayer(used, chosen, sensor)
     turn = np.concatenate([np.zeros(3), se3.matrix_to_quat(rotation)])
     level = Trajectory(path.times, se3.se3_compose(np.broadcast_to(turn, path.poses.shape), path.poses))
@@ -209,16 +209,21 @@ def read_terrain(
     owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(poses) - 1)
     begin, count = time.process_time(), 0
     nodes = np.unique(owner)
+    turns = _Turns(scans, at, level, height, sensor_height is None) if isinstance(scans, PointClouds) else None
     for node in tqdm(nodes.tolist(), desc="terrain", unit="node", disable=not progress):
-        lines = list(_lines(scans, at[owner == node], level, heights))
+        mine = at[owner == node]
+        if turns is not None:
+            lines = [turns.lines(k) for k in mine.tolist()]
+        else:
+            assert isinstance(scans, RangeScans)
+            lines = [_lines(scans, mine, level, height)]
         count += sum(len(part) for part in lines)
         layer.read(node, lines, poses[node])
     read_s = time.process_time() - begin
     begin = time.process_time()
     found = layer.classify()
-    return RunTerrain(
-        layer, found, rotation, poses[:, :3], missing, read_s, time.process_time() - begin, len(at), count, stream
-    )
+    seconds, missing = time.process_time() - begin, turns.missing if turns else 0
+    return RunTerrain(layer, found, rotation, poses[:, :3], missing, read_s, seconds, len(at), count, stream)
 
 
 def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
@@ -237,26 +242,65 @@ def _posed(scans: PointClouds, k: int, path: Trajectory) -> tuple[Array, Array]:
 
 
 def _ground_of_clouds(
-    scans: PointClouds, at: Ints, path: Trajectory, height: float | None, progress: bool
-) -> tuple[Array, Array, int, float]:
-    """Rotation to a level frame, height of the scanner at every scan, scans without ground, and angle between beams."""
+    scans: PointClouds, at: Ints, path: Trajectory, height: float | None
+) -> tuple[Array, float, float]:
+    """Rotation to a level frame, height of the scanner and angle between its beams, of some scans along the path."""
+    some = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _SAMPLE)).astype(np.int64))]
+    posed = [_posed(scans, k, path) for k in some.tolist()]
     up, about = np.array([0.0, 0.0, 1.0]), height
-    planes: list[GroundPlane | None] = []
-    step = 0.0
-    for round_ in range(2):
-        planes = []
-        for k in tqdm(at.tolist(), desc="ground", unit="scan", disable=not progress or round_ > 0):
-            points, origin = _posed(scans, k, path)
-            planes.append(ground_plane(points[::_EVERY_POINT], origin, up, about))
-            if k == at[len(at) // 2]:
-                step = _beam_step(points, origin)
+    for _ in range(2):
+        planes = [ground_plane(points[::_EVERY_POINT], origin, up, about) for points, origin in posed]
         up = common_up(planes)
         if about is None:
             about = float(np.median([p.below for p in planes if p is not None]))
-    found, missing = heights_along(planes)
-    heights = np.full(len(scans.times), about)
-    heights[at] = found if height is None else height
-    return level_rotation(up), heights, missing, step
+    assert about is not None
+    return level_rotation(up), about, _beam_step(*posed[len(posed) // 2])
+
+
+class _Turns:
+    """Lines of clouds, each decoded once: the height above the ground is the median of some scans around.
+
+    Parameters
+    ----------
+    scans : PointClouds
+    at : (k,)
+        Scans that are asked for, in this order.
+    level : Trajectory
+        In the level frame.
+    height : float
+        Of the scanner above the ground, about [m].
+    look : bool
+        Find it in the scans themselves.
+    """
+
+    def __init__(self, scans: PointClouds, at: Ints, level: Trajectory, height: float, look: bool) -> None:
+        self.scans, self.level, self.height, self.look = scans, level, height, look
+        self.coming = deque(at.tolist())
+        self.read: dict[int, tuple[Array, Array]] = {}
+        self.below: dict[int, float] = {}
+        self.place = {k: i for i, k in enumerate(at.tolist())}
+        self.missing = 0
+
+    def lines(self, k: int) -> ScanLines:
+        """Of one scan."""
+        i = self.place[k]
+        while self.coming and self.place[self.coming[0]] <= i + (_AROUND if self.look else 0):
+            self._decode(self.coming.popleft())
+        points, origin = self.read.pop(k)
+        for old in [j for j in self.below if j < i - _AROUND]:
+            if len(self.below) > 1:  # where no ground is found for long, the last one counts
+                del self.below[old]
+        height = float(np.median(list(self.below.values()))) if self.below else self.height
+        return lines_of_clouds(points, origin, float(origin[2] - height))
+
+    def _decode(self, k: int) -> None:
+        points, origin = self.read[k] = _posed(self.scans, k, self.level)
+        if self.look and self.place[k] % _LOOK == 0:
+            plane = ground_plane(points[::_EVERY_POINT], origin, np.array([0.0, 0.0, 1.0]), self.height)
+            if plane is None:
+                self.missing += 1
+            else:
+                self.below[self.place[k]] = plane.below
 
 
 def _beam_step(points: Array, origin: Array) -> float:
@@ -271,15 +315,10 @@ def _beam_step(points: Array, origin: Array) -> float:
     return float(np.clip(np.median(gap), 2e-3, 0.1)) if len(gap) else 0.01
 
 
-def _lines(scans: PointClouds | RangeScans, at: Ints, level: Trajectory, heights: Array) -> Iterator[ScanLines]:
-    if isinstance(scans, RangeScans):
-        mine = np.zeros(len(scans.times), np.bool_)
-        mine[at] = True
-        yield lines_of_scans(scans.take(mine), level, float(heights[at[0]]))
-        return
-    for k in at.tolist():
-        points, origin = _posed(scans, k, level)
-        yield lines_of_clouds(points, origin, float(origin[2] - heights[k]))
+def _lines(scans: RangeScans, at: Ints, level: Trajectory, height: float) -> ScanLines:
+    mine = np.zeros(len(scans.times), np.bool_)
+    mine[at] = True
+    return lines_of_scans(scans.take(mine), level, height)
 
 
 def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | None = None) -> list[Path]:

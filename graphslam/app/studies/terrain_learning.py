@@ -28,15 +28,17 @@ from graphslam.maps.terrain.learning import count_values, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
 from graphslam.maps.terrain.lines import Rows, lines_of_scans
 from graphslam.maps.terrain.pyramid import Pyramid
-from graphslam.maps.terrain.tables import SCALE, WEIGHTS, Tables, fixed_tables
+from graphslam.maps.terrain.tables import BINS, SCALE, WEIGHTS, Tables, fixed_tables
 from graphslam.maps.terrain.vehicle import CELLS
-from graphslam.sim.street import OBSTACLE, TARGETS, draw_street, drive_street
+from graphslam.sim.street import OBSTACLE, RAMP_LENGTH, TARGETS, Street, draw_street, drive_street
 
 FIRST_SEED = 10_000
 """Of the teaching drives; test drives have the seeds of their study."""
 ASKED = (7.0, 4.5, 2.0)
 """Distances to the target at which the cells of a drive are taken [m]."""
 CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
+RAMP_ROUND = 0.4
+"""Cells so near before the foot and behind the top of a ramp go with it [m]: as wide as the widest but one."""
 MOST_FALSE = 0.03
 """The threshold is the lowest candidate at which at most this share of free cells within 7 m is called a hazard …"""
 MOST_FALSE_FLAT = 0.001
@@ -51,6 +53,8 @@ class Drive:
     parts: list[Rows]
     places: Array
     labels: list[Array]
+    slopes: list[npt.NDArray[np.bool_]]
+    """Columns of the cells of each band that lie on or beside a legal ramp ``(nx,)``."""
 
 
 def learn_tables(
@@ -85,7 +89,7 @@ def learn_tables(
     blank = Tables(fixed_tables(4, 0.0, 0.0), np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
     shape = Pyramid(BOX, blank, c.vehicle, c.sensor)
     wide = Pyramid(BOX, blank, c.vehicle, c.sensor, SINGLE)
-    histograms = np.zeros((2, 2, shape.bands, 48), np.int64)
+    histograms = np.zeros((2, 3, shape.bands, BINS), np.int64)
     kept: list[Drive] = []
     kept_wide: list[Drive] = []
     for seed, target in tqdm([(s, t) for s in seeds for t in targets], desc="drives", disable=not progress):
@@ -95,11 +99,12 @@ def learn_tables(
         rows, wide_rows = (r[r[:, 4] < ABOVE] for r in (statements(lines, shape), statements(lines, wide)))
         truth = labelled(street, c).labels
         labels = [coarser(truth, round(w / shape.cells[0])) for w in shape.cells]
-        histograms += count_values(rows, row_labels(rows, labels, shape), shape.bands)
+        histograms += count_values(rows, row_labels(rows, labels, _on_ramp(street, shape), shape), shape.bands)
         ends = snapshots(drive, ASKED)
         places = np.array([street.target_at - d for d in ASKED])
-        kept.append(Drive(target, _until(rows, ends), places, labels))
-        kept_wide.append(Drive(target, _until(wide_rows, ends), places, [coarser(truth, round(SINGLE[0] / CELLS[0]))]))
+        kept.append(Drive(target, _until(rows, ends), places, labels, _on_ramp(street, shape)))
+        flat = [coarser(truth, round(SINGLE[0] / CELLS[0]))]
+        kept_wide.append(Drive(target, _until(wide_rows, ends), places, flat, _on_ramp(street, wide)))
     ratios = ratios_of(histograms)
     learnt = Tables(ratios, np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
     weights = np.array([fit_weights(*of) for of in labelled_cells(kept, learnt, c)])
@@ -117,7 +122,7 @@ def learn_tables(
         "robot": asdict(c.robot),
         "vehicle": asdict(c.vehicle),
         "statements": {
-            name: {kind: int(histograms[k, h].sum()) for h, kind in ((0, "free"), (1, "hazard"))}
+            name: {kind: int(histograms[k, h].sum()) for h, kind in enumerate(("even", "slope", "hazard"))}
             for k, name in ((STEP, "step"), (SUPPORT, "support"))
         },
         "false_alarms_while_learning": {str(t): [round(a, 5) for a in rates[t]] for t in CANDIDATES},
@@ -136,15 +141,28 @@ def write_learnt_tables(
     return tables
 
 
-def row_labels(rows: Rows, labels: list[Array], shape: Pyramid) -> npt.NDArray[np.int8]:
-    """Labels ``(2, k)`` of the cells of statements, for steps and for support; −1 outside."""
+def _on_ramp(street: Street, shape: Pyramid) -> list[npt.NDArray[np.bool_]]:
+    out = []
+    for b in range(shape.bands):
+        along = (shape.first[b, 0] + np.arange(shape.shapes[b, 1]) + 0.5) * shape.cells[b] - street.target_at
+        out.append((street.kind == "ramp") & (along > -RAMP_ROUND) & (along < RAMP_LENGTH + RAMP_ROUND))
+    return out
+
+
+def row_labels(
+    rows: Rows, labels: list[Array], slopes: list[npt.NDArray[np.bool_]], shape: Pyramid
+) -> npt.NDArray[np.int8]:
+    """Kinds ``(2, k)`` of the cells of statements, for steps and for support: 0 free, 1 free on or beside a ramp,
+    2 a hazard, −1 neither or outside."""
     out = np.full((2, len(rows)), -1, np.int8)
     for b, truth in enumerate(labels):
         mine = np.flatnonzero(rows[:, 1] == b)
         ix, iy = rows[mine, 2] - shape.first[b, 0], rows[mine, 3] - shape.first[b, 1]
         inside = (ix >= 0) & (iy >= 0) & (ix < truth.shape[1]) & (iy < truth.shape[0])
+        slope = slopes[b][ix[inside]]
         for channel, of in enumerate(channel_labels(truth)):
-            out[channel, mine[inside]] = of[iy[inside], ix[inside]]
+            own = of[iy[inside], ix[inside]]
+            out[channel, mine[inside]] = np.where(own > 0, 2, np.where((own == 0) & slope, 1, own))
     return out
 
 
@@ -166,19 +184,21 @@ def _pyramids(
 
 def labelled_cells(
     kept: list[Drive], tables: Tables, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
-) -> list[tuple[Array, Array, npt.NDArray[np.bool_]]]:
-    """Of every band: sums of ratios, numbers of statements, and the truth of its cells at all distances asked.
+) -> list[tuple[Array, Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
+    """Of every band: sums of ratios, numbers of statements, the truth of its cells and which free ones lie on a legal
+    slope, at all distances asked.
 
     Of cells with a wire, only those in which a beam met it.
     """
-    parts: list[list[tuple[Array, Array, Array]]] = [[] for _ in range(tables.bands)]
+    parts: list[list[tuple[Array, ...]]] = [[] for _ in range(tables.bands)]
     for pyramid, drive, _ in _pyramids(kept, tables, c, cells):
         for b, truth in enumerate(drive.labels):
             counts, ratios = pyramid.band_of(pyramid.counts, b), pyramid.band_of(pyramid.ratios, b) / SCALE
             judged = (truth >= 0) & (counts[: OVERHANG + 1].sum(axis=0) > 0)
             if drive.target.startswith("wire"):  # a wire between two beams teaches nothing
                 judged &= (truth != OBSTACLE) | (counts[OVERHANG] > 0)
-            parts[b].append((ratios[:, judged], counts[: OVERHANG + 1, judged], truth[judged] > 0))
+            slope = (truth == 0) & drive.slopes[b]
+            parts[b].append((ratios[:, judged], counts[: OVERHANG + 1, judged], truth[judged] > 0, slope[judged]))
     return [tuple(np.concatenate(part, axis=-1) for part in zip(*of)) for of in parts]  # type: ignore[misc]
 
 

@@ -112,25 +112,3 @@ def common_up(planes: list[GroundPlane | None]) -> Array:
         if np.any(near):
             up = normals[near].mean(axis=0)
     return np.asarray(up / np.linalg.norm(up))
-
-
-def heights_along(planes: list[GroundPlane | None], *, most: int = 5) -> tuple[Array, int]:
-    """Height of the scanner above the ground at each scan ``(n,)`` [m], and scans in which it was not found.
-
-    A running median over ``most`` scans before and after; where no ground was found, that of the nearest scan.
-
-    Raises
-    ------
-    DataError
-        No ground in any scan.
-    """
-    own = np.array([np.nan if p is None else p.below for p in planes])
-    found = np.flatnonzero(np.isfinite(own))
-    if not len(found):
-        raise DataError("the ground was not found in any scan", wanted="ground within 15 m of the scanner")
-    out = np.empty(len(own))
-    for k in range(len(own)):
-        near = own[max(k - most, 0) : k + most + 1]
-        near = near[np.isfinite(near)]
-        out[k] = np.median(near) if len(near) else own[found[np.argmin(np.abs(found - k))]]
-    return out, len(own) - len(found)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GridError
 from graphslam.core.geometry import Array
-from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT, add_rows
+from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT, add_rows, bound_rows
 from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
 from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
 from graphslam.maps.terrain.tables import Tables
@@ -60,12 +60,9 @@ class TerrainPiece:
 def piece_of(rows: Rows, tables: Tables, pose: Array) -> TerrainPiece:
     """Sum up statements ``(k, 6)`` that were made in the level frame of a node."""
     bands = tables.bands
-    first, shapes = np.zeros((bands, 2), np.int64), np.zeros((bands, 2), np.int64)
-    for b in range(bands):
-        own = rows[rows[:, 1] == b, 2:4]
-        if len(own):
-            first[b] = own.min(axis=0)
-            shapes[b] = (own.max(axis=0) - first[b] + 1)[::-1]
+    first, last = np.full((bands, 2), 1 << 40), np.full((bands, 2), -(1 << 40))
+    bound_rows(rows, first, last)
+    shapes = np.maximum(last - first + 1, 0)[:, ::-1].copy()
     offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
     n = int(offsets[-1])
     ratios, counts, heights = np.zeros((2, n), np.int32), np.zeros((4, n), np.int32), np.zeros((3, n), np.int64)

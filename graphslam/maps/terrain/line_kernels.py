@@ -41,7 +41,6 @@ class Figures(NamedTuple):
     residual_rate: float
     memory: float
     support_reach: float
-    support_slack: float
     most_slope: float
     clearance: float
     height: float
@@ -52,9 +51,9 @@ class Figures(NamedTuple):
 def put_row(out, key, value, where, lattice):
     """Write a statement, or raise the value of the one that this line made of the same cell.
 
-    ``out``: rows, the slots of this line's statements, and the number of rows so far ``(1,)``; ``key``: line and
-    channel; ``where``: x, y and range from the sensor. Beyond the last band and
-    nearer than the first nothing is written.
+    ``out``: rows, slots of statements (a power of 2), the number of rows so far and that before this line ``(2,)``;
+    ``key``: line and channel; ``where``: x, y and range from the sensor. Beyond the last band and nearer than the first
+    nothing is written.
     """
     rows, slots, total = out
     x, y, r = where
@@ -68,13 +67,13 @@ def put_row(out, key, value, where, lattice):
     line, channel = key
     count = total[0]
     if channel < 4:
-        slot = (ix * 73856093 ^ iy * 19349663 ^ (4 * band + channel) * 83492791) % slots.shape[0]
-        while slots[slot] >= 0:
+        slot = (ix * 73856093 ^ iy * 19349663 ^ (4 * band + channel) * 83492791) & (slots.shape[0] - 1)
+        while slots[slot] >= total[1]:  # a slot of an earlier line is free
             k = slots[slot]
             if rows[k, 2] == ix and rows[k, 3] == iy and rows[k, 4] == channel and rows[k, 1] == band:
                 rows[k, 5] = max(rows[k, 5], value)
                 return
-            slot = (slot + 1) % slots.shape[0]
+            slot = (slot + 1) & (slots.shape[0] - 1)
         slots[slot] = count
     rows[count, 0], rows[count, 1], rows[count, 2], rows[count, 3] = line, band, ix, iy
     rows[count, 4], rows[count, 5] = channel, value
@@ -156,11 +155,18 @@ def follow_ground(s, z, n, foot, f, ground, chain):
 @kernel()
 def heights_above(s, z, n, ground, reach, out):
     """``out``: height of each point above the nearest ground point of the line; NaN where none is within ``reach``."""
+    low = np.empty(n, np.int64)
+    many = 0
+    for i in range(n):
+        if ground[i]:
+            low[many] = i
+            many += 1
     for i in range(n):
         best, height = reach, 0.0 if ground[i] else np.nan
         if not ground[i]:
-            for j in range(n):
-                if ground[j] and abs(s[j] - s[i]) <= best:
+            for k in range(many):
+                j = low[k]
+                if abs(s[j] - s[i]) <= best:
                     best = abs(s[j] - s[i])
                     height = z[i] - z[j]
         out[i] = height
@@ -183,7 +189,7 @@ def observe_line(line, points, origin, foot, lattice, f, out):
     smooth_heights(s, p[:, 2], n, f.smooth, z)
     follow_ground(s, z, n, foot, f, ground, chain)
     heights_above(s, z, n, ground, f.memory, height)
-    out[1][:] = -1
+    out[2][1] = out[2][0]
     for i in range(n):
         where = (p[i, 0], p[i, 1], s[i])
         if ground[i]:
@@ -197,23 +203,22 @@ def observe_line(line, points, origin, foot, lattice, f, out):
             channel = OVERHANG if height[i] <= f.height else ABOVE
             if height[i] <= f.above_limit:
                 put_row(out, (line, channel), 1, where, lattice)
-        # missing support: the beam went below the ground before it came back
-        last_s, last_z, slope, blocked = chain[i]
-        slope = min(slope, 0.0)  # behind the top of a ramp the ground is level
-        fall = (p[i, 2] - origin[2]) / s[i]
-        if ground[i] != 1 and fall < slope - 1e-6 and blocked == 0.0:
-            pierced = (last_z - slope * last_s - origin[2]) / (fall - slope)
-            if pierced > 0.0 and s[i] > pierced + 0.1 and pierced - last_s < f.memory:
+        # Missing support: the beam went below the ground before it came back, and what it met lies deeper than the
+        # steepest ground that may be driven leads to. So there is a fall somewhere on the way.
+        last_s, last_z, _, blocked = chain[i]
+        depth = last_z - f.slack * (s[i] - last_s) - p[i, 2]
+        if ground[i] != 1 and depth > 0.0 and blocked == 0.0 and origin[2] > last_z > p[i, 2]:
+            pierced = s[i] * (origin[2] - last_z) / (origin[2] - p[i, 2])
+            if s[i] > pierced + 0.1 and pierced - last_s < f.memory:
                 end, at = min(s[i], pierced + f.support_reach), pierced
+                value = min(round(100.0 * depth), 1000)
                 while at <= end:
                     band = 0
                     while band < lattice.edges.shape[0] - 1 and at > lattice.edges[band]:
                         band += 1
-                    depth = (slope - fall) * (at - pierced) - f.support_slack * (at - pierced)
                     share = at / s[i]
                     x = origin[0] + share * (p[i, 0] - origin[0])
                     y = origin[1] + share * (p[i, 1] - origin[1])
-                    value = min(max(round(100.0 * depth), 0), 1000)
                     put_row(out, (line, SUPPORT), value, (x, y, at), lattice)
                     at += 0.5 * lattice.cells[band]
     book_steps(line, (p, s, z, height, n), lattice, f, out)
@@ -276,12 +281,52 @@ def observe_lines(points, origins, feet, lattice, figures, rows, counts):
 
     ``counts (n,)``: rows after each line. Writing stops where ``rows`` is full.
     """
-    total = np.zeros(1, np.int64)
-    out = (rows, np.empty(32 * points.shape[1] + 1024, np.int64), total)
+    total = np.zeros(2, np.int64)
+    room = 1024  # a power of 2
+    while room < 32 * points.shape[1]:
+        room *= 2
+    out = (rows, np.full(room, -1), total)
     for k in range(points.shape[0]):
         observe_line(k, points[k], origins[k], feet[k], lattice, figures, out)
         counts[k] = total[0]
     return total[0]
+
+
+@kernel()
+def sort_into_columns(points, origin, order, filled):
+    """Numbers of the points of each column by azimuth, lowest first: ``order (columns, beams)``; ``filled (columns,)``
+    of them are there. Of more points the lowest stay.
+    """
+    columns, beams = order.shape
+    rising = np.empty((columns, beams))
+    filled[:] = 0
+    count = points.shape[0]
+    down = count > 1 and points[0, 2] > points[count - 1, 2]  # scanners tell the highest ring first, or last
+    for i in range(count):
+        k = count - 1 - i if down else i
+        x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
+        c = math.floor((math.atan2(y, x) / (2.0 * math.pi) + 0.5) * columns) % columns
+        own = z / math.sqrt(x * x + y * y + z * z + 1e-24)  # sine of the elevation
+        n = filled[c]
+        if n == beams:
+            if own >= rising[c, n - 1]:
+                continue
+            n -= 1
+        while n > 0 and rising[c, n - 1] > own:
+            rising[c, n], order[c, n] = rising[c, n - 1], order[c, n - 1]
+            n -= 1
+        rising[c, n], order[c, n] = own, k
+        filled[c] = min(filled[c] + 1, beams)
+
+
+@kernel()
+def bound_rows(rows, low, high):
+    """Least and largest ix and iy of each band: ``low (b, 2)`` and ``high (b, 2)``, made larger by the statements."""
+    for k in range(rows.shape[0]):
+        b = rows[k, 1]
+        for axis in range(2):
+            low[b, axis] = min(low[b, axis], rows[k, 2 + axis])
+            high[b, axis] = max(high[b, axis], rows[k, 2 + axis])
 
 
 @kernel()

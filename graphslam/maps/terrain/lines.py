@@ -19,7 +19,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.terrain.line_kernels import Figures, Lattice, observe_lines
+from graphslam.maps.terrain.line_kernels import Figures, Lattice, observe_lines, sort_into_columns
 from graphslam.maps.terrain.vehicle import Vehicle
 
 Rows = npt.NDArray[np.int32]
@@ -44,8 +44,6 @@ class DetectorConfig:
     """The ground is not led on farther than this."""
     support_reach: float = 2.5
     """Cells so far behind the place where a beam went below the ground are said to lack support."""
-    support_slack: float = 0.1
-    """Depth per metre that is not counted as missing."""
     above_limit: float = 6.0
     """What is higher above the ground than this is not booked."""
 
@@ -83,9 +81,10 @@ class ScanLines:
         if points.ndim != 3 or points.shape[2] != 3:
             raise GeometryError("points of lines have the wrong shape", got=points.shape, wanted="(n, m, 3)")
         n = len(points)
-        if np.any(np.isinf(points)):
+        missing = ~np.isfinite(points[..., 0] + points[..., 1] + points[..., 2])
+        if np.any(np.isinf(points[missing])):
             raise DataError("a point of a line is infinite", wanted="finite numbers, or NaN: no return")
-        points[np.isnan(points).any(axis=2)] = np.nan
+        points[missing] = np.nan
         object.__setattr__(self, "points", points)
         for name, shape in (("origins", (n, 3)), ("feet", (n,))):
             a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
@@ -171,15 +170,12 @@ def lines_of_clouds(points: Array, origin: Array, foot: float, *, columns: int =
     beams : int
         Most points of a column; of more, the lowest ones stay.
     """
-    d = np.asarray(points, dtype=np.float64) - origin
-    azimuth = np.floor((np.arctan2(d[:, 1], d[:, 0]) / (2.0 * np.pi) + 0.5) * columns).astype(np.int64) % columns
-    elevation = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1]))
-    order = np.lexsort((elevation, azimuth))
-    column = azimuth[order]
-    place = np.arange(len(order)) - np.searchsorted(column, column, side="left")
-    kept = place < beams
+    p = np.ascontiguousarray(points, dtype=np.float64)
+    order, filled = np.zeros((columns, beams), np.int64), np.zeros(columns, np.int64)
+    sort_into_columns(p, np.asarray(origin, dtype=np.float64), order, filled)
     lines = np.full((columns, beams, 3), np.nan)
-    lines[column[kept], place[kept]] = np.asarray(points, dtype=np.float64)[order[kept]]
+    there = np.arange(beams) < filled[:, None]
+    lines[there] = p[order[there]]
     return ScanLines(lines, np.broadcast_to(origin, (columns, 3)), np.full(columns, float(foot)))
 
 
@@ -213,8 +209,7 @@ def observe(
     c = config or DetectorConfig()
     figures = Figures(
         *(c.smooth, c.window, math.tan(vehicle.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach),
-        *(c.support_slack, math.tan(min(vehicle.max_slope + math.radians(5.0), 1.2)), vehicle.clearance),
-        *(vehicle.height, c.above_limit),
+        *(math.tan(min(vehicle.max_slope + math.radians(5.0), 1.2)), vehicle.clearance, vehicle.height, c.above_limit),
     )
     lattice = Lattice(np.ascontiguousarray(edges, np.float64), np.ascontiguousarray(cells, np.float64), c.nearest)
     per_line = 8 * lines.points.shape[1] + 4 * int(lattice.edges[-1] / lattice.cells[0])

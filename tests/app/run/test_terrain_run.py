@@ -72,6 +72,19 @@ def test_curb_box_and_street_in_a_frame_that_leans(made: tuple[RunTerrain, Point
     assert TerrainClass.HOLE not in classes_at(found, 6.0, -4.0)  # behind the box
 
 
+def test_clouds_are_decoded_once_and_those_that_tell_where_up_is_twice(
+    made: tuple[RunTerrain, PointClouds, Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, scans, path = made
+    decoded: list[int] = []
+    cloud = PointClouds.cloud
+    monkeypatch.setattr(PointClouds, "cloud", lambda self, k: decoded.append(k) or cloud(self, k))
+    monkeypatch.setattr("graphslam.app.run.terrain._SAMPLE", 3)
+    again = read_terrain(scans, path, path.times[::3], path.poses[::3], progress=False)
+    assert sorted(decoded) == sorted([*range(len(scans)), 0, 3, 7])
+    assert again.scans == len(scans)
+
+
 def test_what_is_written(made: tuple[RunTerrain, PointClouds, Trajectory], tmp_path: Path) -> None:
     folder = OutputFiles(tmp_path)
     files = write_terrain(folder, made[0])
