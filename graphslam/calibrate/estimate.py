@@ -133,7 +133,10 @@ class Calibration:
         if chance:
             out.append(Finding("", "calibrated", f"No lasting error was found of {' or '.join(chance)}."))
         if self.noise:
-            out.append(Finding("", "calibrated", f"Noise from {self.data}: {noise_in_words(self.noise)}."))
+            text = f"Noise from {self.data}: {noise_in_words(self.noise)}."
+            if self.corrections.widen_only:
+                text += " Where the log states a larger one, that one counts."
+            out.append(Finding("", "calibrated", text))
         return [*out, *self.notes]
 
     def contradictions(self) -> list[str]:

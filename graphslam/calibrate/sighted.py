@@ -240,9 +240,11 @@ def two_levels(
             if not e.applied and e.name in CONSTANTS:
                 s.constants[CONSTANTS.index(e.name)] = 0.0
         s.fit(budget=200, rounds=2)
-    out = {f"{k}_sigma": s.sigmas[k] for k in ("range", "bearing") if k in s.fitted}
-    out |= {k: s.sigmas[k] for k in ("visit_range", "visit_bearing") if k in s.fitted}
-    out = {{"visit_range": "range_visit", "visit_bearing": "bearing_visit"}.get(k, k): v for k, v in out.items()}
+    out = {}
+    for k in ("range", "bearing"):
+        for of_fit, of_noise in ((k, f"{k}_sigma"), (f"visit_{k}", f"{k}_visit")):
+            if of_fit in s.fitted:
+                out[of_noise] = s.sigmas[of_fit]
     return out | {"visit_sightings": sightings_of_a_visit(s.windows)} | motion_noise(s), again
 
 

@@ -9,11 +9,12 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
-from graphslam.core.geometry import Array, se2_between, se2_compose
+from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, VelocityControls
 from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam.frontends.odometry.recorded import chain
 
 Ints = npt.NDArray[np.int64]
 
@@ -194,15 +195,10 @@ def _path(log: SensorLog, times: Array, speed: float, turn: float) -> Array | No
         elif isinstance(s, SteeringControls):
             streams[name] = replace(s, speed=speed * s.speed, steering=turn * s.steering)
     try:
-        steps = dead_reckoning(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0].increments
+        odometry = dead_reckoning(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0]
     except GraphSlamError:
         return None
-    if steps.shape[1] != 3:
-        return None
-    poses = np.zeros((len(times), 3))
-    for k in range(1, len(poses)):
-        poses[k] = se2_compose(poses[k - 1], steps[k])
-    return poses
+    return chain(odometry).poses if odometry.increments.shape[1] == 3 else None
 
 
 def _unrest(first: Array, second: Array, steps: Array, h: Hypothesis) -> float:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.records import Odometry
+from graphslam.refine.motion import SLIPPED
 from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]
@@ -98,7 +99,9 @@ def path_between(steps: Scans, nodes: Index, poses: Array, covariances: Array) -
     poses : (n, 7|3)
     covariances : (n, d, d)
     own : (n, d, d)
-        What steps between nodes do not share with a node.
+        What steps between nodes do not share with a node. Where wheels slipped on the way it holds the jump itself: a
+        step at the share s of the way lies before it with the probability 1 - s, and its mean is off by the variance
+        s (1 - s) of that.
     """
     g, n = steps.group, len(steps)
     U, _ = chained(steps, nodes)
@@ -113,6 +116,11 @@ def path_between(steps: Scans, nodes: Index, poses: Array, covariances: Array) -
     out[nodes] = poses
     s = share[:, None, None]
     own = s * (1.0 - s) * whole.covariances[b]
+    # wheels that slipped did so at one instant, which nothing tells: spread evenly is a guess with the jump's own size
+    inside = np.flatnonzero((share > 0.0) & (share < 1.0))
+    x = np.linalg.solve(whole.covariances[b[inside]], left[inside, :, None])[:, :, 0]
+    slipped = inside[np.sum(left[inside] * x, axis=1) > SLIPPED]
+    own[slipped] += (s * (1.0 - s))[slipped] * left[slipped, :, None] * left[slipped, None, :]
     C = own.copy()
     for node, weight in ((a, 1.0 - s), (b, s)):
         A = g.adjoint(g.between(out, poses[node]))

@@ -35,7 +35,7 @@ def scan(pose, walls, bearings):
     return np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf).min(axis=1)
 
 
-def drive(*, bias=0.0, scale=1.0, noise=0.0, bend=0.0, slip=0.0, stated=1e-4, seconds=150.0, seed=3):
+def drive(*, bias=0.0, scale=1.0, noise=0.0, spread=0.0, bend=0.0, slip=0.0, stated=1e-4, seconds=150.0, seed=3):
     """Its log, and the true poses ``(n, 3)``.
 
     Parameters
@@ -46,6 +46,8 @@ def drive(*, bias=0.0, scale=1.0, noise=0.0, bend=0.0, slip=0.0, stated=1e-4, se
         Of the distances.
     noise : float
         Of the heading [rad/√m].
+    spread : float
+        Noise of each increment, on every axis [m, rad].
     slip : float
         What the wheels measure too much in one step, half way [m].
     stated : float
@@ -66,6 +68,8 @@ def drive(*, bias=0.0, scale=1.0, noise=0.0, bend=0.0, slip=0.0, stated=1e-4, se
     d = np.hypot(xi[:, 0], xi[:, 1])
     xi[:, :2] *= scale
     xi[1:, 2] += bias * 0.5 + bend * d[1:] + noise * np.sqrt(d[1:]) * rng.standard_normal(len(t) - 1)
+    if spread:
+        xi[1:] += spread * rng.standard_normal((len(t) - 1, 3))
     xi[len(t) // 2, 0] += slip
     odometry = Odometry(times=t, increments=se2_exp(xi), covariances=np.tile(stated**2 * np.eye(3), (len(t), 1, 1)))
     scans = LaserScans(times=t, ranges=ranges, bearings=bearings, max_range=30.0)
