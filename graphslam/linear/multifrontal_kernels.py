@@ -17,8 +17,13 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.linear.product_kernels import BLOCK, subtract_product
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+
+LARGE = 64
+"""Fronts of so many rows are worked on by products of blocks."""
 
 
 @nb.njit(cache=True)
@@ -232,9 +237,9 @@ def analyse(
 
 
 @nb.njit(cache=True, fastmath={"contract"})
-def _eliminate(F: Array, w: int, r: int) -> int:
-    """Partial Cholesky of the first ``w`` of ``r`` columns of a front, ``F[c, i]`` = row i ≥ c of column c."""
-    for c in range(w):
+def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
+    """Cholesky of the columns ``first`` to ``end`` of a front with ``r`` rows, within themselves."""
+    for c in range(first, end):
         d = F[c, c]
         if not d > 0.0:
             return c + 1
@@ -243,10 +248,27 @@ def _eliminate(F: Array, w: int, r: int) -> int:
         inverse = 1.0 / d
         for i in range(c + 1, r):
             F[c, i] *= inverse
-        for b in range(c + 1, w):
+        for b in range(c + 1, end):
             f = F[c, b]
             for i in range(b, r):
                 F[b, i] -= f * F[c, i]
+    return 0
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def _eliminate(F: Array, w: int, r: int) -> int:
+    """Partial Cholesky of the first ``w`` of ``r`` columns of a front, ``F[c, i]`` = row i ≥ c of column c."""
+    if r >= LARGE:
+        for first in range(0, w, BLOCK):
+            end = min(first + BLOCK, w)
+            bad = _eliminate_columns(F, first, end, r)
+            if bad:
+                return bad
+            subtract_product(F[first:end, end:r], F[first:end, end:r], F[end:r, end:r], True)
+        return 0
+    bad = _eliminate_columns(F, 0, w, r)
+    if bad:
+        return bad
     # What is left to the others: four columns at once, so that a row is read and written a quarter as often.
     k = 0
     while k + 4 <= w:

@@ -11,6 +11,9 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.linear.multifrontal_kernels import LARGE
+from graphslam.linear.product_kernels import BLOCK, subtract_product
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -101,6 +104,19 @@ class Panels(NamedTuple):
 
 
 @nb.njit(cache=True, fastmath={"contract"})
+def _solve_upper(P: Array, X: Array, first: int, end: int) -> None:
+    """``X ← L⁻ᵀ X`` for the columns ``first`` to ``end`` of a panel, and the same rows of ``X`` ``(w, m)``."""
+    for c in range(end - 1, first - 1, -1):
+        for b in range(c + 1, end):
+            f = P[c, b]
+            for i in range(X.shape[1]):
+                X[c, i] -= f * X[b, i]
+        inverse = 1.0 / P[c, c]
+        for i in range(X.shape[1]):
+            X[c, i] *= inverse
+
+
+@nb.njit(cache=True, fastmath={"contract"})
 def inverse_diagonal(panels: Panels, begin: Index, width: int, most: int) -> Array:
     """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
 
@@ -155,42 +171,41 @@ def inverse_diagonal(panels: Panels, begin: Index, width: int, most: int) -> Arr
                 li = local[row[at + w + i]]
                 for j in range(n):
                     Z[w + i, w + j] = T[li, local[row[at + w + j]]]
-        # Y, row by row of R, and the inverse of L_SS: both from L_SS x = e-like back substitutions
-        Y = np.empty((w, n))
-        for c in range(w - 1, -1, -1):
-            for i in range(n):
-                Y[c, i] = P[c, w + i]
-            for b in range(c + 1, w):
-                f = P[c, b]
+        X = np.zeros((w, n + w))  # L_SS⁻ᵀ (L_RSᵀ, I): Yᵀ, and the inverse of L_SS, upper
+        X[:, :n] = P[:, w:]
+        for c in range(w):
+            X[c, n + c] = 1.0
+        if r < LARGE:
+            _solve_upper(P, X, 0, w)
+            for c in range(w):
                 for i in range(n):
-                    Y[c, i] -= f * Y[b, i]
-            inverse = 1.0 / P[c, c]
-            for i in range(n):
-                Y[c, i] *= inverse
-        M = np.zeros((w, w))  # L_SS⁻ᵀ, upper
-        for c in range(w):
-            M[c, c] = 1.0 / P[c, c]
-            for b in range(c - 1, -1, -1):
-                v = 0.0
-                for d in range(b + 1, c + 1):
-                    v -= P[b, d] * M[d, c]
-                M[b, c] = v / P[b, b]
-        for c in range(w):
-            for i in range(n):
-                v = 0.0
-                for j in range(n):
-                    v -= Z[w + i, w + j] * Y[c, j]
-                Z[c, w + i] = v
-                Z[w + i, c] = v
-        for c in range(w):
-            for b in range(c, w):
-                v = 0.0
-                for d in range(b, w):
-                    v += M[c, d] * M[b, d]
-                for i in range(n):
-                    v -= Y[c, i] * Z[b, w + i]
-                Z[c, b] = v
-                Z[b, c] = v
+                    v = 0.0
+                    for j in range(n):
+                        v -= Z[w + i, w + j] * X[c, j]
+                    Z[c, w + i] = v
+                    Z[w + i, c] = v
+            for c in range(w):
+                for b in range(c, w):
+                    v = 0.0
+                    for d in range(b, w):
+                        v += X[c, n + d] * X[b, n + d]
+                    for i in range(n):
+                        v -= X[c, i] * Z[b, w + i]
+                    Z[c, b] = v
+                    Z[b, c] = v
+        else:
+            for end in range(w, 0, -BLOCK):
+                b = max(0, end - BLOCK)
+                if end < w:
+                    subtract_product(P[b:end, end:w].T, X[end:w], X[b:end], False)
+                _solve_upper(P, X, b, end)
+            Z[:w] = 0.0
+            subtract_product(X[:, :n].T, Z[w:, w:], Z[:w, w:], False)
+            subtract_product(-X[:, n:].T, X[:, n:].T, Z[:w, :w], True)
+            subtract_product(X[:, :n].T, Z[:w, w:].T, Z[:w, :w], True)
+            for c in range(w):
+                for i in range(c + 1, r):
+                    Z[i, c] = Z[c, i]
         while q >= 0 and begin[by_super[q]] >= own[s]:
             k = by_super[q]
             for i in range(width):

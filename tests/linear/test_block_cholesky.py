@@ -59,7 +59,17 @@ def l_entries(A: np.ndarray, order: np.ndarray) -> int:
     return int(np.tril(F).sum())
 
 
-CASES = [(1, 0.0, 0), (2, 0.0, 0), (30, 0.0, 0), (40, 0.06, 0), (60, 0.01, 2), (50, 1.0, 0), (90, 0.02, 1)]
+CASES = [
+    (1, 0.0, 0),
+    (2, 0.0, 0),
+    (30, 0.0, 0),
+    (40, 0.06, 0),
+    (60, 0.01, 2),
+    (50, 1.0, 0),
+    (90, 0.02, 1),
+    (150, 1.0, 0),  # fronts of several blocks of columns
+    (200, 0.05, 1),
+]
 
 
 @pytest.mark.parametrize("slack", [0, 48, 10_000])

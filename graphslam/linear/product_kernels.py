@@ -1,0 +1,56 @@
+"""Numba kernels: products of large dense matrices by products of small blocks. Plain arrays only.
+
+BLAS multiplies blocks of 64 x 64 about five times as fast as compiled loops do, and products of that size never spread
+over threads: the result has the same bytes whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+BLOCK = 64
+"""Rows and columns of a block."""
+
+
+@nb.njit(cache=True)
+def _pack(A: Array, out: Array) -> None:
+    """Blocks of columns of ``A`` ``(k, n)`` one after the other, each with its rows together."""
+    k, n = A.shape
+    at = 0
+    for j in range(0, n, BLOCK):
+        m = min(BLOCK, n - j)
+        for row in range(k):
+            for c in range(m):
+                out[at + c] = A[row, j + c]
+            at += m
+
+
+@nb.njit(cache=True)
+def subtract_product(A: Array, B: Array, C: Array, upper: bool) -> None:
+    """``C ← C - Aᵀ B`` for ``A`` ``(k, m)``, ``B`` ``(k, n)``, ``C`` ``(m, n)``.
+
+    With ``upper`` only the blocks on and above the diagonal of ``C``.
+    """
+    k, m = A.shape
+    n = B.shape[1]
+    left, right = np.empty(BLOCK * m), np.empty(BLOCK * n)
+    product = np.empty(BLOCK * BLOCK)
+    for first in range(0, k, BLOCK):
+        d = min(BLOCK, k - first)
+        _pack(A[first : first + d], left)
+        _pack(B[first : first + d], right)
+        for i in range(0, m, BLOCK):
+            mi = min(BLOCK, m - i)
+            X = left[i * d : (i + mi) * d].reshape(d, mi)
+            for j in range(i if upper else 0, n, BLOCK):
+                nj = min(BLOCK, n - j)
+                Y = right[j * d : (j + nj) * d].reshape(d, nj)
+                P = product[: mi * nj].reshape(mi, nj)
+                np.dot(X.T, Y, P)
+                for p in range(mi):
+                    for q in range(nj):
+                        C[i + p, j + q] -= P[p, q]
