@@ -194,12 +194,16 @@ NEXT = 1
 """Chunks that follow each other so closely are compared with each other."""
 NEIGHBOURS = 5
 """Chunks that follow each other so closely are neighbours on the way; others are passes of the same place."""
+PASSES = 2
+"""A chunk is compared with as many chunks as so many passes before it have."""
 
 
 def chunk_pairs(cloud: Cloud, poses: Array, reach: float, most: int, *, passes: bool) -> ChunkPairs:
     """Chunks next to each other on the way; with ``passes`` also those whose centres are within ``reach`` [m].
 
-    Of one pass, no more than ``most`` chunks are paired with a chunk: the nearest.
+    Of one pass, no more than ``most`` chunks are paired with a chunk, and of all passes before it no more than
+    ``PASSES`` times as many: the nearest. A place that was seen ten times needs no pairs of every two of them to hang
+    together, and each further one would widen the separators of the elimination.
     """
     C, d = cloud.chunks, cloud.points.shape[1]
     first = np.searchsorted(cloud.chunk, np.arange(C))
@@ -222,6 +226,9 @@ def _nearest(pairs: Index, centres: Array, most: int) -> Index:
     order = np.lexsort((np.linalg.norm(centres[a] - centres[b], axis=1), group))
     first = np.searchsorted(group[order], group[order])
     chosen = order[np.arange(len(order)) - first < most]
+    chosen = chosen[np.lexsort((np.linalg.norm(centres[a[chosen]] - centres[b[chosen]], axis=1), a[chosen]))]
+    first = np.searchsorted(a[chosen], a[chosen])
+    chosen = chosen[np.arange(len(chosen)) - first < PASSES * most]
     return np.column_stack([a, b])[chosen]
 
 
