@@ -60,13 +60,14 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
     g = group_of(refinement.poses)
     at = steps_at(refinement, m.node_times)
     beside = np.tile(g.identity, (len(at), 1))  # T_body_node
-    bases = np.arange(len(at)) if m.base_nodes is None else m.base_nodes
-    for s, row in zip(submaps, bases):
+    rows = np.arange(len(at)) if m.base_nodes is None else m.base_nodes
+    first = submaps[0].trajectory
+    if first is not None and len(first):
+        beside[rows[0]] = g.inverse(first.poses[0])
+    # A node is the frame of an exit. The next submap may begin with the body as a match placed it, leaning otherwise.
+    for s, row in zip(submaps, rows[1:]):
         if s.trajectory is not None and len(s.trajectory):
-            beside[row] = g.inverse(s.trajectory.poses[0])
-    last = submaps[-1]
-    if last.trajectory is not None and len(last.trajectory):
-        beside[-1] = g.between(last.trajectory.poses[-1], last.exit_pose)
+            beside[row] = g.between(s.trajectory.poses[-1], s.exit_pose)
     ad = g.adjoint(g.inverse(beside))
     C = ad @ refinement.covariances[at] @ np.swapaxes(ad, 1, 2)
     return replace(

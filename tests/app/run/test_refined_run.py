@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from graphslam.core.poses import SE3, level
 from graphslam.core.records import Gps
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.io.tum import read_tum
-from graphslam.maps.refined import base_frames
+from graphslam.maps.refined import base_frames, refined_map
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -66,6 +67,25 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def differing(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
     return [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
+
+
+def test_nodes_stand_beside_the_body_as_exits_do(finished: Run) -> None:
+    """A submap that was entered by a match may begin with a body that leans otherwise than the exit before it."""
+    m = finished.map
+    C = np.tile(1e-6 * np.eye(6), (len(m.trajectory), 1, 1))
+    path = SimpleNamespace(times=m.trajectory.times, poses=m.trajectory.poses, covariances=C, fixes=None)
+    lean = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
+    submaps = []
+    for k, s in enumerate(finished.submaps):
+        poses = s.trajectory.poses.copy()
+        if k:
+            poses[0] = SE3.compose(poses[0], SE3.exp(lean))
+        submaps.append(replace(s, trajectory=replace(s.trajectory, poses=poses)))
+    nodes = refined_map(m, path, submaps).base_poses
+    for k, s in enumerate(finished.submaps):
+        body = m.trajectory.interpolate(np.array([s.interval[1]]))[0]
+        wanted = SE3.compose(body, SE3.between(s.trajectory.poses[-1], s.exit_pose))
+        np.testing.assert_allclose(SE3.log(SE3.between(wanted, nodes[k + 1])), 0.0, atol=1e-6)
 
 
 def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
