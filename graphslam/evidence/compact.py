@@ -194,6 +194,19 @@ def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
     return grid
 
 
+def move(grids: Sequence[EvidenceGrid]) -> None:
+    """Move grids into a pool of their own, the same for all, as large as they need it.
+
+    A pool keeps the memory of maps that died. After a particle filter that is many times what is left alive; its memory
+    is free as soon as no other grid lives in it. What grids shared is no longer shared.
+    """
+    pools: dict[int, GridPool] = {}
+    for grid in grids:
+        levels = grid.pool.levels
+        pool = pools.setdefault(levels, GridPool(levels))
+        grid.take(grid_of(grid.empty(pool), pieces_of(grid)))
+
+
 def overlap(pieces: Pieces) -> str | None:
     """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
     for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):

@@ -103,9 +103,9 @@ class EvidenceGrid:
     def __deepcopy__(self, memo: Any) -> EvidenceGrid:
         return self.copy()
 
-    def empty(self) -> EvidenceGrid:
-        """An empty grid of the same kind in the same pool."""
-        return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool, dim=self.dim)
+    def empty(self, pool: GridPool | None = None) -> EvidenceGrid:
+        """An empty grid of the same kind, in the same pool or another."""
+        return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
 
     def release(self) -> None:
         """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""
@@ -126,10 +126,9 @@ class EvidenceGrid:
         return self._box.root
 
     def take(self, other: EvidenceGrid) -> None:
-        """Become what ``other``, a grid of the same pool and kind, is now: how a long change is made whole or not at
-        all."""
+        """Become what ``other``, a grid of the same kind, is now: how a long change is made whole or not at all."""
         other._box.shared = True
-        self._box = other._box
+        self.pool, self._box = other.pool, other._box
 
     def same_as(self, other: EvidenceGrid) -> bool:
         """Whether two handles hold the very same tree (a copy that neither side has written to)."""

@@ -72,7 +72,9 @@ from graphslam.evaluate.refined import (
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
+from graphslam.evidence.compact import move
 from graphslam.evidence.formats import load_npz
+from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
@@ -239,6 +241,7 @@ def finished(
     scans = None if steps is None else Scans.of(steps)
     del steps
     front.forget()
+    move([s.grid for s in work.submaps if isinstance(s.grid, EvidenceGrid)])
     give_back()
     taken = take(log, work.drops.counts, reference_identities(log, front), noticed, scans)
     result = _solved(taken, settings, work.submaps, work.back, seconds, begin, work.work, effective, undo)
