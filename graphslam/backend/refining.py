@@ -138,6 +138,13 @@ def refine_run(
 
 def _input(r: Refinement) -> list[Finding]:
     """Is the odometry that came in better than what came out?"""
+    if r.left is not None:
+        text = (
+            f"The odometry of the log is better than what was made of it: scans agree in {r.reckoned:.1%} of the "
+            f"points along it, in {r.agreement[0]:.1%} along the graph's path and in {r.left:.1%} along the refined "
+            "one. So the path is the odometry's, and as sure as its own noise says; no loop is closed in it."
+        )
+        return [Finding("look", "input-better", text)]
     if not r.input_better:
         return []
     text = (
@@ -226,11 +233,13 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
     wrong : sequence of (i, j, metres, radians), optional
         Loops of the graph that it contradicts (:func:`wrong_loops`); None: the graph is not known.
     """
+    if r.left is not None:
+        return _input(r)
     last = r.rounds[-1]
     text = (
         f"The path was refined by its scans: {last.pairs} points on surfaces of other steps, {last.passes} of them of "
         f"other passes, with a spread of {1e3 * last.spread:.0f} mm; scans agree in {r.agreement[1]:.0%} of the points "
-        f"(before: {r.agreement[0]:.0%})."
+        f"(before: {r.agreement[0]:.0%}; along the odometry alone: {r.reckoned:.0%})."
     )
     out = [Finding("good", "refined", text)]
     out += _input(r)

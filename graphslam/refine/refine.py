@@ -141,6 +141,8 @@ class Refinement:
         Covariance of steps between nodes that they do not share with a node.
     fixes : FixReport or None
         What fixes did; None: there were none, or their way is too short to say where north is.
+    left : float or None
+        Agreement at the refined path where that of the odometry was taken instead, since scans agree better there.
     """
 
     times: Array
@@ -162,6 +164,7 @@ class Refinement:
     nodes: Index
     own: Array
     fixes: FixReport | None = None
+    left: float | None = None
 
     @property
     def better(self) -> bool:
@@ -320,7 +323,40 @@ class _Work:
             self.tell(f"{why}: once more from the odometry")
             other = self.from_odometry()
             taken = taken & (not other.taken)
-        return self.result(guides.steps[~taken & guides.far(self.poses)], other)
+            self.reckoned = self.agreement(self.raw, at_odometry, odometry, self.noise)
+        found = self.result(guides.steps[~taken & guides.far(self.poses)], other)
+        if not found.input_better or self.fixes is not None:  # fixes hold a path, and odometry knows none of them
+            return found
+        self.tell("the odometry alone agrees better than all that was made of it: its path is taken")
+        return self.as_it_came(found, odometry)
+
+    def as_it_came(self, found: Refinement, odometry: Array) -> Refinement:
+        """The path of the odometry, as sure as motion and gravity say without any scan."""
+        assert self.surfaces is not None
+        self.poses, self.states = odometry, self.first_states()
+        self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
+        unspent = np.zeros(len(self.found.pairs.source))
+        solved, _ = self.problem.linearise(self.poses, self.states, self.found.pairs, self.surfaces, unspent)
+        return replace(
+            found,
+            poses=odometry,
+            covariances=self.marginals(solved),
+            yaw_bias=np.column_stack([self.motion.knots, self.states[0]]),
+            constants={},
+            parts=solved.parts,
+            agreement=(found.agreement[0], found.reckoned),
+            left=found.agreement[1],
+            other=None,
+            scales=self.motion.scales,
+            walk=self.motion.walk,
+            motion=0.0,
+            solved=solved,
+        )
+
+    def marginals(self, solved: Solved) -> Array:
+        """Covariances ``(n, d, d)`` of the poses."""
+        n, w = len(self.steps), self.group.dof
+        return solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
 
     def from_odometry(self) -> Other:
         """Once more without the start, whose wrong loops may have pulled its right ones along or bent it too far.
@@ -479,7 +515,7 @@ class _Work:
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
-        C = solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
+        C = self.marginals(solved)
         const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))
         names = ("scale", "side", "rise", "clock", "roll", "pitch", "bend", "turn")
         sigma = np.sqrt(np.diag(const))

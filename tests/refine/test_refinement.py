@@ -16,8 +16,9 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
-from graphslam.refine.refine import refine
+from graphslam.refine.refine import _Work, refine
 from graphslam.refine.scans import Scans
+from graphslam.refine.surfaces import find_surfaces
 from tests.refine.world import court_scans
 
 SEEDS = range(40, 46)
@@ -208,3 +209,32 @@ def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
     assert "input-better" not in {f.code for f in findings_of(found)}
     worse = replace(found, reckoned=found.agreement[1] + 0.1)
     assert {f.code: f.level for f in findings_of(worse)}["input-better"] == "bad"
+
+
+def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start bent by metres, and rounds that bend the path whatever they begin with: what came in comes out."""
+    scans, start, truth = court_scans(41)
+    u = SE3.between(truth[:-1], truth[1:])
+    good = replace(scans.odometry, increments=np.concatenate([scans.odometry.increments[:1], u]))
+    scans = replace(scans, odometry=good)
+    rounds = _Work.all_passes
+
+    def bent(self: _Work, distances: tuple[float, ...]) -> None:
+        rounds(self, distances)
+        turns = np.linspace(0.0, 1.0, len(self.poses))[:, None] * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        self.poses = SE3.compose(SE3.exp(turns), self.poses)
+        self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
+
+    monkeypatch.setattr(_Work, "all_passes", bent)
+    found = refine(scans, start)
+    assert found.left is not None
+    assert found.left < found.reckoned == found.agreement[1]
+    assert found.better
+    assert not found.input_better
+    assert error(scans.times, found.poses, truth) < 0.01
+    said = {f.code: f.level for f in findings_of(found)}
+    assert said == {"input-better": "look"}
+    # as sure as the motion alone: each step adds its own noise and what lasts, and no scan takes any of it away
+    wide = np.sqrt(np.trace(found.covariances[-1][3:, 3:]))
+    assert wide >= 0.99 * np.sqrt(sum(np.trace(C[3:, 3:]) for C in good.covariances[1:]))
+    np.testing.assert_allclose(found.joint([len(scans) - 1]), found.covariances[-1], atol=1e-12)
