@@ -33,7 +33,7 @@ HEAD = CONSTANTS + 1
 PARAMETERS = 16
 Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
 """What is measured in a window."""
-Work = namedtuple("Work", ["L", "X", "C", "S", "chi2"])
+Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "gone", "pivots", "order", "when", "at"])
 """What an elimination leaves."""
 _Row = namedtuple("_Row", ["jp", "jn", "cols", "vals"])
 _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
@@ -72,8 +72,39 @@ def _add(row, n, blocks):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
+def _leave(at, active, A, C, S, gone):
+    """Eliminate a border column that one pose alone still knows; its row goes to ``gone``. Returns the pivot."""
+    D, m = C.shape
+    pivot = S[at, at]
+    gone[:] = 0.0
+    for b in range(at):
+        gone[b], S[b, at] = S[b, at], 0.0
+    for b in range(at + 1, active):
+        gone[b], S[at, b] = S[at, b], 0.0
+    S[at, at] = 0.0
+    for a in range(D):
+        gone[m + a], C[a, at] = C[a, at], 0.0
+    for a in range(active):
+        w = gone[a] / pivot
+        if w != 0.0:
+            for b in range(a, active):
+                S[a, b] -= w * gone[b]
+    for a in range(D):
+        w = gone[m + a] / pivot
+        if w != 0.0:
+            for b in range(active):
+                C[a, b] -= w * gone[b]
+            for b in range(D):
+                A[a, b] -= w * gone[m + b]
+    return pivot
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
-    """Linearise a window, and eliminate its poses, then its nuisances, onto the constants.
+    """Linearise a window, and eliminate its poses and nuisances onto the constants.
+
+    A nuisance goes with the last pose that sights it, and leaves its place in the border to another: so the border is
+    as wide as there are nuisances at a time, and not as long as the window.
 
     poses : (n, D) x, y, heading, and for D = 5 the lasting errors of yaw rate [rad/s] and speed [m/s].
     nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first sighting.
@@ -89,9 +120,11 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
     p : (PARAMETERS,) standard deviations and times.
     damping : share added to every diagonal, Levenberg-Marquardt.
     work : Work
-        L (n, D, D), X (n, D, D), C (n, D, HEAD + 2 M), S (HEAD + 2 M, HEAD + 2 M), chi2 (6,) out: what
-    :func:`substitute` needs; S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in
-    row RHS; chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
+        L (n, D, D), X (n, D, D), C (n, D, m), S (m, m), chi2 (6,), gone (2 M, m + D), pivots (2 M,), order (M,),
+        when (M,), at (M,) out, m = HEAD + 2 times the most nuisances at a time: what :func:`substitute` needs.
+        ``order`` has the nuisances in the order in which they went, ``when`` the poses with which, ``at`` their places
+        in the border. S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in row RHS;
+        chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
 
     Returns
     -------
@@ -99,10 +132,10 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
         ln det of all that was eliminated, and the sum of ln σ of all residuals.
     """
     steps, first, sightings, slots, kinds = data
-    L, X, C, S, chi2 = work
+    L, X, C, S, chi2, gone, pivots, order, when, at = work
     n, D = poses.shape
     M = len(nuisance)
-    m = HEAD + 2 * M
+    m = C.shape[2]
     S[:] = 0.0
     C[:] = 0.0
     chi2[:] = 0.0
@@ -124,18 +157,15 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
             _add(here, 1, start)
             chi2[5] += vals[0] * vals[0]
             volume += math.log(s)
-    for j in range(M):
-        for c in range(2):
-            s = 0.0
-            if kinds[j] == 1:
-                s = p[VISIT_RANGE] if c == 0 else p[VISIT_BEARING]
-                volume += math.log(s)
-                cols[1], vals[0], vals[1] = HEAD + 2 * j + c, -nuisance[j, c] / s, 1.0 / s
-                _add(alone, 2, start)
-                chi2[5] += vals[0] * vals[0]
-            else:
-                S[HEAD + 2 * j + c, HEAD + 2 * j + c] += _FAR
-    known = 0
+    last = np.zeros(M, np.int64)
+    for k in range(n):
+        for q in range(first[k], first[k + 1]):
+            for j in slots[q]:
+                if j >= 0:
+                    last[j] = k
+    at[:], when[:], order[:] = -1, -1, -1
+    used, gone_by = np.zeros((m - HEAD) // 2, np.bool_), np.zeros(M, np.bool_)
+    known = went = 0
     for k in range(n):
         X[k] = 0.0
         An[:] = 0.0
@@ -145,11 +175,27 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
         ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
         for q in range(first[k], first[k + 1]):
             j, v = slots[q, 0], slots[q, 1]
-            known = max(known, j + 1, v + 1)
+            for new in (j, v):  # seen for the first time: what is known of it beforehand
+                if new < 0 or at[new] >= 0:
+                    continue
+                place = 0
+                while used[place]:
+                    place += 1
+                at[new], used[place], known = place, True, max(known, place + 1)
+                for a in range(2):
+                    col = HEAD + 2 * place + a
+                    if kinds[new] == 1:
+                        sv = p[VISIT_RANGE] if a == 0 else p[VISIT_BEARING]
+                        volume += math.log(sv)
+                        cols[1], vals[0], vals[1] = col, -nuisance[new, a] / sv, 1.0 / sv
+                        _add(alone, 2, blocks)
+                        chi2[5] += vals[0] * vals[0]
+                    else:
+                        S[col, col] += _FAR
             dx, dy = nuisance[j, 0] - x - ox, nuisance[j, 1] - y - oy
             r2 = dx * dx + dy * dy + 1e-12
             r = math.sqrt(r2)
-            base = HEAD + 2 * j
+            base = HEAD + 2 * at[j]
             grow = 1.0 + g[RANGE_SCALE]
             w = 1.0 / p[RANGE]
             volume += math.log(p[RANGE])
@@ -165,7 +211,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
             count = 5
             if v >= 0:
                 e += nuisance[v, 0]
-                cols[5], vals[5] = HEAD + 2 * v, w
+                cols[5], vals[5] = HEAD + 2 * at[v], w
                 count = 6
             vals[0] = -w * e
             chi2[3] += vals[0] * vals[0]
@@ -185,7 +231,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
                 cols[3], vals[3] = SENSOR_YAW, -w
                 count = 4
                 if v >= 0:
-                    cols[4], vals[4] = HEAD + 2 * v + 1, w
+                    cols[4], vals[4] = HEAD + 2 * at[v] + 1, w
                     count = 5
                 vals[0] = -w * e
                 chi2[4] += vals[0] * vals[0]
@@ -257,8 +303,25 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
         if damping > 0.0:
             for a in range(D):
                 A[a, a] *= 1.0 + damping
-        # Cholesky of the pose, then what it leaves to the next one and to the border
+        # nuisances that are not seen again, then Cholesky of the pose, and what it leaves to the next and to the border
         active = HEAD + 2 * known
+        for q in range(first[k], first[k + 1]):
+            for j in slots[q]:
+                if j < 0 or last[j] != k or gone_by[j]:
+                    continue
+                order[went], when[went] = j, k
+                went += 1
+                gone_by[j], used[at[j]] = True, False
+                col = HEAD + 2 * at[j]
+                if damping > 0.0:
+                    S[col, col] *= 1.0 + damping
+                    S[col + 1, col + 1] *= 1.0 + damping
+                for a in range(1, -1, -1):
+                    pivot = _leave(col + a, active, A, C[k], S, gone[2 * j + a])
+                    if not pivot > 0.0:
+                        return np.nan, volume
+                    pivots[2 * j + a] = pivot
+                    logdet += math.log(pivot)
         for a in range(D):
             for b in range(a + 1):
                 t = A[a, b]
@@ -299,37 +362,22 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
                     for b in range(a, active):
                         S[a, b] -= w * C[k, i, b]
         A, An = An, A
-    if damping > 0.0:
-        for j in range(HEAD, m):
-            S[j, j] *= 1.0 + damping
-    for j in range(m - 1, HEAD - 1, -1):
-        pivot = S[j, j]
-        if not pivot > 0.0:
-            return np.nan, volume
-        logdet += math.log(pivot)
-        for a in range(j):
-            w = S[a, j] / pivot
-            if w != 0.0:
-                for b in range(a, j):
-                    S[a, b] -= w * S[b, j]
     return logdet, volume
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def substitute(work, dg, d_poses, d_nuisance):
     """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
-    L, X, C, S, _ = work
+    L, X, C, _, _, gone, pivots, order, when, at = work
     n, D = d_poses.shape
     m = C.shape[2]
     y = np.zeros(m)
     y[:CONSTANTS] = dg
     y[RHS] = -1.0
-    for j in range(HEAD, m):
-        t = 0.0
-        for a in range(j):
-            t += S[a, j] * y[a]
-        y[j] = -t / S[j, j]
-        d_nuisance[(j - HEAD) // 2, (j - HEAD) % 2] = y[j]
+    d_nuisance[:] = 0.0
+    last = len(order) - 1
+    while last >= 0 and order[last] < 0:
+        last -= 1
     for k in range(n - 1, -1, -1):
         for a in range(D - 1, -1, -1):
             t = 0.0
@@ -341,6 +389,16 @@ def substitute(work, dg, d_poses, d_nuisance):
             for b in range(a + 1, D):
                 t += L[k, b, a] * d_poses[k, b]
             d_poses[k, a] = -t / L[k, a, a]
+        while last >= 0 and when[last] == k:  # those that went with it, the last one first
+            j = order[last]
+            for a in range(2):
+                t = 0.0
+                for b in range(m):
+                    t += gone[2 * j + a, b] * y[b]
+                for b in range(D):
+                    t += gone[2 * j + a, m + b] * d_poses[k, b]
+                d_nuisance[j, a] = y[HEAD + 2 * at[j] + a] = -t / pivots[2 * j + a]
+            last -= 1
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

@@ -146,9 +146,9 @@ class Smoothing:
         if len(self._memory) != len(self.windows):
             self._memory = []
             for w in self.windows:
-                (n, D), m = w.poses.shape, K.HEAD + 2 * len(w.nuisance)
-                shapes = ((n, D, D), (n, D, D), (n, D, m), (m, m), (6,))
-                self._memory.append(K.Work(*(np.zeros(s) for s in shapes)))
+                (n, D), M, m = w.poses.shape, len(w.nuisance), K.HEAD + 2 * at_a_time(w)
+                shapes = ((n, D, D), (n, D, D), (n, D, m), (m, m), (6,), (2 * M, m + D), (2 * M,))
+                self._memory.append(K.Work(*(np.zeros(s) for s in shapes), *np.zeros((3, M), dtype=np.int64)))
         return self._memory
 
     def _eliminated(self, p: Array, damping: float = 0.0) -> tuple[float, float, Array, Array]:
@@ -296,6 +296,18 @@ class Smoothing:
             v = v + s["heading_second"] ** 2 * u[:, 3] + s["floor_heading"] ** 2
             moved.append((np.pi - np.mod(np.pi - e, 2 * np.pi)) / np.sqrt(v))
         return seen, moved
+
+
+def at_a_time(w: Window) -> int:
+    """The most nuisances of a window that were sighted already and will be sighted again."""
+    k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))
+    change = np.zeros(len(w.poses) + 1, dtype=np.int64)
+    for j in range(len(w.nuisance)):
+        mine = k[(w.slots == j).any(axis=1)]
+        if len(mine):
+            change[mine[0]] += 1
+            change[mine[-1] + 1] -= 1
+    return int(np.cumsum(change).max(initial=0))
 
 
 def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) -> Smoothing:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window, numbered
+from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window, at_a_time, numbered
 from tests.reference.slow_smoothing import objective_and_step, residuals, states_of
 
 
-def window(rng, n=7, landmarks=4, states=3, visits=True, bearings=True):
+def window(rng, n=7, landmarks=4, states=3, visits=2, bearings=True):
     """A window with everything in it, its states off their optimum."""
     steps = np.column_stack([rng.normal(0.5, 0.1, n), rng.normal(0, 0.05, n), rng.normal(0, 0.2, n)])
     steps = np.column_stack([steps, rng.uniform(0.1, 0.3, n), np.hypot(steps[:, 0], steps[:, 1]), np.zeros((n, 3))])
@@ -25,7 +25,7 @@ def window(rng, n=7, landmarks=4, states=3, visits=True, bearings=True):
             if rng.random() < 0.7:
                 d = places[l] - poses[k, :2]
                 seen.append([np.hypot(*d) + rng.normal(0, 0.1), np.arctan2(d[1], d[0]) - poses[k, 2]])
-                slots.append([l, landmarks + 2 * l + (k > n // 2) if visits else -1])
+                slots.append([l, landmarks + visits * l + k * visits // n if visits else -1])
         first.append(len(seen))
     seen = np.array(seen)
     if not bearings:
@@ -38,13 +38,30 @@ def window(rng, n=7, landmarks=4, states=3, visits=True, bearings=True):
     return Window(np.arange(n) * 1.0, steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance)
 
 
-@pytest.mark.parametrize(("states", "visits", "bearings"), [(3, False, True), (3, True, False), (5, True, True)])
+@pytest.mark.parametrize(("states", "visits", "bearings"), [(3, 0, True), (3, 2, False), (5, 2, True)])
 def test_likelihood_and_step_are_those_of_dense_algebra(states, visits, bearings):
     rng = np.random.default_rng(4)
     windows = [window(rng, states=states, visits=visits, bearings=bearings) for _ in range(2)]
     s = Smoothing(windows, np.array([0.4, -0.1, 0.2]), CONSTANTS, ("range", "heading_metre"))
     s.constants[:] = 0.02 * rng.standard_normal(7)
     s.sigmas["range"] = 0.31
+    wanted, step = objective_and_step(s)
+    assert s.objective() == pytest.approx(wanted, abs=1e-3)
+    before = states_of(s)
+    moved = s.copy()
+    moved.settle(iterations=1)
+    np.testing.assert_allclose(states_of(moved) - before, step, atol=2e-5)
+
+
+@pytest.mark.parametrize("states", [3, 5])
+def test_a_nuisance_that_goes_early_leaves_its_place_to_another(states):
+    """Many short visits: the border is as wide as there are at a time, and the algebra is that of all at once."""
+    rng = np.random.default_rng(6)
+    windows = [window(rng, n=20, landmarks=3, states=states, visits=7) for _ in range(2)]
+    for w in windows:
+        assert at_a_time(w) <= 3 + 2 * 3 < len(w.nuisance) - 6
+    s = Smoothing(windows, np.array([0.4, -0.1, 0.2]), CONSTANTS, ("range",))
+    s.constants[:] = 0.02 * rng.standard_normal(7)
     wanted, step = objective_and_step(s)
     assert s.objective() == pytest.approx(wanted, abs=1e-3)
     before = states_of(s)
