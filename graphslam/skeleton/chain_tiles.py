@@ -1,9 +1,10 @@
-"""Chains with loops that are larger than memory: tiles on disk, one in memory at a time, one task a tile and step.
+"""Chains with loops that are larger than memory: tiles on disk, one in memory at a time, and tasks of some tiles.
 
 A tile is a range of poses; it shares its last pose with the next one. The *separator* is these shared poses and the
-ends of loops between tiles. A task moves the poses of its tile by the last step, joins its links, eliminates all poses
-that are not of the separator and hands over what is left; the separator is solved exactly where the tasks are given
-out. So a step is the Gauss-Newton step of the whole network, as if it were in memory.
+ends of loops between tiles. In each step a task takes as many neighbouring tiles as make it worth being handed out. Of
+one after the other it moves the poses by the last step, joins the links, eliminates all poses that are not of the
+separator and hands over what is left; the separator is solved exactly where the tasks are given out. So a step is the
+Gauss-Newton step of the whole network, as if it were in memory.
 
 Every file is named by the digest of its bytes, and a task only reads files and writes files: it can be repeated, by the
 same worker or by another one, at any moment, and nothing changes.
@@ -11,9 +12,10 @@ same worker or by another one, at any moment, and nothing changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +37,10 @@ from graphslam.skeleton.schur import moved
 from graphslam.skeleton.segment_kernels import Links
 from graphslam.skeleton.tile_store import put_arrays, take_arrays
 
+TASK_SECONDS = 1.0
+"""CPU time from which a task is worth being handed out."""
+POSE_SECONDS = 2e-6
+"""CPU time of a pose in one step, until the first step has told it: as measured, loops at one pose in a hundred."""
 FORMAT = "graphslam.chain-tiles/1"
 _INDEX = "chain.json"
 _SHAPE = {"format": str, "ties": str, "tiles": [{"file": str, "poses": str, "begin": int, "end": int}]}
@@ -138,6 +144,8 @@ class RelaxedTiles:
     converged : bool
     separator : int
         Poses of the separator.
+    tasks : list of float
+        CPU time of the tasks of the last step [s].
     """
 
     folder: Path
@@ -148,6 +156,7 @@ class RelaxedTiles:
     largest_move: float
     converged: bool
     separator: int
+    tasks: list[float]
 
     def poses(self, tile: int) -> Poses:
         """Poses of one tile; its first one is the last one of the tile before."""
@@ -161,6 +170,7 @@ def relax_tiles(
     cluster: str | None = None,
     iterations: int = 30,
     gain: float = 1e-6,
+    task_seconds: float = TASK_SECONDS,
     progress: Callable[[float], None] | None = None,
 ) -> RelaxedTiles:
     """Gauss-Newton on a chain with loops on disk, each system solved exactly.
@@ -175,6 +185,9 @@ def relax_tiles(
         Address of a running Dask scheduler, whose workers see the same folder.
     iterations, gain, progress
         As in :func:`~graphslam.skeleton.chain_graph.relax_chain`.
+    task_seconds : float
+        A task takes as many tiles, one after the other, as make so much CPU time [s]: a shorter one is not worth being
+        handed out. Nothing else depends on it.
 
     Raises
     ------
@@ -187,19 +200,27 @@ def relax_tiles(
     index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
     tiles = index["tiles"]
     separator = _Separator(take_arrays(where, index["ties"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
+    seconds = [POSE_SECONDS * (int(t["end"]) - int(t["begin"])) for t in tiles]
+    spent: list[float] = []
+    known: list[bool] = []
     given = {index["ties"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
 
     with hands(workers, cluster) as run:
 
         def step(names: list[str], x: Array | None, scale: float = 1.0) -> list[Done]:
-            rows = separator.rows
-            return run(
-                work_on_tile,
-                [
-                    (str(where), t["file"], name, stay, None if x is None else x[a:b], scale)
-                    for t, name, stay, (a, b) in zip(tiles, names, separator.stay, rows)
-                ],
-            )
+            work = [
+                (str(where), t["file"], name, stay, None if x is None else x[a:b], scale)
+                for t, name, stay, (a, b) in zip(tiles, names, separator.stay, separator.rows)
+            ]
+            # without a step there is half to do
+            given_out = tasks_of(seconds, task_seconds * (2.0 if x is None else 1.0))
+            done = [d for some in run(work_on_tiles, [(work[s],) for s in given_out]) for d in some]
+            spent[:] = [sum(d.seconds for d in done[s]) for s in given_out]
+            if x is not None:
+                # what a worker does for the first time takes longer
+                seconds[:] = [min(s, d.seconds) for s, d in zip(seconds if known else [np.inf] * len(done), done)]
+                known.append(True)
+            return done
 
         def keep(done: list[Done]) -> None:
             """Remove what earlier steps wrote."""
@@ -237,7 +258,7 @@ def relax_tiles(
     keep(done)
     sweep_parts(where)
     names = [d.poses for d in done]
-    return RelaxedTiles(where, names, left.total, history, predicted, far, converged, separator.size)
+    return RelaxedTiles(where, names, left.total, history, predicted, far, converged, separator.size, spent)
 
 
 class Done(NamedTuple):
@@ -248,6 +269,34 @@ class Done(NamedTuple):
     total: float
     gain: float
     far: float
+    seconds: float
+    """CPU time that it took."""
+
+
+def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
+    """Neighbouring tiles, grouped to tasks of ``least`` seconds or more; all in one where they are fewer.
+
+    Parameters
+    ----------
+    seconds : sequence of float
+        Of each tile.
+    least : float
+    """
+    out, begin, taken = [], 0, 0.0
+    for k, s in enumerate(seconds):
+        taken += s
+        if taken >= least:
+            out.append(slice(begin, k + 1))
+            begin, taken = k + 1, 0.0
+    if begin < len(seconds):  # what is left is no task of its own
+        first = out.pop().start if out else 0
+        out.append(slice(first, len(seconds)))
+    return out
+
+
+def work_on_tiles(work: Sequence[tuple[Any, ...]]) -> list[Done]:
+    """:func:`work_on_tile` of each, one in memory at a time."""
+    return [work_on_tile(*one) for one in work]
 
 
 def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | None, scale: float) -> Done:
@@ -264,7 +313,7 @@ def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | Non
     scale : float
         Share of the step that is taken.
     """
-    where = Path(folder)
+    where, began = Path(folder), process_time()
     network = KeptNetwork(ChainGraph(**take_arrays(where, tile)), stay)
     inner = _Inner(network, stay)
     here, far = _poses(where, poses), 0.0
@@ -283,7 +332,9 @@ def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | Non
         "rotation": here.rotation[stay],
         "position": here.position[stay],
     }
-    return Done(poses, put_arrays(where, arrays), joined.total, joined.total - joined.energy + left.gain, far)
+    name = put_arrays(where, arrays)
+    spent = process_time() - began
+    return Done(poses, name, joined.total, joined.total - joined.energy + left.gain, far, spent)
 
 
 def _poses(folder: Path, name: str) -> Poses:

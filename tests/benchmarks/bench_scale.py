@@ -327,6 +327,8 @@ def chain_from_tiles(folder: str, workers: int, cluster: str) -> dict[str, Any]:
         "history": found.history,
         "separator": found.separator,
         "tiles": len(found.names),
+        "tasks": len(found.tasks),
+        "shortest": min(found.tasks),
         "peak": peak(),
         "peak_workers": theirs.ru_maxrss / 1e6,
     }
@@ -558,7 +560,8 @@ def main() -> int:
                 failed += 1
                 continue
             print(
-                f"  from disk: written in {drawn['seconds']:.1f} CPU s; {t['tiles']} tiles, separator of "
+                f"  from disk: written in {drawn['seconds']:.1f} CPU s; {t['tiles']} tiles in {t['tasks']} tasks "
+                f"(the shortest {t['shortest']:.2f} CPU s a step), separator of "
                 f"{t['separator']:,} poses; relaxed in {t['seconds']:.1f} CPU s and {t['workers']:.1f} CPU s of "
                 f"workers ({t['wall']:.1f} s wall), peak {t['peak']:.2f} GB, of a worker {t['peak_workers']:.2f} GB; "
                 "objective " + " → ".join(f"{J:.7g}" for J in t["history"]),

@@ -6,8 +6,10 @@ import json
 import os
 import signal
 import threading
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +18,9 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.core.cluster import require_distributed
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.skeleton import chain_tiles as tiles
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
-from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, pieces_of, relax_tiles
+from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, pieces_of, relax_tiles, tasks_of
 from graphslam.skeleton.landmark_kernels import Poses
 from tests.skeleton.test_chain_graph import drawn
 
@@ -90,11 +93,48 @@ def test_a_killed_worker_changes_no_byte(graph: ChainGraph, tmp_path: Path) -> N
                 kill(0)  # before the tasks of the next step are given out …
                 threading.Timer(0.02, kill, (1,)).start()  # … and while they run
 
-        found = relax_tiles(shared, cluster=cluster.scheduler_address, gain=1e-12, progress=progress)
+        found = relax_tiles(shared, cluster=cluster.scheduler_address, gain=1e-12, task_seconds=0.0, progress=progress)
     assert len(set(killed)) == 2
     assert found.names == wanted.names
     assert found.history == wanted.history
     assert bytes_of(shared) == bytes_of(alone)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.5, 1.0, 3.0, 100.0])
+def test_tasks_are_whole_tiles_of_so_many_seconds(least: float) -> None:
+    seconds = np.random.default_rng(3).uniform(0.01, 0.7, 60)
+    tasks = tasks_of(seconds.tolist(), least)
+    assert [k for s in tasks for k in range(s.start, s.stop)] == list(range(60))
+    spent = np.array([seconds[s].sum() for s in tasks])
+    assert spent.min() >= min(least, seconds.sum())
+    assert len(tasks) == 1 or spent[:-1].max() < least + 0.7  # and no longer than they must be
+
+
+def test_tasks_are_as_long_as_what_was_measured_makes_them(
+    graph: ChainGraph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten times as slow as was thought: tasks of one tile where they were of ten; and no byte differs."""
+    sizes: list[list[int]] = []
+
+    def slow(work: list[Any]) -> list[tiles.Done]:
+        sizes[-1].append(len(work))
+        return [tiles.work_on_tile(*one)._replace(seconds=0.1) for one in work]
+
+    def run(work: Any, tasks: list[Any]) -> list[Any]:
+        sizes.append([])
+        return [work(*t) for t in tasks]
+
+    folders = [chain_to_disk(tmp_path / name, pieces_of(graph, 5)) for name in ("one", "two")]
+    wanted = relax_tiles(folders[0])
+    monkeypatch.setattr(tiles, "POSE_SECONDS", 0.01 / 5)
+    monkeypatch.setattr(tiles, "work_on_tiles", slow)
+    monkeypatch.setattr(tiles, "hands", lambda workers, cluster: nullcontext(run))
+    found = relax_tiles(folders[1], task_seconds=0.095)
+    assert sizes[:2] == [[20], [10, 10]]  # first there is no step to take, and half to do
+    assert all(set(s) == {1} for s in sizes[2:])
+    assert found.tasks == [0.1] * 20
+    assert found.names == wanted.names
+    assert bytes_of(folders[0]) == bytes_of(folders[1])
 
 
 def test_the_command_relaxes_a_folder(graph: ChainGraph, tmp_path: Path) -> None:

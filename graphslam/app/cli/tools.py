@@ -75,6 +75,7 @@ def relax(
     value = {
         "folder": str(folder),
         "tiles": len(found.names),
+        "tasks": len(found.tasks),
         "separator": found.separator,
         "objective_initial": found.history[0],
         "objective": found.objective,
