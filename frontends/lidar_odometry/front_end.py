@@ -16,10 +16,11 @@ from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
+from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
-from graphslam.core.records import Odometry
+from graphslam.core.records import Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.beams import BeamModel
@@ -27,6 +28,7 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.lidar_odometry.cells import evenly
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
 from graphslam.frontends.lidar_odometry.odometry import MAPPED, LidarOdometry, Seen
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.exits import relative_covariance
@@ -35,6 +37,14 @@ BENT = 0.1
 """Way of points in the time from scan to scan from which it matters that they have no times [m]."""
 MANY = 0.05
 """Share of lost scans of a submap from which a line of the verdict says so."""
+FIRST = 5
+"""Scans that must have come before any is followed: an IMU whose readings begin later is left alone."""
+UNNAMED = ("auto", "none")
+"""Choices of an IMU that are no name of a stream."""
+OF_USE = 15.0
+"""Readings are of use for so long after a scan [s]."""
+REHEARSED = 60
+"""Scans at the start that are followed twice at most, until it is known what an IMU does not know."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +92,9 @@ class LidarFrontEndConfig:
 
     stream: str | None = None
     """Stream of point clouds; None: the first of the log."""
+    imu: str = "auto"
+    """Stream of an IMU that tells where a match begins, unbends scans, and knows up; ``none``; or the first of the
+    log."""
     odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     """How scans are matched."""
     submap: LidarSubmapConfig = field(default_factory=LidarSubmapConfig)
@@ -120,9 +133,9 @@ class Follow:
 class LidarFrontEnd(FrontEnd):
     """The front end ``kiss-icp``.
 
-    Needs a stream of point clouds and nothing else. It draws nothing, and says of every scan what the scans up to it
-    let it say. A run that is resumed follows the scans again from the start, since window and running medians go on
-    from submap to submap, and makes the maps that are missing.
+    Needs a stream of point clouds, and takes an IMU where there is one. It draws nothing, and says of every scan what
+    the scans up to it let it say. A run that is resumed follows the scans again from the start, since window and
+    running medians go on from submap to submap, and makes the maps that are missing.
     """
 
     config: LidarFrontEndConfig = field(default_factory=LidarFrontEndConfig)
@@ -138,23 +151,30 @@ class LidarFrontEnd(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`~graphslam.frontends.base.FrontEnd`. A scan is followed when the next one has come."""
+        """See :class:`~graphslam.frontends.base.FrontEnd`. A scan is followed when the next one has come, and the IMU's
+        readings up to it; the first ones when there are enough of them to know that unit."""
         first = 0 if after is None else after.key + 1
         while not feed.ended and self._stream(feed) is None:
             yield None
         name = self._named(feed.name, self._stream(feed))
+        while not feed.ended and (feed.count(name) < FIRST or self.config.imu not in (*feed.names(object), *UNNAMED)):
+            yield None
+        unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
+        yield from unit.rehearse(name)
+        odometry = unit.odometry()
         seen: list[Follow] = []
-        self._made[:] = [feed, seen]
-        config, odometry = self.config.submap, LidarOdometry(self.config.odometry)
+        self._made[:] = [feed, seen, unit]
+        config = self.config.submap
         kept: list[Follow] = []
         k, key, way, told = -1, 0, 0.0, False
         while True:
-            while not feed.ended and feed.count(name) <= k + 2:
+            while not feed.ended and (feed.count(name) <= k + 2 or not unit.reaches(feed.part(name, k + 1, k + 2))):
                 yield None
             k, scans = k + 1, feed.count(name)  # only the end tells that a scan is the last
             if k >= scans:
                 break
             clouds = self._checked(name, feed.part(name, k, k + 1))
+            unit.hear(float(clouds.times[0]))
             seen.append(self._follow(odometry, clouds, 0))
             feed.let_go(name, k + 1)
             if k == 0:
@@ -168,7 +188,10 @@ class LidarFrontEnd(FrontEnd):
                 if n and key >= first:
                     ended = "end-of-log" if k == scans - 1 else "length"
                     origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)
-                    yield _submap(name, kept, origin, config, key, ended, bent)
+                    base = kept[0].pose
+                    if key == 0 and odometry.inertial is not None:
+                        base = upright(base, odometry.inertial.up)
+                    yield _submap((name, unit.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
                 kept, key, way = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
         if key == 0:
@@ -182,9 +205,14 @@ class LidarFrontEnd(FrontEnd):
         name, clouds = self._clouds(log)
         made = bool(self._made) and self._made[0].ended and self._made[0].log is log
         if not (made and len(self._made[1]) == len(clouds)):
-            odometry = LidarOdometry(self.config.odometry)
-            self._made[:] = [Feed(log), [self._follow(odometry, clouds, k) for k in range(len(clouds))]]
-        return _steps(log, name, clouds, self._made[1], self.config)
+            feed = Feed(log)
+            unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
+            for _ in unit.rehearse(name):
+                pass
+            odometry = unit.odometry()
+            self._made[:] = [feed, [self._follow(odometry, clouds, k) for k in range(len(clouds))], unit]
+        _, seen, unit = self._made
+        return _steps(log, name, clouds, seen, self.config, unit.tilt(log, *_stamped(seen)))
 
     def forget(self) -> None:
         """Let go of the path and the scans of the last log."""
@@ -207,9 +235,19 @@ class LidarFrontEnd(FrontEnd):
         name = self._named(log.name, self._stream(log))
         return name, self._checked(name, log[name])
 
+    def _imu(self, feed: Feed, clouds: str) -> str | None:
+        """Name of the IMU that is taken: one that reads as soon as the first scans are made."""
+        name = feed.of_type(Imu) if self.config.imu == "auto" else self.config.imu
+        if name is None or name == "none":
+            return None
+        stream = feed.part(name)
+        if not isinstance(stream, Imu):
+            raise ConfigError(f"frontend.imu = {name!r} is no IMU; got {type(stream).__name__}")
+        scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
+        return name if len(stream.times) and len(scans) and stream.times[0] <= scans[-1] else None
+
     def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> Follow:
-        cloud, ages = clouds.cloud(k), clouds.ages(k)
-        seen = odometry.step(se3.se3_transform(clouds.T_base_sensor, cloud), float(clouds.times[k]), ages)
+        seen = _step(odometry, clouds, k)
         return Follow(
             float(clouds.times[k]),
             odometry.pose,
@@ -217,8 +255,97 @@ class LidarFrontEnd(FrontEnd):
             odometry.spread,
             odometry.points[evenly(len(odometry.points), self.config.submap.points)],
             seen,
-            ages is not None,
+            clouds.ages(k) is not None,
         )
+
+
+class _Unit:
+    """The IMU of a feed, if there is one, and what of it is known.
+
+    Parameters
+    ----------
+    feed : Feed
+    name : str or None
+    config : LidarOdometryConfig
+    """
+
+    def __init__(self, feed: Feed, name: str | None, config: LidarOdometryConfig) -> None:
+        self.feed, self.name, self.config = feed, name, config
+        self.inertial: Inertial | None = None
+        self._heard = 0
+
+    def reaches(self, scan: Stream) -> bool:
+        """Have its readings come up to the stamp of a scan?"""
+        return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
+
+    def hear(self, now: float = -np.inf) -> None:
+        """Take the readings that have come, and forget those that are of no use any more ``now`` [s]."""
+        if self.name is None or self.inertial is None:
+            return
+        n = self.feed.count(self.name)
+        if n > self._heard:
+            self.inertial.readings.more(self._part(self._heard, n), now - OF_USE)
+            self._heard = n
+
+    def rehearse(self, clouds: str) -> Iterator[None]:
+        """Follow the first scans to learn what the unit does not know; None: more records are wanted."""
+        if self.name is None:
+            return
+        while not self.feed.ended and self.feed.count(self.name) < USUAL:
+            yield None
+        self._heard = self.feed.count(self.name)
+        self.inertial = Inertial(self._part(0, self._heard))
+        odometry = LidarOdometry(self.config, self.inertial)
+        for k in range(REHEARSED):
+            while not self.feed.ended and (
+                self.feed.count(clouds) <= k or not self.reaches(self.feed.part(clouds, k, k + 1))
+            ):
+                yield None
+            if k >= self.feed.count(clouds):
+                break
+            self.hear()
+            _step(odometry, self.feed.part(clouds, k, k + 1), 0)
+            if self.inertial.rehearsed:
+                break
+        if self.inertial.believed and self.inertial.known:
+            self.inertial.rewind()
+        else:
+            self.inertial = Inertial(self._part(0, self._heard))  # it may be believed later
+
+    def odometry(self) -> LidarOdometry:
+        """At its start."""
+        return LidarOdometry(self.config, self.inertial)
+
+    def tilt(self, log: SensorLog, times: Array, poses: Array) -> Tilt | None:
+        """Gravity along a path, by all readings."""
+        if self.name is None or self.inertial is None:
+            return None
+        self.inertial.readings = Readings(log[self.name])
+        return tilt_of(self.inertial, times, poses)
+
+    def _part(self, first: int, last: int) -> Imu:
+        assert self.name is not None
+        stream = self.feed.part(self.name, first, last)
+        assert isinstance(stream, Imu)
+        return stream
+
+
+def odometry_of(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | None = None) -> LidarOdometry:
+    """LiDAR odometry at its start.
+
+    With an IMU, the first scans are followed to learn its bias, the velocity and gravity, and whether it is to be
+    believed; then they are to be followed anew, so that not even the first of them is bent.
+    """
+    streams: dict[str, Stream] = {"clouds": clouds} if imu is None else {"clouds": clouds, "imu": imu}
+    unit = _Unit(Feed(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
+    for _ in unit.rehearse("clouds"):
+        pass
+    return unit.odometry()
+
+
+def _step(odometry: LidarOdometry, clouds: Any, k: int) -> Seen:
+    points = se3.se3_transform(clouds.T_base_sensor, clouds.cloud(k))
+    return odometry.step(points, float(clouds.times[k]), clouds.ages(k))
 
 
 def _bent(key: int, kept: list[Follow]) -> list[Finding]:
@@ -239,11 +366,24 @@ def _bent(key: int, kept: list[Follow]) -> list[Finding]:
     return [Finding("look", "points-without-times", text)]
 
 
+def _stamped(made: list[Follow]) -> tuple[Array, Array]:
+    """Stamps and poses of the scans that were matched."""
+    some = [f for f in made if f.seen.state in MAPPED]
+    return np.array([f.time for f in some]), np.array([f.pose for f in some]).reshape(-1, 7)
+
+
 def _submap(
-    name: str, kept: list[Follow], origin: Array, config: LidarSubmapConfig, key: int, ended: str, bent: list[Finding]
+    names: tuple[str, str | None],
+    base: Array,
+    kept: list[Follow],
+    origin: Array,
+    config: LidarSubmapConfig,
+    key: int,
+    ended: str,
+    bent: list[Finding],
 ) -> Submap:
     poses = np.array([f.pose for f in kept])
-    path = se3.se3_between(np.broadcast_to(poses[0], poses.shape), poses)
+    path = se3.se3_between(np.broadcast_to(base, poses.shape), poses)
     C = np.array([relative_covariance((poses[0], f.pose), (poses[0], f.pose), f.joint) for f in kept])
     grid = EvidenceGrid(config.voxel_size, model=config.beam_model(), dim=3)
     dropped, points, scan = 0, [], []
@@ -272,7 +412,10 @@ def _submap(
         "beams_dropped": int(dropped),
         "exit_covariance": "window",
     }
-    findings = [*bent, *_findings(key, kept, report)]
+    aided = sum(f.seen.aided for f in kept[int(key > 0) :])
+    if names[1] is not None:
+        report["scans_aided"] = aided
+    findings = [*bent, *_findings(key, kept, report, names[1])]
     if findings:
         report["findings"] = [f.as_row() for f in findings]
     cloud = None
@@ -288,13 +431,20 @@ def _submap(
         trajectory=Trajectory(np.array([f.time for f in kept]), path, C),
         grid=grid,
         cloud=cloud,
-        uses=frozenset({name}),
+        uses=frozenset({names[0]}),
+        aids=frozenset({names[1]} if names[1] is not None and aided else ()),
         report=report,
     )
 
 
-def _findings(key: int, kept: list[Follow], report: dict[str, Any]) -> list[Finding]:
+def _findings(key: int, kept: list[Follow], report: dict[str, Any], imu: str | None) -> list[Finding]:
     out, n = [], report["scans"]
+    if imu is not None and report["scans_aided"] < 0.5 * n:
+        text = (
+            f"Submap {key}: {imu} was left aside in {n - report['scans_aided']} of {n} scans. There its readings have "
+            "a pause, or an even motion tells the turns between scans better: look at its axes, units and stamps."
+        )
+        out.append(Finding("look", "imu-left-aside", text))
     if report["scans_lost"] > MANY * n:
         text = (
             f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
@@ -310,7 +460,14 @@ def _findings(key: int, kept: list[Follow], report: dict[str, Any]) -> list[Find
     return out
 
 
-def _steps(log: SensorLog, name: str, clouds: PointClouds, made: list[Follow], config: LidarFrontEndConfig) -> Steps:
+def _steps(
+    log: SensorLog,
+    name: str,
+    clouds: PointClouds,
+    made: list[Follow],
+    config: LidarFrontEndConfig,
+    tilt: Tilt | None,
+) -> Steps:
     times = np.array([f.time for f in made])
     poses = np.array([f.pose for f in made])
     increments = np.concatenate([np.array([[0.0, 0, 0, 0, 0, 0, 1]]), se3.se3_between(poses[:-1], poses[1:])])
@@ -328,6 +485,9 @@ def _steps(log: SensorLog, name: str, clouds: PointClouds, made: list[Follow], c
         returns=np.ones(len(ends), np.bool_),
         max_range=config.odometry.max_range,
         range_sigma=0.03,
+        tilt=None if tilt is None else tilt.at(times, poses),
+        tilt_sigma=0.0 if tilt is None else tilt.sigma,
+        tilt_time=1.0 if tilt is None else tilt.time,
         uses=frozenset({name}),
         name=log.name,
         truth=log.truth.trajectory if log.truth is not None else None,

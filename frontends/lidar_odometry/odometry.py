@@ -10,7 +10,7 @@ spoils all that come after.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -20,6 +20,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, evenly, thin
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.inertial import Inertial
 from graphslam.frontends.lidar_odometry.joint import JointErrors
 from graphslam.frontends.scan_window.tracker import directions
 
@@ -89,6 +90,8 @@ class Seen:
     state : str
         "first", "matched", "new space", "found again" (far and wide), "lost" (predicted, not in the map), "empty".
     searched : bool
+    aided : bool
+        An IMU told where the match began, or unbent the points.
     """
 
     points: int
@@ -96,6 +99,7 @@ class Seen:
     unheld: int
     state: str
     searched: bool
+    aided: bool = False
 
 
 def _spreads() -> tuple[Array, Array]:
@@ -124,10 +128,13 @@ class Raw:
         In the body at its time of each.
     ages : (n,) or None
         Time from each to the stamp of the scan [s].
+    straight : (n, 3), optional
+        In the body at the stamp, by an IMU.
     """
 
     points: Array
     ages: Array | None
+    straight: Array | None = None
 
     def at(self, motion: Array, dt: float) -> Array:
         """In the body at the stamp ``(n, 3)``, where it moved by ``motion`` (7,) evenly in the ``dt`` [s] before."""
@@ -143,6 +150,8 @@ class LidarOdometry:
     Parameters
     ----------
     config : LidarOdometryConfig
+    inertial : Inertial, optional
+        Tells where a match begins and how a scan is bent, as long as it is believed; an even motion does otherwise.
 
     Attributes
     ----------
@@ -155,8 +164,8 @@ class LidarOdometry:
     errors : JointErrors
     """
 
-    def __init__(self, config: LidarOdometryConfig) -> None:
-        self.config = config
+    def __init__(self, config: LidarOdometryConfig, inertial: Inertial | None = None) -> None:
+        self.config, self.inertial = config, inertial
         last = len(config.levels) - 1
         self.levels = [
             CellMap(LevelConfig(size, config.finest_sigma if k == last else 0.25 * size, k == last))
@@ -192,16 +201,13 @@ class LidarOdometry:
 
     # --- one scan ----------------------------------------------------------------------------------------------------
 
-    def predict(self, time: float, turn: Array | None = None) -> Array:
-        """Motion ``(7,)`` from the last scan to ``time``, at constant velocity, or with the turn ``(4,)`` of a gyro."""
+    def predict(self, time: float) -> Array:
+        """Motion ``(7,)`` from the last scan to ``time`` at constant velocity."""
         dt = time - self.time
         ratio = min(dt / self.dt, 2.0) if self.dt > 0 and np.isfinite(dt) else 0.0
-        step = np.asarray(se3.se3_exp(self.twist * ratio))
-        if turn is not None:
-            step[3:] = turn
-        return step
+        return np.asarray(se3.se3_exp(self.twist * ratio))
 
-    def step(self, cloud: Array, time: float, ages: Array | None = None, turn: Array | None = None) -> Seen:
+    def step(self, cloud: Array, time: float, ages: Array | None = None) -> Seen:
         """Match the next scan, and put it into the map.
 
         Parameters
@@ -212,29 +218,33 @@ class LidarOdometry:
             [s]; not before the scan before.
         ages : (m,), optional
             Time from each point to ``time`` [s].
-        turn : (4,), optional
-            Rotation from the last scan to this one, as a gyro tells it.
         """
         self.scan += 1
         c = self.config
-        motion = self.predict(time, turn)
         before = self.pose
+        even = se3.se3_compose(before, self.predict(time))
+        ahead = None if self.inertial is None else self.inertial.ahead(time)
+        predicted = even if ahead is None else ahead
         rows = thin(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
         kept = rows[evenly(len(rows), c.most_kept)]
-        raw = Raw(cloud[kept], None if ages is None or not c.deskew else ages[kept])
+        raw = self._raw(cloud[kept], None if ages is None or not c.deskew else ages[kept], time)
         dt = time - self.time if np.isfinite(self.time) else 0.0
         self._since(raw, time)
         chosen = evenly(len(kept), c.most_points)
-        points = self._unbent(raw, se3.se3_compose(before, motion), time)[chosen]
+        points = self._unbent(raw, predicted, time)[chosen]
         if self.scan == self.first:
             seen = Seen(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
             self.first += len(points) < FEW
             fit = None
         else:
-            self.pose, fit, seen = self._match(raw, chosen, se3.se3_compose(before, motion), time)
+            self.pose, fit, seen = self._match(raw, chosen, predicted, time)
+        if ahead is not None or raw.straight is not None:
+            seen = replace(seen, aided=True)
         self.points = self._unbent(raw, self.pose, time)
         points = self.points[chosen]
-        self._doubt(raw, points, before, motion, dt, fit, seen)
+        self._doubt(raw, points, before, predicted, even, dt, fit, seen)
+        if self.inertial is not None and seen.state in MAPPED:
+            self.inertial.learn(time, self.pose, even)
         if seen.state in MAPPED:
             self._add(self.points)
             self.lost, self.anchor = 0, self.pose
@@ -268,7 +278,12 @@ class LidarOdometry:
 
         The motion within a scan is off the mean one by half of what it changes by from one interval to the next.
         """
-        if raw.ages is None or not len(raw.ages) or not self.changes:
+        if raw.ages is None or not len(raw.ages):
+            return np.zeros((6, 6))
+        if raw.straight is not None and self.inertial is not None:
+            turn2, shift2 = self.inertial.unsure(float(np.mean(raw.ages)))
+            return np.diag([turn2] * 3 + [shift2] * 3)
+        if not self.changes:
             return np.zeros((6, 6))
         turn2, shift2 = 0.25 * np.mean(self.changes, axis=0) * float(np.mean(raw.ages)) ** 2
         return np.diag([turn2] * 3 + [shift2] * 3)
@@ -285,8 +300,14 @@ class LidarOdometry:
         while len(self.recent) > 1 and time - self.recent[1][0] >= span:
             self.recent.popleft()
 
+    def _raw(self, points: Array, ages: Array | None, time: float) -> Raw:
+        then = None if ages is None or self.inertial is None else self.inertial.within(time, ages)
+        return Raw(points, ages, None if then is None else np.asarray(se3.se3_transform(then, points)))
+
     def _unbent(self, raw: Raw, pose: Array, time: float) -> Array:
         """Points of a scan where the body stands at ``pose`` (7,), at its stamp."""
+        if raw.straight is not None:
+            return raw.straight
         if raw.ages is None or not self.recent or time <= self.recent[0][0]:
             return raw.points
         then, before = self.recent[0]
@@ -297,14 +318,28 @@ class LidarOdometry:
         for memory in (self.overlaps, self.coarse, self.qualities):
             memory.clear()
         self.errors.forget()
+        if self.inertial is not None:
+            self.inertial.forget()
 
     def _doubt(
-        self, raw: Raw, points: Array, before: Array, motion: Array, dt: float, fit: Fit | None, seen: Seen
+        self,
+        raw: Raw,
+        points: Array,
+        before: Array,
+        predicted: Array,
+        even: Array,
+        dt: float,
+        fit: Fit | None,
+        seen: Seen,
     ) -> None:
-        """How far the pose of now is off, jointly with those of the window."""
-        predicted = se3.se3_compose(before, motion)
+        """How far the pose of now is off, jointly with those of the window.
+
+        What is expected of a motion is what an even one would miss, also where an IMU predicted it: nothing of what
+        that tells is in the covariance, so that a graph may still count it.
+        """
+        motion = se3.se3_between(before, predicted)
         if seen.state in MAPPED and seen.state != "first":
-            off = np.asarray(se3.se3_log(se3.se3_between(predicted, self.pose)))
+            off = np.asarray(se3.se3_log(se3.se3_between(even, self.pose)))
             self.missed.append((float(np.mean(off[:3] ** 2)), float(np.mean(off[3:] ** 2))))
         if self.scan == 0:
             return
@@ -383,7 +418,8 @@ class LidarOdometry:
             pose, fit = self._descend(points, pose, self.levels[-1:])
             moved = se3.se3_log(se3.se3_between(before, pose))
             # a scan that is bent by a motion that is off pulls each pose a little, and always to the same side
-            if raw.ages is None or (np.linalg.norm(moved[:3]) < STILL[0] and np.linalg.norm(moved[3:]) < STILL[1]):
+            stood = np.linalg.norm(moved[:3]) < STILL[0] and np.linalg.norm(moved[3:]) < STILL[1]
+            if raw.ages is None or raw.straight is not None or stood:
                 break
         return pose, points, fit
 

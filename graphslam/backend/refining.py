@@ -202,20 +202,25 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     """
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
-    out.spend(SCAN_PAIRS, "scan-pairs", streams, (float(r.times[0]), float(r.times[-1])))
+    # gravity that the front end had of a stream which it used for nothing else that weighs
+    gravity = frozenset().union(*(s.aids for s in submaps)) if "gravity" in r.parts else frozenset()
+    out.spend(SCAN_PAIRS, "scan-pairs", streams | gravity, (float(r.times[0]), float(r.times[-1])))
     held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
     for stream in sorted(held):
         out.spend(SCAN_PAIRS, "fixes", [stream], (float(r.times[0]), float(r.times[-1])))
     streams = streams | held
     factors = len({e.factor_id for e in entries})
+    spent = ", ".join(sorted(streams | gravity)) or "the scans"
     text = (
-        f"The refined path spends {', '.join(sorted(streams)) or 'the scans'} once (scan-pairs). The {factors} factors "
-        "of the graph, its exits, matches and loops, were its start and enter no sum."
+        f"The refined path spends {spent} once (scan-pairs). The {factors} factors of the graph, its exits, matches "
+        "and loops, were its start and enter no sum."
     )
     found = [Finding("", "refine-evidence", text)]
     lost = sorted({e.stream.partition("/")[0] for e in entries if e.kind == EXCLUSIVE} - streams)
     if lost:
         text = f"The refined path does not hold {', '.join(lost)}: the graph that was its start did."
+        if some := sorted(gravity.intersection(lost)):
+            text += f" Of {', '.join(some)} it holds gravity."
         found.append(Finding("look", "refine-streams", text))
     return out, found
 

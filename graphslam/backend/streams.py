@@ -14,6 +14,7 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_floor import fix_segments
+from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver
 
@@ -214,7 +215,7 @@ class ImuPart:
             return []
         if self.config.use != "auto":
             return [self.config.use]
-        spent = {e.stream for e in graph.ledger.entries()}
+        spent = {e.stream for e in graph.ledger.entries() if e.kind == EXCLUSIVE}
         return [name for name in self.imus if name in self._given or name not in spent]
 
 

@@ -182,6 +182,9 @@ class Submap:
     matches : tuple of Match
     uses : frozenset of str
         Streams whose information is already inside.
+    aids : frozenset of str
+        Streams that helped to find what is inside, while nothing that they tell is in its covariances: where a match
+        began, how a scan is bent. A factor may still spend them.
     report : mapping
         What the front end says of this map: why it ended, honesty figures, counts. JSON-serialisable.
 
@@ -201,6 +204,7 @@ class Submap:
     cloud: CloudMap | None = None
     matches: tuple[Match, ...] = ()
     uses: frozenset[str] = frozenset()
+    aids: frozenset[str] = frozenset()
     report: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -251,6 +255,11 @@ class Submap:
         if self.landmarks is None:
             raise GeometryError(f"submap {self.key} has no landmarks to identify")
         return replace(self, landmarks=replace(self.landmarks, ids=np.asarray(ids, dtype=np.int64)))
+
+    def of_session(self, name: str) -> Submap:
+        """The same submap with its streams named as those of a session of several: ``name/stream``."""
+        uses, aids = (frozenset(f"{name}/{u}" for u in streams) for streams in (self.uses, self.aids))
+        return replace(self, uses=uses, aids=aids)
 
     def __repr__(self) -> str:
         n = 0 if self.landmarks is None else len(self.landmarks)

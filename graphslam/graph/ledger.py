@@ -26,6 +26,7 @@ DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
     "levelled": "each base was levelled by the same gravity that the submap's exit holds",
+    "aid": "where matches began and how scans are bent: nothing that it tells is in a covariance of the path",
     "start": "where the refinement by scans began: it enters no sum of the refined path",
 }
 

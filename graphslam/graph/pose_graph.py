@@ -143,6 +143,7 @@ class PoseGraph(GraphRecord):
         )
         node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
+        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
         # from here on nothing fails
         fresh = np.flatnonzero(ids < 0)
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
@@ -177,6 +178,7 @@ class PoseGraph(GraphRecord):
             for k, (T, P) in enumerate(zip(cut.increments, cut.covariances))
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
+        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
         # from here on nothing fails
         self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances, stated)
         if level_sigma is not None:

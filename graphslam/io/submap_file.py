@@ -35,6 +35,7 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         "exit_covariance": submap.exit_covariance,
         "has_landmarks": np.bool_(submap.landmarks is not None),
         "used": np.array(sorted(submap.uses), dtype=np.str_),
+        "aided": np.array(sorted(submap.aids), dtype=np.str_),
         "report": json.dumps(dict(submap.report), sort_keys=True, default=_plain),
     }
     landmarks = submap.landmarks
@@ -95,6 +96,7 @@ def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
             raise FormatError("dim and exit_pose do not agree", where=where, got=(dim, exit_pose.shape))
         rest: dict[str, Any] = {
             "uses": frozenset(a["used"].tolist()) if "used" in a else frozenset(),
+            "aids": frozenset(a["aided"].tolist()) if "aided" in a else frozenset(),
             "report": check_json(parse_json(str(a.get("report", "{}")), f"{where}, report"), {str: object}, where),
             "trajectory": _trajectory(a, where),
             "matches": _matches(a, where),
@@ -124,6 +126,7 @@ _FIELDS = {
     "exit_covariance": floats("d", "d", optional=True),
     "has_landmarks": flags(optional=True),
     "used": texts("u", optional=True),
+    "aided": texts("a", optional=True),
     "report": texts(optional=True),
     "landmark_ids": ints("l", optional=True),
     "landmarks": floats("l", "c", optional=True),

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
@@ -25,6 +26,9 @@ from graphslam.sim.raycast import RayCaster
 
 if TYPE_CHECKING:
     from graphslam.sim.world import World
+
+_FINE = 200.0
+"""Poses a second of the true path [Hz]; between them it is even."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,11 +63,17 @@ class LidarConfig:
     """… and the time in which it does so [s]."""
     bob: float = 0.0
     """σ of its position [m], over the same time."""
+    imu: ImuNoise | None = None
+    """Of an IMU beside it; None: it has none."""
+    imu_rate: float = 200.0
+    """Readings per second [Hz]."""
+    T_base_imu: tuple[float, ...] = (0.05, -0.03, -0.06, 0.0, 0.0, 1.0, 0.0)
+    """Where it is: turned by half a turn about the vertical."""
 
     def __post_init__(self) -> None:
         if self.pattern not in ("spinning", "rosette"):
             raise ConfigError(f"lidar: pattern = {self.pattern!r}; known: spinning, rosette")
-        for name in ("rate", "sweep", "points", "lines", "half_angle", "max_range", "height", "sway_time"):
+        for name in ("rate", "sweep", "points", "lines", "half_angle", "max_range", "height", "sway_time", "imu_rate"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"lidar: {name} = {getattr(self, name)}; wanted > 0")
         for name in ("range_sigma", "beam_sigma", "sway", "bob"):
@@ -95,6 +105,20 @@ def drawn_lidar(seed: int) -> LidarConfig:
     )
 
 
+def drawn_imu(seed: int) -> ImuNoise:
+    """An IMU as lidars carry them: densities of data sheets of small units, up to ten times as much where it shakes."""
+    r = SeedTree(int(seed)).child("drawn-imu").generator()
+    gyro, force = np.exp(r.uniform(np.log([1e-4, 1e-3]), np.log([1e-3, 1e-2])))
+    return ImuNoise(
+        gyro=float(gyro),
+        gyro_bias=float(r.uniform(1e-3, 1e-2)),
+        gyro_walk=1e-4,
+        accelerometer=float(force),
+        accelerometer_bias=float(r.uniform(0.01, 0.1)),
+        accelerometer_walk=1e-3,
+    )
+
+
 def simulate_lidar(world: World, seed: int, config: LidarConfig = LidarConfig(), *, most: float = np.inf) -> SensorLog:
     """Carry a lidar through a world.
 
@@ -110,17 +134,18 @@ def simulate_lidar(world: World, seed: int, config: LidarConfig = LidarConfig(),
     Returns
     -------
     SensorLog
-        Stream ``clouds`` (PointClouds with times of points). Truth in the frame of the world.
+        Stream ``clouds`` (PointClouds with times of points), and ``imu`` (Imu) where there is one. Truth in the frame
+        of the world.
     """
     caster = RayCaster.of(world)
     motion = drive_motion(world, DriveConfig(), caster)
     tree = SeedTree(int(seed)).child("lidar")
     end = min(motion.duration, most)
-    fine = np.arange(int(end * 200.0) + 1) / 200.0
+    fine = np.arange(int(end * _FINE) + 1) / _FINE
     base = motion.poses(fine)
     sway = tree.child("sway").generator()
     # smooth: a running mean of white noise over the sway's time, twice
-    width = max(int(config.sway_time * 200.0 / 2), 1)
+    width = max(int(config.sway_time * _FINE / 2), 1)
     kernel = np.hanning(2 * width + 1)
     kernel /= np.sqrt(np.sum(kernel**2))
     raw = sway.standard_normal((len(fine) + 2 * width, 6))
@@ -149,8 +174,36 @@ def simulate_lidar(world: World, seed: int, config: LidarConfig = LidarConfig(),
     streams: dict[str, Any] = {
         "clouds": PointClouds.from_arrays(times, points, offsets, np.concatenate(ages) if ages else np.zeros(0))
     }
+    if config.imu is not None:
+        streams["imu"] = _imu(truth, config, config.imu, tree.child("imu").generator())
     meta = {"source": "simulation", "robot": "lidar", "world": world.name, "seed": int(seed)}
     return SensorLog(name=f"lidar-{world.name}", streams=streams, truth=Truth(trajectory=truth), meta=meta)
+
+
+def _imu(truth: Trajectory, config: LidarConfig, noise: ImuNoise, r: np.random.Generator) -> Imu:
+    """Readings of a unit that is carried along a path, by differences of its poses half a reading apart."""
+    dt = 1.0 / config.imu_rate
+    t = np.arange(1, int((truth.times[-1] - 2.0 * dt) * config.imu_rate)) * dt
+    unit = np.asarray(config.T_base_imu, dtype=np.float64)
+    before, now, after = (
+        se3.se3_compose(truth.interpolate(t + k * dt), np.broadcast_to(unit, (len(t), 7))) for k in (-1, 0, 1)
+    )
+    rate = se3.so3_log(se3.se3_between(before, after)[:, 3:]) / (2.0 * dt)
+    force = (after[:, :3] - 2.0 * now[:, :3] + before[:, :3]) / dt**2 + [0.0, 0.0, GRAVITY]
+    force = se3.quat_rotate(now[:, 3:] * [-1.0, -1.0, -1.0, 1.0], force)
+
+    def errors(density: float, bias: float, walk: float) -> Array:
+        constant = bias * r.standard_normal(3)
+        walked = np.cumsum(np.sqrt(dt) * walk * r.standard_normal((len(t), 3)), axis=0)
+        return np.asarray(constant + walked + density / np.sqrt(dt) * r.standard_normal((len(t), 3)))
+
+    return Imu(
+        times=np.asarray(t),
+        angular_rate=rate + errors(noise.gyro, noise.gyro_bias, noise.gyro_walk),
+        specific_force=force + errors(noise.accelerometer, noise.accelerometer_bias, noise.accelerometer_walk),
+        noise=noise,
+        T_base_imu=unit,
+    )
 
 
 def _beams(config: LidarConfig, r: np.random.Generator, k: int) -> tuple[Array, Array, npt.NDArray[np.int64]]:

@@ -1,9 +1,10 @@
 """LiDAR odometry: recorded packs against their poses, drawn simulated lidars against truth, and the cached neighbour.
 
-``python -m tests.benchmarks.bench_lidar [--scans N] [--draws 12] [--first 101] [--quick]``
+``python -m tests.benchmarks.bench_lidar [--scans N] [--draws 12] [--first 101] [--simulated | --runs] [--quick]``
 
 CPU time on one thread, without compilation. Recorded: ATE after rigid alignment to the poses that come with the packs,
 which are results of other programs; KITTI 0005 to the path of KISS-ICP, where that is installed. NEES of pieces of 3 m.
+Simulated lidars are followed without and with the IMU beside them; with ``--runs`` by whole runs.
 Neighbours: nanoseconds a point for one scan against the map, asked for the first time (cold), again (warm), and of k-d
 trees of scipy and small_gicp over the same cells.
 """
@@ -13,6 +14,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import small_gicp
@@ -23,22 +26,26 @@ from graphslam.app.worlds import mesh_world
 from graphslam.core import se3
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array
+from graphslam.core.imu import Imu
 from graphslam.core.point_clouds import PointClouds
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam.frontends.lidar_odometry.front_end import odometry_of
 from graphslam.frontends.lidar_odometry.odometry import LidarOdometry
 from graphslam.frontends.odometry.recorded import chain
 from graphslam.frontends.scan_window.exits import relative_covariance
-from graphslam.sim.lidar import drawn_lidar, simulate_lidar
+from graphslam.sim.lidar import drawn_imu, drawn_lidar, simulate_lidar
 
 PACKS = ("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall", "lidar3d-kitti-0005")
 PIECE = 3.0
 """Way of the pieces whose covariances are judged [m]."""
 
 
-def followed(clouds: PointClouds, truth: Array | None, scans: int) -> tuple[Array, list[float], str]:
+def followed(
+    clouds: PointClouds, truth: Array | None, scans: int, imu: Imu | None = None
+) -> tuple[Array, list[float], str]:
     """Path ``(n, 7)``, NEES/6 of its pieces, and a line of figures."""
     clouds.cloud(0)  # decoded
-    odometry = LidarOdometry(LidarOdometryConfig())
+    odometry = odometry_of(clouds, LidarOdometryConfig(), imu)
     poses, states, nees, begin, way, spent = [], Counter[str](), [], 0, 0.0, 0.0
     for k in range(min(len(clouds), scans)):
         cloud, ages = clouds.cloud(k), clouds.ages(k)
@@ -115,21 +122,76 @@ def recorded(scans: int) -> None:
 
 def simulated(draws: int, first: int, seconds: float) -> None:
     """Lidars and carriers that are drawn."""
-    every: list[float] = []
+    rows: dict[str, list[tuple[float, ...]]] = {}
+    every: dict[str, list[float]] = {}
     for k in range(draws):
         seed, world = first + k, ("garage", "building", "mine")[k % 3]
-        config = drawn_lidar(seed)
+        config = replace(drawn_lidar(seed), imu=drawn_imu(seed))
         layout = {"layout": "B"} if world == "garage" else {}
         log = simulate_lidar(mesh_world(world, seed=seed, **layout), seed, config, most=seconds)
         truth = log.truth.trajectory.interpolate(log["clouds"].times)
-        path, nees, said = followed(log["clouds"], truth, 10**9)
-        every += nees
         carried = "hand" if config.sway else "wheels"
-        print(f"{world:9s}{seed:5d} {config.pattern:9s}{carried:7s} ATE {ate(path, truth):.4f} m {said}")
-    if every:
-        inside = np.mean(np.array(every) < 12.6 / 6.0)
-        said = f"NEES/6 {np.mean(every):.2f}, median {np.median(every):.2f}, {inside:.0%} inside 95 %"
-        print(f"all {len(every)} pieces: {said}")
+        for what, imu in (("alone", None), ("IMU", log["imu"])):
+            path, nees, said = followed(log["clouds"], truth, 10**9, imu)
+            every.setdefault(what, []).extend(nees)
+            off = se3.se3_log(
+                se3.se3_between(se3.se3_between(path[:-1], path[1:]), se3.se3_between(truth[:-1], truth[1:]))
+            )
+            step = tuple(float(np.sqrt(np.mean(np.sum(off[:, c] ** 2, axis=1)))) for c in (slice(3, 6), slice(0, 3)))
+            rows.setdefault(what, []).append((ate(path, truth), *step))
+            print(
+                f"{world:9s}{seed:5d} {config.pattern:9s}{carried:7s}{what:6s} ATE {rows[what][-1][0]:.4f} m "
+                f"scan to scan {1e3 * step[0]:.1f} mm, {1e3 * step[1]:.2f} mrad {said}"
+            )
+    for what, nees in every.items():
+        a, mm, mrad = np.array(rows[what]).mean(axis=0)
+        print(f"{what}: mean ATE {a:.4f} m, scan to scan {1e3 * mm:.1f} mm, {1e3 * mrad:.2f} mrad", end="")
+        inside = np.mean(np.array(nees) < 12.6 / 6.0)
+        print(
+            f"; {len(nees)} pieces: NEES/6 {np.mean(nees):.2f}, median {np.median(nees):.2f}, {inside:.0%} inside 95 %"
+        )
+    better = sum(b[0] < a[0] for a, b in zip(rows["alone"], rows["IMU"]))
+    print(f"ATE better with the IMU: {better} of {draws}")
+
+
+RUNS: dict[str, dict[str, Any]] = {
+    "alone": {"frontend": {"imu": "none"}, "refine": {"use": False}},
+    "front end": {"refine": {"use": False}},
+    "and graph": {"imu": {"use": "auto"}, "refine": {"use": False}},
+    "refined, alone": {"frontend": {"imu": "none"}},
+    "refined": {},
+}
+"""What a run does with the IMU."""
+
+
+def runs(draws: int, first: int, seconds: float) -> None:
+    """Whole runs over drawn lidars: what an IMU does to path, up, and honesty."""
+    table: dict[str, list[tuple[float, ...]]] = {}
+    for k in range(draws):
+        seed, world = first + k, ("garage", "building", "mine")[k % 3]
+        config = replace(drawn_lidar(seed), imu=drawn_imu(seed), points=5000)
+        layout = {"layout": "B"} if world == "garage" else {}
+        log = simulate_lidar(mesh_world(world, seed=seed, **layout), seed, config, most=seconds)
+        for what, options in RUNS.items():
+            options = {**options, "map": {"fuse": False}}
+            run = gs.run(log, frontend="kiss-icp", config=options, progress=False)
+            value = run.metrics.set_index("key")["value"]
+            path = run.map.trajectory
+            truth = log.truth.trajectory.interpolate(path.times)
+            up = [se3.quat_to_matrix(T[:, 3:])[:, 2] for T in (path.poses, truth)]
+            row = (
+                value["path_rmse_aligned"],
+                value["path_rmse"],
+                1e3 * float(np.mean(np.linalg.norm(up[0] - up[1], axis=1))),
+                value["nees_per_dof"],
+                value.get("honesty_imu_chi2_per_dof", np.nan),
+            )
+            table.setdefault(what, []).append(tuple(float(x) for x in row))
+            said = "aligned {:.4f} m, first base held {:.4f} m, up off {:.1f} mrad, NEES/n {:.2f}, ways {:.2f}"
+            print(f"{world:9s}{seed:5d} {what:15s}", said.format(*table[what][-1]), flush=True)
+    for what, rows in table.items():
+        mean, middle = np.mean(rows, axis=0), np.median(rows, axis=0)
+        print(f"{what:15s} mean {np.array2string(mean, precision=4)}, middle {np.array2string(middle, precision=4)}")
 
 
 def neighbours(scans: int) -> None:
@@ -172,13 +234,20 @@ def main() -> None:
     p.add_argument("--draws", type=int, default=12)
     p.add_argument("--first", type=int, default=101)
     p.add_argument("--seconds", type=float, default=25.0)
+    p.add_argument("--simulated", action="store_true", help="simulated lidars only")
+    p.add_argument("--runs", action="store_true", help="whole runs over simulated lidars, without and with their IMU")
     p.add_argument("--quick", action="store_true")
     a = p.parse_args()
     if a.quick:
         a.scans, a.draws, a.seconds = 30, 2, 8.0
-    recorded(a.scans)
+    if not (a.simulated or a.runs):
+        recorded(a.scans)
+    if a.runs:
+        runs(a.draws, a.first, a.seconds)
+        return
     simulated(a.draws, a.first, a.seconds)
-    neighbours(min(a.scans, 60))
+    if not a.simulated:
+        neighbours(min(a.scans, 60))
 
 
 if __name__ == "__main__":

@@ -102,10 +102,7 @@ def _in_common(s: Submap, keys: dict[int, int], name: str, shift: float) -> Subm
     path = s.trajectory
     moved = None if path is None else Trajectory(path.times + shift, path.poses, path.covariances)
     a, b = s.interval
-    return replace(
-        s, key=keys[s.key], interval=(a + shift, b + shift), trajectory=moved, matches=(),
-        uses=frozenset(f"{name}/{u}" for u in s.uses),
-    )  # fmt: skip
+    return replace(s.of_session(name), key=keys[s.key], interval=(a + shift, b + shift), trajectory=moved, matches=())
 
 
 def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:

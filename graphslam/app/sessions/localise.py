@@ -218,8 +218,6 @@ def _query(run: Run, known: DenseSession, submaps: list[Submap]) -> DenseSession
         a, b = s.interval
         path = s.trajectory
         moved = None if path is None else replace(path, times=path.times + shift)
-        uses = frozenset(f"here/{u}" for u in s.uses)
-        out.append(
-            replace(s, key=last.key + 1 + k, interval=(a + shift, b + shift), trajectory=moved, matches=(), uses=uses)
-        )
+        here = s.of_session("here")
+        out.append(replace(here, key=last.key + 1 + k, interval=(a + shift, b + shift), trajectory=moved, matches=()))
     return DenseSession("here", out, config, SessionMap(out, config.node_spacing), [], shift)

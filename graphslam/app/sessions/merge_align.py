@@ -122,7 +122,7 @@ def align_runs(
 
 def of_session(submap: Submap, key: int, session: str, renamed: dict[int, int]) -> Submap:
     """The submap with its key and landmark ids in the common graph; its streams are those of its own robot."""
-    s = replace(submap, key=key, uses=frozenset(f"{session}/{u}" for u in submap.uses))
+    s = replace(submap.of_session(session), key=key)
     if s.landmarks is None:
         return s
     return s.with_ids([renamed[int(i)] for i in s.landmarks.ids])

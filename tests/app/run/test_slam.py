@@ -20,7 +20,7 @@ from graphslam.core.log import SensorLog
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from graphslam.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
 from tests.frontends.landmarks.test_preparing import in_portions
 
 QUIET = {"calibrate": {"use": "none"}}
@@ -36,6 +36,13 @@ def landmarks() -> SensorLog:
 def clouds() -> SensorLog:
     config = LidarConfig(rate=4.0, points=2000, lines=32)
     return simulate_lidar(mesh_world("building", seed=2), 2, config, most=6.0)
+
+
+def carried() -> SensorLog:
+    """With an IMU beside the lidar."""
+    noise = drawn_imu(2)
+    config = LidarConfig(rate=4.0, points=2000, lines=32, sway=0.06, bob=0.03, imu=noise)
+    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=7.0)
 
 
 def beams() -> SensorLog:
@@ -60,9 +67,10 @@ def fed(log: SensorLog, slam: Slam, seed: int = 0) -> None:
         ("ekf", landmarks, LANDMARKS),
         ("rbpf-ekf", landmarks, {**LANDMARKS, "frontend": {"particles": 10}}),
         ("kiss-icp", clouds, CLOUDS),
+        ("kiss-icp", carried, CLOUDS),
         ("segslam", beams, BEAMS),
     ],
-    ids=["ekf", "rbpf-ekf", "kiss-icp", "segslam"],
+    ids=["ekf", "rbpf-ekf", "kiss-icp", "kiss-icp-imu", "segslam"],
 )
 def test_a_fed_run_is_the_run_over_the_stored_log(
     frontend: str, log: Any, config: dict[str, Any], tmp_path: Path

@@ -1,0 +1,412 @@
+"""What an IMU knows of the motion from scan to scan and within a scan, for a start and for unbending.
+
+Rates and forces between two scans say how the body turned and how its velocity changed, but for the bias of the gyro,
+for the velocity itself, and for gravity. These three are learned from the poses that scans were matched to: the bias by
+how much faster the gyro turned, velocity and gravity by a fit to the positions of the last seconds. In the body at the
+last scan, at time τ since::
+
+    R(τ) = ΔR(τ)        p(τ) = v τ + ½ g τ² + Δp(τ)
+
+Nothing of it weighs in a pose: a match begins where this leads, and its points are moved by it. It is believed as long
+as it tells the turns of the scans to some milliradians, or far better than an even motion does, so that a unit whose
+axes, stamps or units are wrong does no harm.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core import se3
+from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY, Imu
+
+USUAL = 20
+"""Readings by which it is told how far apart they are."""
+WINDOW = 5.0
+"""Positions of so many seconds are fitted."""
+LONGEST = 3.0
+"""A motion is told for so long after the last scan that was matched [s]."""
+FEWEST = 5
+"""Scans that an even motion and the IMU are compared over before it is believed."""
+COMPARED = 20
+"""… and over which at most."""
+CLEARLY = 0.25
+"""Squared turn that the IMU misses beside that of an even motion: far better."""
+PLACED = 0.01
+"""σ of a matched position [m] …"""
+TURNED = 2e-3
+"""… and of the turn between two matched poses [rad]."""
+FASTEST = 3.0
+"""σ of the velocity before anything is known of it [m/s]."""
+MOSTLY = 0.8
+"""Share of the scans at which gravity must be seen, to be told along a path."""
+ON_ITS_SIDE = np.deg2rad(60.0)
+"""Pitch beyond which roll is ill defined."""
+GRAVITY_SIGMA = (1.0, 0.2)
+"""σ of gravity as the mean force tells it at first, and as the last fit does [m/s²]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The motion by readings alone, seen from the body at an anchor.
+
+    Parameters
+    ----------
+    seconds : (m,)
+        Since the anchor; negative before.
+    q : (m, 4)
+        ΔR.
+    v, p : (m, 3)
+        Δv, Δp.
+    """
+
+    seconds: Array
+    q: Array
+    v: Array
+    p: Array
+
+    def poses(self, velocity: Array, gravity: Array) -> Array:
+        """``T_anchor_body`` ``(m, 7)`` with a velocity and a gravity, both in the body at the anchor."""
+        t = self.seconds[:, None]
+        return np.concatenate([t * velocity + 0.5 * t**2 * gravity + self.p, self.q], axis=1)
+
+
+class Readings:
+    """Readings of an IMU as the base would make them.
+
+    Parameters
+    ----------
+    imu : Imu
+    """
+
+    def __init__(self, imu: Imu) -> None:
+        self.noise = imu.noise
+        self.lever = imu.T_base_imu[:3]
+        self.times, self.rate, self.force = _turned(imu)
+        self.usual = float(np.median(np.diff(self.times[:USUAL]))) if len(self.times) > 1 else 0.0
+        self.pause = max(0.1, 5.0 * self.usual)
+
+    def more(self, imu: Imu, since: float) -> None:
+        """Readings that came after; those before ``since`` [s] are not asked for any more."""
+        a = int(np.searchsorted(self.times, since))
+        t, w, f = _turned(imu)
+        self.times = np.concatenate([self.times[a:], t])
+        self.rate, self.force = np.concatenate([self.rate[a:], w]), np.concatenate([self.force[a:], f])
+
+    def way(self, anchor: float, at: Array, bias: Array) -> Way | None:
+        """The motion at some times ``(m,)``, seen from the body at ``anchor``; None where readings are missing."""
+        first, last = min(anchor, float(at.min())), max(anchor, float(at.max()))
+        t = self.times
+        # the first and the last reading hold for as long as a reading does
+        if len(t) < 2 or first < t[0] - 1.5 * self.usual or last > t[-1] + 1.5 * self.usual:
+            return None
+        a, b = int(np.searchsorted(t, first, side="right")), int(np.searchsorted(t, last, side="left"))
+        some = slice(max(a - 1, 0), b + 1)
+        if np.max(np.diff(t[some]), initial=0.0) > self.pause:
+            return None
+        knots = np.unique(np.concatenate([t[a:b], at, [anchor]]))
+        rate = np.stack([np.interp(knots, t[some], x) for x in self.rate[some].T], axis=1) - bias
+        force = np.stack([np.interp(knots, t[some], x) for x in self._at_base(some).T], axis=1)
+        dt = np.diff(knots)[:, None]
+        turn = 0.5 * (rate[1:] + rate[:-1]) * dt
+        q = running(se3.so3_exp(turn))
+        # a force acts, on the average, through the attitude half-way
+        f = se3.quat_rotate(se3.quat_multiply(q[:-1], se3.so3_exp(0.5 * turn)), 0.5 * (force[1:] + force[:-1]))
+        v = np.concatenate([np.zeros((1, 3)), np.cumsum(f * dt, axis=0)])
+        p = np.concatenate([np.zeros((1, 3)), np.cumsum(v[:-1] * dt + 0.5 * f * dt**2, axis=0)])
+        j, k = int(np.searchsorted(knots, anchor)), np.searchsorted(knots, at)
+        back = q[j] * [-1.0, -1.0, -1.0, 1.0]
+        since = (knots[k] - knots[j])[:, None]
+        return Way(
+            since[:, 0],
+            se3.quat_multiply(back, q[k]),
+            se3.quat_rotate(back, v[k] - v[j]),
+            se3.quat_rotate(back, p[k] - p[j] - v[j] * since),
+        )
+
+    def _at_base(self, some: slice) -> Array:
+        """Forces at the base: without those of the lever as the body turns."""
+        force, rate = self.force[some], self.rate[some]
+        if not np.any(self.lever) or len(rate) < 2:
+            return force
+        turning = np.gradient(rate, self.times[some], axis=0)
+        return np.asarray(force - np.cross(turning, self.lever) - np.cross(rate, np.cross(rate, self.lever)))
+
+    def doubt(self, seconds: Array, bias_sigma: float) -> Array:
+        """Variance ``(m,)`` [m²] of a fitted position so many seconds off: its own, and what noise does to Δp."""
+        s, n = np.abs(seconds), self.noise
+        turned = (GRAVITY * n.gyro) ** 2 * s**5 / 20.0 + (GRAVITY * bias_sigma * s**3 / 6.0) ** 2
+        return np.asarray(PLACED**2 + turned + n.accelerometer**2 * s**3 / 3.0)
+
+
+def _turned(imu: Imu) -> tuple[Array, Array, Array]:
+    """Stamps, rates and forces in the axes of the base."""
+    q = imu.T_base_imu[3:]
+    return imu.times, se3.quat_rotate(q, imu.angular_rate), se3.quat_rotate(q, imu.specific_force)
+
+
+def running(turns: Array) -> Array:
+    """Products ``(n + 1, 4)`` of the first 0, 1, 2 … of n turns ``(n, 4)``."""
+    q, step = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], turns]), 1
+    while step < len(q):
+        q = np.concatenate([q[:step], se3.quat_multiply(q[:-step], q[step:])])
+        step *= 2
+    return np.asarray(se3.quat_normalize(q))
+
+
+def fit(way: Way, positions: Array, variance: Array, gravity: Array, sigma: float) -> tuple[Array, Array, Array]:
+    """Velocity and gravity in the body at the anchor that positions ``(m, 3)`` there agree with.
+
+    Parameters
+    ----------
+    way : Way
+        At the times of the positions.
+    positions : (m, 3)
+    variance : (m,)
+    gravity : (3,)
+        Known before, within ``sigma``.
+
+    Returns
+    -------
+    velocity, gravity : (3,)
+    covariance : (3, 3)
+        Of place, velocity and gravity along any axis.
+    """
+    A = np.stack([np.ones_like(way.seconds), way.seconds, 0.5 * way.seconds**2], axis=1)
+    W = A / variance[:, None]
+    N = A.T @ W + np.diag([0.0, FASTEST**-2, sigma**-2])
+    b = W.T @ (positions - way.p)
+    b[2] += gravity / sigma**2
+    C = np.linalg.inv(N)
+    x = C @ b
+    return np.asarray(x[1]), np.asarray(x[2]), np.asarray(C)
+
+
+class Inertial:
+    """Learns what a unit does not know, and tells motions.
+
+    Parameters
+    ----------
+    imu : Imu
+
+    Attributes
+    ----------
+    bias : (3,)
+        Of the gyro [rad/s], body.
+    velocity, gravity : (3,)
+        In the body at the last scan that was learned [m/s], [m/s²].
+    """
+
+    def __init__(self, imu: Imu) -> None:
+        self.readings = Readings(imu)
+        n = imu.noise
+        self._bias_var = max(n.gyro_bias, 1e-6) ** 2
+        self.bias, self.bias_var = np.zeros(3), self._bias_var
+        self.velocity, self.gravity = np.zeros(3), np.zeros(3)
+        self.cov = np.diag([0.0, FASTEST**2, GRAVITY_SIGMA[0] ** 2])
+        self.kept: deque[tuple[float, Array]] = deque()
+        self.missed: deque[tuple[float, float]] = deque(maxlen=COMPARED)
+        self.known = False
+        self._up: Array | None = None
+
+    @property
+    def up(self) -> Array | None:
+        """Unit vector ``(3,)`` in the frame of the path, as it was known last; None: never."""
+        return self._up if self.believed else None
+
+    @property
+    def believed(self) -> bool:
+        """Does it tell turns as well as scans do, or far better than an even motion?"""
+        if len(self.missed) < FEWEST:
+            return False
+        own, even = np.median(self.missed, axis=0)  # the first matches of a map may be poor
+        return bool(own <= (3.0 * TURNED) ** 2 or own <= CLEARLY * even)
+
+    def ahead(self, time: float) -> Array | None:
+        """``T_first_body`` ``(7,)`` at a time after the last scan that was learned; None: it does not know."""
+        if not (self.believed and self.known) or not 0.0 < time - self.kept[-1][0] <= LONGEST:
+            return None
+        last, pose = self.kept[-1]
+        way = self.readings.way(last, np.array([time]), self.bias)
+        return None if way is None else np.asarray(se3.se3_compose(pose, way.poses(self.velocity, self.gravity)[0]))
+
+    def within(self, time: float, ages: Array) -> Array | None:
+        """``T_now_then`` ``(m, 7)`` of the body at a time, and so many seconds ``(m,)`` before; None: not known."""
+        if not (self.believed and self.known and len(ages)) or not 0.0 <= time - self.kept[-1][0] <= LONGEST:
+            return None
+        last = self.kept[-1][0]
+        t = self.readings.times
+        # readings are joined by straight lines; so are the motions between
+        knots = time - np.array([ages.max(), ages.min()])
+        at = np.concatenate([knots[:1], t[(t > knots[0]) & (t < knots[1])], knots[1:]])
+        way = self.readings.way(last, np.append(at, time), self.bias)
+        if way is None:
+            return None
+        T = way.poses(self.velocity, self.gravity)
+        T = se3.se3_between(np.broadcast_to(T[-1], T[:-1].shape), T[:-1])
+        xi = np.concatenate([se3.so3_log(T[:, 3:]), T[:, :3]], axis=1)
+        x = np.stack([np.interp(time - ages, at, column) for column in xi.T], axis=1)
+        return np.concatenate([x[:, 3:], se3.so3_exp(x[:, :3])], axis=1)
+
+    def unsure(self, age: float) -> tuple[float, float]:
+        """Variance by axis of what is unsure of the motion within a scan of mean age ``age`` does to its pose."""
+        n = self.readings.noise
+        turn2 = n.gyro**2 * 2.0 * age / 3.0 + self.bias_var * age**2
+        return float(turn2), float(self.cov[1, 1] * age**2)
+
+    def learn(self, time: float, pose: Array, even: Array) -> None:
+        """A scan was matched at ``pose``; an even motion would have led to ``even`` (both ``T_first_body``)."""
+        if self.kept and time > self.kept[-1][0]:
+            before, last = self.kept[-1]
+            way = self.readings.way(before, np.array([time]), self.bias)
+            if way is None:
+                self.forget()
+            else:
+                self._compare(time - before, se3.se3_between(last, pose), way, se3.se3_between(last, even))
+        elif self.kept:
+            return  # of the same instant
+        self.kept.append((time, pose))
+        while time - self.kept[0][0] > WINDOW:
+            self.kept.popleft()
+        self._place()
+
+    @property
+    def rehearsed(self) -> bool:
+        """Is enough known to begin anew with the first scan?"""
+        return self.believed and self.known and self.kept[-1][0] - self.kept[0][0] >= 0.6 * WINDOW
+
+    def rewind(self) -> None:
+        """Back to the first scan of those that are kept, with what was learned since as a first guess."""
+        if self.known:
+            self._place(0)
+            self.bias_var = self._bias_var
+            first = self.kept[0]
+            self.kept.clear()
+            self.kept.append(first)
+
+    def forget(self) -> None:
+        """What was before says nothing of what comes."""
+        self.kept.clear()
+        self.known = False
+
+    def _compare(self, dt: float, made: Array, way: Way, even: Array) -> None:
+        """The bias of the gyro by a turn that scans know (a Kalman filter), and who told the turn better."""
+        off = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], way.q[0])))
+        worse = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], even[3:])))
+        self.missed.append((float(off @ off), float(worse @ worse)))
+        n = self.readings.noise
+        self.bias_var += n.gyro_walk**2 * dt
+        # scans that are bent tell turns worse
+        turned = max(TURNED**2, float(np.median(self.missed, axis=0)[0]) / 3.0)
+        noise = (turned + n.gyro**2 * dt) / dt**2
+        gain = self.bias_var / (self.bias_var + noise)
+        self.bias = self.bias + gain * off / dt
+        self.bias_var *= 1.0 - gain
+
+    def _place(self, k: int = -1) -> None:
+        """Velocity and gravity in the body at the last scan that is kept, or at another, by the positions of all."""
+        anchor, pose = self.kept[k]
+        at = np.array([t for t, _ in self.kept])
+        way = self.readings.way(anchor, at, self.bias)
+        if way is None or len(at) < (2 if self.known else 3):
+            self.known = False
+            return
+        if self.known:
+            # as the fit before has it, in the body of the last scan it knew
+            then = self.kept[-1 if k == 0 else -2][1]
+            turn = se3.se3_between(pose, then)[3:]
+            guess, sigma = se3.quat_rotate(turn, self.gravity), GRAVITY_SIGMA[1]
+        else:
+            # the mean force, the body's own acceleration left aside
+            guess, sigma = -way.v[0] / way.seconds[0], GRAVITY_SIGMA[0]
+        there = se3.se3_between(np.broadcast_to(pose, (len(at), 7)), np.array([p for _, p in self.kept]))[:, :3]
+        variance = self.readings.doubt(way.seconds, float(np.sqrt(self.bias_var)))
+        self.velocity, self.gravity, self.cov = fit(way, there, variance, guess, sigma)
+        self.known = True
+        self._up = se3.quat_rotate(pose[3:], -self.gravity / np.linalg.norm(self.gravity))
+
+
+def upright(pose: Array, up: Array | None) -> Array:
+    """A pose ``(7,)`` stood upright, where ``up`` ``(3,)`` is known in its frame: place and heading are kept."""
+    if up is None:
+        return pose
+    x, y, z = se3.quat_rotate(pose[3:] * [-1.0, -1.0, -1.0, 1.0], up)
+    roll, pitch = np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))
+    leaning = se3.quat_multiply(se3.so3_exp(np.array([0.0, pitch, 0.0])), se3.so3_exp(np.array([roll, 0.0, 0.0])))
+    return np.concatenate([pose[:3], se3.quat_multiply(pose[3:], leaning * [-1.0, -1.0, -1.0, 1.0])])
+
+
+@dataclass(frozen=True, slots=True)
+class Tilt:
+    """Gravity along a path.
+
+    Parameters
+    ----------
+    times : (n,)
+    up : (n, 3)
+        In the frame of the path, of the body at these times.
+    sigma : float
+        Of roll and pitch [rad].
+    time : float
+        In which their errors fade [s].
+    """
+
+    times: Array
+    up: Array
+    sigma: float
+    time: float
+
+    def at(self, times: Array, poses: Array) -> Array:
+        """Roll and pitch ``(m, 2)`` of poses ``(m, 7)`` of the path [rad]."""
+        up = np.stack([np.interp(times, self.times, x) for x in self.up.T], axis=1)
+        x, y, z = se3.quat_rotate(poses[:, 3:] * [-1.0, -1.0, -1.0, 1.0], up / np.linalg.norm(up, axis=1)[:, None]).T
+        return np.stack([np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))], axis=1)
+
+
+def tilt_of(inertial: Inertial, times: Array, poses: Array) -> Tilt | None:
+    """Gravity along a path, by the positions and the readings half a window before and after.
+
+    Parameters
+    ----------
+    inertial : Inertial
+        That went along.
+    times : (n,)
+        Of scans that were matched.
+    poses : (n, 7)
+
+    Returns
+    -------
+    Tilt or None
+        None: the unit is not believed, there is too little of it, or the body hangs on its side, where roll and pitch
+        are none.
+    """
+    readings, noise = inertial.readings, inertial.readings.noise
+    if not inertial.believed:
+        return None
+    at: list[float] = []
+    ups, variances = [], []
+    for k, t in enumerate(times.tolist()):
+        a, b = np.searchsorted(times, [t - 0.5 * WINDOW, t + 0.5 * WINDOW], side="left")
+        if b - a < 3 or (at and t <= at[-1]):
+            continue
+        some = np.arange(a, b)
+        way = readings.way(t, times[some], inertial.bias)
+        if way is None:
+            continue
+        span = way.seconds[-1] - way.seconds[0]
+        guess = -(way.v[-1] - way.v[0]) / span
+        there = se3.se3_between(np.broadcast_to(poses[k], (len(some), 7)), poses[some])[:, :3]
+        variance = readings.doubt(way.seconds, float(np.sqrt(inertial.bias_var)))
+        _, gravity, C = fit(way, there, variance, guess, GRAVITY_SIGMA[0])
+        at.append(t)
+        ups.append(se3.quat_rotate(poses[k, 3:], -gravity / np.linalg.norm(gravity)))
+        variances.append(C[2, 2] + noise.accelerometer**2 / span)
+    if len(at) < MOSTLY * len(times):
+        return None
+    lasting = noise.accelerometer_bias
+    sigma = float(np.sqrt(np.median(variances) + lasting**2)) / GRAVITY
+    out = Tilt(np.array(at), np.array(ups), sigma, 0.5 * WINDOW)
+    return None if np.abs(out.at(times, poses)[:, 1]).max() > ON_ITS_SIDE else out
