@@ -12,7 +12,7 @@ import numpy as np
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.corrections import Corrections, calibrated
 from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, rounded
-from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window
+from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Smoothing, Window
 from graphslam.calibrate.windows import Seen
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
@@ -26,6 +26,9 @@ VISITS = 240.0
 """… and of those that hold several visits of a landmark."""
 FEW = 40
 """Landmarks of a log that is looked at for errors of visits in any case: it costs little."""
+RAN_AWAY = 5.0
+"""A constant so many σ from what was known of it beforehand was not found, but ran away: noise so large that the wheels
+say nothing, and wheels so wrong that they need not, are likely together wherever sightings are sparse."""
 PERHAPS = 0.15
 """Residuals that are so alike from one to the next are looked at for errors that last as long as a visit."""
 
@@ -59,11 +62,17 @@ def calibrate_sightings(seen: Seen, effort: Effort = QUICK, *, seed: int = 0) ->
     return _range_and_bearing(seen, effort)
 
 
-def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
+def _range_and_bearing(seen: Seen, effort: Effort, held: tuple[str, ...] = ()) -> Calibration:
+    """``held``: constants that ran away before."""
     steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
-    free = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    free = tuple(c for c in named if c not in held)
     count = _count(seen, SHORT, effort)
     short, short_value = L.fitted(L.sighted(seen, SHORT, count, free))
+    wild = tuple(c for c in free if abs(short.constants[CONSTANTS.index(c)]) > RAN_AWAY * PRIOR[CONSTANTS.index(c)])
+    if wild:
+        held, free = (*held, *wild), tuple(c for c in free if c not in wild)
+        short, short_value = L.fitted(L.sighted(seen, SHORT, count, free))
     _enough(short, seen)
     start = dict(short.sigmas), short.constants.copy()
     long = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), free)
@@ -72,10 +81,13 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
     long, _ = L.fitted(long, trims=L.TRIMS[1:])
     _enough(long, seen)
     notes: list[Finding] = []
+    if held:
+        text = f"{', '.join(held)} cannot be told from this log: held at what the log says."
+        notes.append(Finding("", "calibrated", text))
     if effort.clock:
         clock = profile_clock(short, seen)
     if clock is not None and clock.applied:
-        return _again(seen, clock, effort)
+        return _again(seen, clock, effort, held)
     estimates, short, long = gates(short, short_value, long)
     if clock is not None:
         estimates.append(clock)
@@ -90,10 +102,10 @@ def _range_and_bearing(seen: Seen, effort: Effort) -> Calibration:
     return calibration_of("sightings", estimates, noise, notes, _data(short))
 
 
-def _again(seen: Seen, clock: Estimate, effort: Effort) -> Calibration:
+def _again(seen: Seen, clock: Estimate, effort: Effort, held: tuple[str, ...]) -> Calibration:
     """The calibration with the motion's clock put right."""
     mended = Seen.of(calibrated(seen.log, Corrections(clock=rounded(clock.value))), seen.name, seen.sightings)
-    found = _range_and_bearing(mended, replace(effort, clock=False))
+    found = _range_and_bearing(mended, replace(effort, clock=False), held)
     if found.contradictions():
         return found
     corrections = replace(found.corrections, clock=rounded(clock.value))

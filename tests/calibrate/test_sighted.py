@@ -15,7 +15,9 @@ from graphslam.app.cli.run import join_note
 from graphslam.app.studies.calibration_robot import draw_robot, drive
 from graphslam.calibrate.corrections import Corrections, calibrated
 from graphslam.calibrate.estimate import Estimate
-from graphslam.calibrate.sighted import QUICK, calibrate_sightings
+from graphslam.calibrate.landmarks import fitted, sighted
+from graphslam.calibrate.sighted import QUICK, RAN_AWAY, SHORT, calibrate_sightings
+from graphslam.calibrate.smoothing import CONSTANTS
 from graphslam.calibrate.windows import Seen
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
@@ -152,3 +154,19 @@ def test_a_scale_that_is_hardly_told_is_left() -> None:
     assert "20 %" in vague.gated().why_not
     assert not vague.contradiction
     assert dataclasses.replace(vague, sigma=0.02).contradiction
+
+
+@pytest.mark.data
+def test_a_scale_that_runs_away_is_held_and_the_noise_is_found(data_dir):
+    """Sightings of MRCLAM are so sparse that wheels without any say are likelier than the right ones."""
+    log = gs.load("mrclam-dataset7/robot1")
+    seen = Seen.of(log, "landmarks", log["landmarks"])
+    free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    wild, _ = fitted(sighted(seen, SHORT, 20, free))
+    assert abs(wild.constants[CONSTANTS.index("distance_scale")]) > RAN_AWAY * 0.2
+    found = calibrate_sightings(seen, dataclasses.replace(QUICK, clock=False))
+    assert "distance_scale" not in {e.name for e in found.estimates}
+    assert any("distance_scale cannot be told" in f.text for f in found.findings())
+    assert found.corrections.distance_scale == 1.0
+    assert 0.01 < found.noise["range_sigma"] < 0.1
+    assert int(found.data.split()[3]) > 900  # sightings: nearly none is trimmed
