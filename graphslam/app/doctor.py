@@ -17,6 +17,8 @@ REQUIRED = {
     "gtsam": "gtsam",
     "numpy": "numpy",
     "scipy": "scipy",
+    "scikit-image": "skimage",
+    "trimesh": "trimesh",
     "numba": "numba",
     "matplotlib": "matplotlib",
     "pandas": "pandas",

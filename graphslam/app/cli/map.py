@@ -38,13 +38,20 @@ def make_map(
         "the clearest map and the others are kept in the same way.",
     ),
     log: str | None = typer.Option(
-        None, help="With --hypotheses, --terrain: card or folder of the log of the run, if it was moved."
+        None, help="With --hypotheses, --terrain, --surface: card or folder of the log of the run, if it was moved."
     ),
     terrain: bool = typer.Option(
         False,
         "--terrain",
         help="Only the terrain: where a vehicle can drive. The log of the run is read once more along its solved path.",
     ),
+    surface: bool = typer.Option(
+        False,
+        "--surface",
+        help="Only the surface, as PLY, GLB and OBJ. The log of the run is read once more along its solved path.",
+    ),
+    voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
+    colour: str = typer.Option("height", help="With --surface: height, piece (the node it hangs on) or sigma."),
     sensor_height: float | None = typer.Option(
         None, help="With --terrain: height of the scanner above the ground [m]. Default: found from the ground itself."
     ),
@@ -63,7 +70,14 @@ def make_map(
     if terrain:
         if grid or minimum_entropy or hypotheses:
             raise ConfigError("--terrain makes the terrain alone: leave --grid, --minimum-entropy and --hypotheses out")
+        if surface:
+            raise ConfigError("--terrain and --surface are made one after the other: name one of them")
         _make_terrain(run, log, sensor_height, as_json)
+        return
+    if surface:
+        if grid or minimum_entropy or hypotheses:
+            raise ConfigError("--surface makes the surface alone: leave --grid, --minimum-entropy and --hypotheses out")
+        _make_surface(run, log, voxel, colour, as_json)
         return
     made = remake_map(
         run, grid=grid, minimum_entropy=minimum_entropy, hypotheses=hypotheses, log=log, low=low, high=high,
@@ -101,5 +115,18 @@ def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_js
     facts = found.facts()
     rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
     rows += [{"what": f"cells {k}", "value": v} for k, v in facts["cells"].items()]
+    facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
+    emit(facts, f"{table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json)
+
+
+def _make_surface(run: Path, log: str | None, voxel: float, colour: str, as_json: bool) -> None:
+    from graphslam.app.run.remake_map import remake_surface
+    from graphslam.maps.surface.piece import SurfaceConfig
+
+    found, files, figures = remake_surface(
+        run, log=log, config=SurfaceConfig(voxel=voxel), colour=colour, progress=not as_json
+    )
+    facts = found.facts()
+    rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
     facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
     emit(facts, f"{table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json)

@@ -13,14 +13,16 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.run.run import Run
+from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, terrain_of_run, write_terrain
 from graphslam.core.config import build, merge
-from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.evidence.formats import load_npz
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
+from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.maps.terrain.vehicle import Vehicle
 
 
@@ -144,6 +146,50 @@ def remake_terrain(
             files = write_terrain(new, made, generation=run.report.get("generation"))
             figures = draw_terrain(made, new.figures, name=run.name)
             new.adopt(drop=["terrain*", "figures/terrain*.png"])
+            report_beside(new)
+    files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
+    return made, files, figures
+
+
+def remake_surface(
+    folder: str | Path,
+    *,
+    log: str | Path | SensorLog | None = None,
+    config: SurfaceConfig | None = None,
+    colour: str = "height",
+    progress: bool = True,
+) -> tuple[RunSurface, list[Path], list[Path]]:
+    """Make the surface of a run, and write it with its pictures and the page of the run.
+
+    Parameters
+    ----------
+    folder : path
+        Of a finished run in space.
+    log, config, progress
+        See :func:`graphslam.app.run.surface.surface_of_run`.
+    colour : str
+        One of :data:`graphslam.app.run.surface.COLOURS`.
+
+    Returns
+    -------
+    RunSurface, files, figures
+
+    Raises
+    ------
+    RunFolderError, MissingDataError, FormatError, DataError, UnknownNameError
+    """
+    home = Path(folder)
+    if colour not in COLOURS:
+        raise UnknownNameError("colour of a surface", colour, COLOURS)
+    if not (outputs(home) / "run.json").is_file():
+        open_run(home)  # says what is wrong
+    with locked(home):
+        run = open_run(home)
+        made = surface_of_run(run, log=log, config=config, progress=progress)
+        with new_generation(home) as new:
+            files = write_surface(new, made, colour=colour, generation=run.report.get("generation"))
+            figures = draw_surface(made, new.figures, name=run.name)
+            new.adopt(drop=["surface*", "figures/surface*.png"])
             report_beside(new)
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return made, files, figures

@@ -135,10 +135,21 @@ def terrain_of_run(
     DataError
         Another log, a run in the plane, or no ground in the scans.
     """
+    name, scans = scans_of_run(run, log, stream, what="terrain")
+    return read_terrain(
+        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
+        stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
+    )  # fmt: skip
+
+
+def scans_of_run(
+    run: Run, log: str | Path | SensorLog | None, stream: str | None, *, what: str
+) -> tuple[str, PointClouds | RangeScans]:
+    """Name and records of the scans of a run in space, from its log; see :func:`terrain_of_run` for the errors."""
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
     if run.map.dim != 3:
-        raise DataError("terrain is read along a path in space", got="a run in the plane", wanted="a run in space")
+        raise DataError(f"{what} is read along a path in space", got="a run in the plane", wanted="a run in space")
     said = read_options(run.folder)["run"]
     source = load_log_source(said["source"] if log is None else log)
     digest = log_digest(source)
@@ -148,13 +159,10 @@ def terrain_of_run(
     scans = source.streams.get(name) if name else None
     if name is None or not isinstance(scans, PointClouds | RangeScans):
         raise MissingDataError(
-            "no scans to read terrain from", where=source.name, got=stream or "no such stream",
+            f"no scans to read {what} from", where=source.name, got=stream or "no such stream",
             wanted="a stream of point clouds, or of lines in space",
         )  # fmt: skip
-    return read_terrain(
-        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
-        stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
-    )  # fmt: skip
+    return name, scans
 
 
 def read_terrain(

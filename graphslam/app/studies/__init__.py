@@ -14,6 +14,7 @@ STUDIES: dict[str, str] = {
     "calibration": "graphslam.app.studies.calibration:STUDY",
     "scale": "graphslam.app.studies.scale:STUDY",
     "smartloc": "graphslam.app.studies.smartloc:STUDY",
+    "surface": "graphslam.app.studies.surface:STUDY",
     "terrain": "graphslam.app.studies.terrain:STUDY",
     "withheld-fixes": "graphslam.app.studies.withheld_fixes:STUDY",
 }

@@ -1,0 +1,201 @@
+"""The surface of a finished run: its log is read once more along the solved path."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.run import Run
+from graphslam.app.run.terrain import scans_of_run
+from graphslam.core import se3
+from graphslam.core.errors import DataError, UnknownNameError
+from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.trajectory import Trajectory
+from graphslam.maps.surface.layer import PieceId, SurfaceLayer
+from graphslam.maps.surface.mesh import Mesh, owners, position_sigma, save_mesh, zero_set
+from graphslam.maps.surface.piece import Scan, SurfaceConfig
+from graphslam.maps.terrain.lines import lines_of_scans
+
+FORMAT = "graphslam.surface/1"
+COLOURS = ("height", "piece", "sigma")
+"""What a surface may be coloured by: height, the node it hangs on, σ of its place that comes of that node."""
+
+
+@dataclass(frozen=True)
+class RunSurface:
+    """What was made.
+
+    Parameters
+    ----------
+    layer : SurfaceLayer
+        A piece for each node of the graph.
+    mesh : Mesh
+    owner : (v,)
+        Node that each vertex hangs on; −1 none.
+    sigma : (v,)
+        σ of its place that comes of the pose of that node [m]; NaN where it is not known.
+    scans : int
+    stream : str
+    read_s, seconds : float
+        CPU time to read the scans into pieces, and to make the surface of the pieces.
+    """
+
+    layer: SurfaceLayer
+    mesh: Mesh
+    owner: npt.NDArray[np.int64]
+    sigma: Array
+    scans: int
+    stream: str
+    read_s: float
+    seconds: float
+
+    def facts(self) -> dict[str, Any]:
+        """What ``surface.json`` holds."""
+        known = self.sigma[np.isfinite(self.sigma)]
+        return {
+            "format": FORMAT,
+            "stream": self.stream,
+            "scans": self.scans,
+            "pieces": len(self.layer.pieces),
+            "bricks": len(self.layer),
+            "vertices": len(self.mesh.vertices),
+            "triangles": len(self.mesh.triangles),
+            "area": self.mesh.area(),
+            "sigma_median": float(np.median(known)) if len(known) else None,
+            "sigma_most": float(np.max(known)) if len(known) else None,
+            "memory_mb": self.layer.nbytes / 1e6,
+            "read_s": self.read_s,
+            "surface_s": self.seconds,
+            "config": asdict(self.layer.config),
+        }
+
+    def colours(self, by: str) -> npt.NDArray[np.uint8]:
+        """Colours ``(v, 4)`` of the vertices by one of :data:`COLOURS`."""
+        from graphslam.plots.surface import vertex_colours
+
+        if by == "piece":  # neighbours along the path differ
+            return vertex_colours(np.asarray((7.0 * self.owner) % 20.0, dtype=np.float64), "tab20")
+        if by not in COLOURS:
+            raise UnknownNameError("colour of a surface", by, COLOURS)
+        return vertex_colours(self.mesh.vertices[:, 2] if by == "height" else self.sigma)
+
+
+def surface_of_run(
+    run: Run,
+    *,
+    log: str | Path | SensorLog | None = None,
+    stream: str | None = None,
+    config: SurfaceConfig | None = None,
+    progress: bool = True,
+) -> RunSurface:
+    """Read the log of a run once more, along its solved path; for the errors see
+    :func:`graphslam.app.run.terrain.terrain_of_run`."""
+    name, scans = scans_of_run(run, log, stream, what="a surface")
+    return read_surface(
+        scans, run.map.trajectory, run.map.node_times, run.map.node_poses, run.map.node_covariances,
+        stream=name, config=config, progress=progress,
+    )  # fmt: skip
+
+
+def read_surface(
+    scans: PointClouds | RangeScans,
+    path: Trajectory,
+    node_times: Array,
+    node_poses: Array,
+    node_covariances: Array | None = None,
+    *,
+    stream: str = "scans",
+    config: SurfaceConfig | None = None,
+    progress: bool = True,
+) -> RunSurface:
+    """The surface of scans along a path, a piece for each node.
+
+    Parameters
+    ----------
+    scans : PointClouds or RangeScans
+    path : Trajectory
+        ``T_world_base`` in space.
+    node_times, node_poses : (k,), (k, 7)
+        In time order; a scan goes with the last node before it.
+    node_covariances : (k, 6, 6), optional
+        In the right tangent of each node.
+    stream, config, progress
+        See :func:`surface_of_run`.
+
+    Raises
+    ------
+    DataError
+        No scan within the path, or no surface in the scans.
+    """
+    inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
+    if isinstance(scans, RangeScans):
+        inside &= scans.times + scans.beam_times.max() <= path.times[-1]
+    at = np.flatnonzero(inside)
+    if not len(at):
+        raise DataError("no scan lies within the solved path in time", where=stream)
+    layer = SurfaceLayer(config)
+    owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(node_poses) - 1)
+    begin = time.process_time()
+    for node in tqdm(np.unique(owner).tolist(), desc="surface", unit="node", disable=not progress):
+        layer.read(node, _scans(scans, at[owner == node], path), node_poses[node])
+    read_s = time.process_time() - begin
+    begin = time.process_time()
+    mesh = zero_set(layer.bricks(), layer.config.voxel)
+    if not len(mesh.triangles):
+        raise DataError("the scans show no surface", where=stream, wanted="points that lie densely beside each other")
+    seconds = time.process_time() - begin
+    nodes = np.array([*layer.pieces, -1])
+    covariances: dict[PieceId, Array] = {}
+    if node_covariances is not None:
+        covariances |= {k: node_covariances[k] for k in np.unique(owner).tolist()}
+    sigma = position_sigma(mesh, layer, covariances)
+    return RunSurface(layer, mesh, nodes[owners(mesh, layer)], sigma, len(at), stream, read_s, seconds)
+
+
+def _scans(scans: PointClouds | RangeScans, at: npt.NDArray[np.int64], path: Trajectory) -> Iterator[Scan]:
+    if isinstance(scans, RangeScans):
+        mine = np.zeros(len(scans.times), np.bool_)
+        mine[at] = True
+        lines = lines_of_scans(scans.take(mine), path, 0.0)
+        met = np.isfinite(lines.points[..., 0])
+        yield lines.points[met], np.broadcast_to(lines.origins[:, None], lines.points.shape)[met]
+        return
+    for k in at.tolist():
+        T = se3.se3_compose(path.interpolate(scans.times[k : k + 1])[0], scans.T_base_sensor)
+        points = np.asarray(scans.cloud(k), dtype=np.float64)
+        yield se3.se3_transform(np.broadcast_to(T, (len(points), 7)), points), T[:3]
+
+
+def write_surface(
+    folder: OutputFiles, made: RunSurface, *, colour: str = "height", generation: str | None = None
+) -> list[Path]:
+    """Write ``surface.ply``, ``surface.glb``, ``surface.obj`` in the colours asked for, and ``surface.json``."""
+    colours = made.colours(colour)
+    files = [save_mesh(made.mesh, folder.path / f"surface{ending}", colours) for ending in (".ply", ".glb", ".obj")]
+    folder.write_json("surface.json", {**made.facts(), "colour": colour, "generation": generation})
+    return [*files, folder.path / "surface.json"]
+
+
+def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
+    """Pictures from aslant: by height, and by σ of its place where that is known."""
+    from graphslam.plots.save import save
+    from graphslam.plots.surface import plot_surface
+
+    v, t = made.mesh.vertices, made.mesh.triangles
+    ax = plot_surface(v, t, v[:, 2], label="height [m]", title=f"{name}: surface")
+    out = [save(ax, figures / "surface.png")]
+    if np.any(np.isfinite(made.sigma)):
+        ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the place [mm]", title=f"{name}: how sure the surface is")
+        out.append(save(ax, figures / "surface_sigma.png"))
+    return out

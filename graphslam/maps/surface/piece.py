@@ -1,0 +1,216 @@
+"""What the scans of one node say of the surfaces around it: bricks of signed distances in the node's own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from graphslam.core import se3
+from graphslam.core.errors import ConfigError, DataError, GridError
+from graphslam.core.geometry import Array
+from graphslam.evidence.layout import BRICK_VOXELS
+from graphslam.maps.surface.field_kernels import COLUMNS, add_planes, add_rays, carve, mark_bricks, settle
+
+Ints = npt.NDArray[np.int64]
+Scan: TypeAlias = tuple[Array, Array]
+"""Points ``(n, 3)`` and the place of the scanner ``(3,)``, or one for each point ``(n, 3)`` [m]."""
+_TABLE_LIMIT = 1 << 27
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceConfig:
+    """How surfaces are made."""
+
+    voxel: float = 0.05
+    """Edge of a voxel [m]."""
+    normal_radius: float = 0.3
+    """The plane of a point is that of its neighbours within this [m]; fewer than five make none."""
+    normal_neighbours: int = 30
+    """… and of the nearest so many at most."""
+    most_range: float = 40.0
+    """Points farther from the scanner are left out [m]."""
+    data: str = "planes"
+    """``planes``: distances to the plane of each point; ``rays``: along its beam, as a truncated signed distance."""
+    enough: float = 0.06
+    """A voxel is known from so many points on, each right under its middle; one at its rim is a sixteenth."""
+    flatness: float = 4.0
+    """A point has a plane where its neighbours scatter by so much more (in squares) along it than across it."""
+    carving: bool = True
+    """Beams clear what they passed through."""
+    carve_beams: int = 4
+    """A voxel behind a surface is free where at least so many beams passed …"""
+    carve_ratio: float = 3.0
+    """… and more than this for each point in it."""
+    smoothing: float = 0.1
+    """λ: weight of curvature beside the data, whose weight is W / (W + 3) of W points; in units of voxels, so that
+    its error shrinks with the square of their size."""
+    steps: int = 6
+    """Of the evolution …"""
+    redistance_steps: int = 2
+    """… and of making it a distance again. Both are fixed: a voxel depends on others at most so many voxels away, so
+    what changed somewhere can be made anew there and nowhere else, bit for bit."""
+    dt: float = 0.2
+    """Length of a step of the evolution."""
+
+    def __post_init__(self) -> None:
+        for name in ("voxel", "normal_radius", "most_range", "enough", "flatness", "carve_ratio", "dt"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"surface: {name} = {value}; wanted above 0")
+        if not (np.isfinite(self.smoothing) and self.smoothing >= 0) or self.dt * (1.0 + 8.0 * self.smoothing) > 2.0:
+            raise ConfigError(f"surface: smoothing {self.smoothing}, dt {self.dt}; wanted dt · (1 + 8 smoothing) ≤ 2")
+        if self.data not in ("planes", "rays"):
+            raise ConfigError(f"surface: data = {self.data!r}; known: planes, rays")
+        if self.normal_neighbours < 5 or self.steps < 0 or self.redistance_steps < 0 or self.carve_beams < 1:
+            raise ConfigError(
+                f"surface: normal_neighbours {self.normal_neighbours}, steps {self.steps}, redistance_steps "
+                f"{self.redistance_steps}, carve_beams {self.carve_beams}; wanted ≥ 5, ≥ 0, ≥ 0, ≥ 1"
+            )
+
+    @property
+    def halo(self) -> int:
+        """Bricks that a change may reach beyond its own."""
+        return -(-(self.steps + self.redistance_steps) // 8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePiece:
+    """Sums in bricks that move with one node.
+
+    Parameters
+    ----------
+    coordinates : (n, 3) int64
+        Of the bricks, in the node's frame; each once.
+    distance : (n, 512) float32
+    normal : (n, 512, 3) int8
+    counts : (n, 512, 3) uint16
+        Distances, their gradients, and weight, beams that passed and points of every voxel; see
+        :func:`~graphslam.maps.surface.field_kernels.settle`.
+    """
+
+    coordinates: Ints
+    distance: npt.NDArray[np.float32]
+    normal: npt.NDArray[np.int8]
+    counts: npt.NDArray[np.uint16]
+    first: Ints = field(init=False, repr=False)
+    table: npt.NDArray[np.int32] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        c = np.ascontiguousarray(self.coordinates, dtype=np.int64).reshape(-1, 3)
+        for name, last in (("distance", ()), ("normal", (3,)), ("counts", (3,))):
+            got, wanted = getattr(self, name).shape, (len(c), BRICK_VOXELS, *last)
+            if got != wanted:
+                raise GridError(f"{name} of a surface piece", got=got, wanted=wanted)
+        first, shape = _box(c)
+        table = np.zeros(shape[::-1], np.int32)
+        at = c - first
+        table[at[:, 2], at[:, 1], at[:, 0]] = np.arange(1, len(c) + 1)
+        for name, value in (("coordinates", c), ("first", first), ("table", table)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.coordinates)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return sum(a.nbytes for a in (self.coordinates, self.table, self.distance, self.normal, self.counts))
+
+
+def _box(coordinates: Ints) -> tuple[Ints, Ints]:
+    """First brick ``(3,)`` and shape of the box around bricks."""
+    if not len(coordinates):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    first = coordinates.min(axis=0)
+    shape = coordinates.max(axis=0) - first + 1
+    if float(np.prod(shape.astype(np.float64))) > _TABLE_LIMIT:
+        raise GridError("a piece of a surface is too wide: is there a stray point in it?", got=(8 * shape).tolist())
+    return first, shape
+
+
+def normals_of(points: Array, towards: Array, config: SurfaceConfig) -> Array:
+    """Normals ``(n, 3)`` of points, turned to where they were seen from ``(n, 3)``; NaN where too few others are near.
+
+    The direction in which a point's neighbours scatter least.
+    """
+    out = np.full((len(points), 3), np.nan)
+    if len(points) < 5:
+        return out
+    most = min(config.normal_neighbours, len(points))
+    reach, index = cKDTree(points).query(points, k=most, distance_upper_bound=config.normal_radius)
+    near = np.isfinite(reach)
+    at = points[np.where(near, index, 0)]
+    count = near.sum(axis=1)
+    mean = np.einsum("nk,nkj->nj", near, at) / np.maximum(count, 1)[:, None]
+    off = (at - mean[:, None]) * near[..., None]
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+    n = vectors[..., 0]
+    n = n * np.where(np.sum(n * (towards - points), axis=1) < 0.0, -1.0, 1.0)[:, None]
+    flat = (count >= 5) & (values[:, 1] > config.flatness * values[:, 0])  # points along a line have no plane
+    out[flat] = n[flat]
+    return out
+
+
+def piece_of_scans(scans: Iterable[Scan], pose: Array, config: SurfaceConfig) -> SurfacePiece:
+    """The piece of a node at ``pose`` ``(7,)`` of scans whose points and scanner are in the world frame.
+
+    Raises
+    ------
+    DataError
+        Points that are not finite, or of another shape.
+    """
+    parts, origins = [], []
+    to_node = se3.se3_inverse(np.asarray(pose, dtype=np.float64))
+    for points, origin in scans:
+        p = np.asarray(points, dtype=np.float64)
+        if p.ndim != 2 or p.shape[1] != 3 or not np.all(np.isfinite(p)):
+            raise DataError("impossible points of a surface", got=p.shape, wanted="(n, 3), finite")
+        o = np.broadcast_to(np.asarray(origin, dtype=np.float64), p.shape)
+        near = np.linalg.norm(p - o, axis=1) < config.most_range
+        back = np.broadcast_to(to_node, (int(near.sum()), 7))
+        parts.append(se3.se3_transform(back, p[near]))
+        origins.append(se3.se3_transform(back, o[near]))
+    if not parts:
+        return _settled(np.zeros((0, 3), np.int64), np.zeros((0, BRICK_VOXELS, COLUMNS), np.int32))
+    own, seen_from = np.concatenate(parts), np.concatenate(origins)
+    if config.data == "rays":
+        return piece_of_planes(own, seen_from, np.zeros_like(own), np.ones(len(own), np.bool_), config)
+    normals = normals_of(own, seen_from, config)
+    flat = np.isfinite(normals[:, 0])
+    return piece_of_planes(own, seen_from, np.where(flat[:, None], normals, 0.0), flat, config)
+
+
+def piece_of_planes(
+    points: Array, seen_from: Array, normals: Array, flat: npt.NDArray[np.bool_], config: SurfaceConfig
+) -> SurfacePiece:
+    """A piece of points ``(n, 3)`` with normals in the node's frame; those that are not ``flat`` only carve."""
+    p = np.ascontiguousarray(points / config.voxel)
+    at = np.floor(p[flat]).astype(np.int64) // 8
+    first, shape = _box(at)
+    table = np.zeros((shape + 2 * (shape > 0))[::-1], np.int32)
+    first = first - 1
+    mark_bricks(p[flat], first, table)
+    where = np.argwhere(table)
+    table[where[:, 0], where[:, 1], where[:, 2]] = np.arange(1, len(where) + 1)
+    sums = np.zeros((len(where), BRICK_VOXELS, COLUMNS), np.int32)
+    beams = np.ascontiguousarray(seen_from / config.voxel)
+    if config.data == "rays":
+        add_rays(p, beams, first, table, sums)
+    else:
+        add_planes(p[flat], np.ascontiguousarray(normals[flat]), first, table, sums)
+    if config.carving and len(where):
+        carve(p, beams, 2.5, first, table, sums)
+    return _settled(where[:, ::-1] + first, sums)
+
+
+def _settled(coordinates: Ints, sums: npt.NDArray[np.int32]) -> SurfacePiece:
+    n = len(coordinates)
+    distance, normal = np.zeros((n, BRICK_VOXELS), np.float32), np.zeros((n, BRICK_VOXELS, 3), np.int8)
+    counts = np.zeros((n, BRICK_VOXELS, 3), np.uint16)
+    settle(sums, distance, normal, counts)
+    return SurfacePiece(coordinates, distance, normal, counts)
