@@ -17,6 +17,7 @@ from graphslam.app.run.slam import Slam
 from graphslam.app.worlds import mesh_world
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
+from graphslam.frontends.lidar_odometry.front_end import FIRST
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -133,7 +134,7 @@ def test_beams_that_were_used_leave_the_memory() -> None:
         most = max(most, held["clouds"])
     kept = sum(t.size for t in tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/io/*")]).traces)
     tracemalloc.stop()
-    assert most <= 2
+    assert most <= FIRST
     assert kept < 0.1 * bytes_of_all
     run = slam.finish()  # and they are all there where the end asks for them
     assert all(np.array_equal(a, b) for a, b in zip(run.log["clouds"], log["clouds"], strict=True))
