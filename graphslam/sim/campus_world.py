@@ -254,6 +254,8 @@ def _rooms(
     while length - cuts[-1] > 8.0:
         cuts.append(cuts[-1] + float(rng.uniform(3.5, 6.5)))
     cuts.append(length)
+    if len(cuts) > 2 and cuts[-1] - cuts[-2] < 0.6 + _ROOM_DOOR[0]:
+        del cuts[-2]  # no room for a door
     doors = []
 
     def at(s: float, t: float) -> tuple[float, float]:

@@ -117,6 +117,13 @@ def test_sessions_share_a_place_and_a_far_one_sees_nothing_of_it() -> None:
     assert len(campus(dataclasses.replace(base), seed=3).vertices) != len(meshes[0])
 
 
+def test_a_corridor_whose_last_piece_is_too_short_for_a_door_ends_in_a_longer_room() -> None:
+    """Two in twenty-one of the largest places had one, and were not built at all."""
+    wide = {"size": (600.0, 800.0), "block": 90.0, "open_share": 0.7, "visits": 3, "round": False}
+    world = campus(campus_preset("full", **wide), seed=5062472233008329382)
+    assert len(world.meta["corridors"]) == 3
+
+
 def test_two_doors_that_face_each_other_are_one_place() -> None:
     """Seed 1 of the whole campus has a way out of one building straight into the next."""
     world = campus(campus_preset("full", clutter=0.0), seed=1)
