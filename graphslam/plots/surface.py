@@ -89,6 +89,7 @@ def plot_surface(
     ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
     ax.figure.colorbar(matplotlib.cm.ScalarMappable(norm, palette), ax=ax, label=label, shrink=0.7)
     ax.set_xlabel("x [m]")
+    ax.grid(False)
     ax.set_yticks([])
     ax.set_title(title)
     return ax
