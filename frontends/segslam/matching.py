@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,44 @@ from graphslam.registration.register import Registration, distinct, register_sta
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+KEPT_BYTES = 200_000_000
+"""What is kept of search fields, and of clouds that others are registered to, takes so much memory each [bytes]."""
+POINT_BYTES = 1250
+"""Of one point of such a cloud, with its covariance and its places in two trees."""
+
+
+class Recent(dict[K, V]):
+    """What was made, by what it was made of; what was asked for longest ago goes first, and is made again.
+
+    Parameters
+    ----------
+    size : callable
+        Bytes of one.
+    """
+
+    def __init__(self, size: Callable[[V], int]) -> None:
+        super().__init__()
+        self._size = size
+
+    def of(self, key: K, make: Callable[[], V]) -> V:
+        """That of a key, made where it is not there."""
+        value = self[key] = self.pop(key) if key in self else make()
+        size = sum(map(self._size, self.values()))
+        for oldest in list(self)[:-1]:
+            if size <= KEPT_BYTES:
+                break
+            size -= self._size(self.pop(oldest))
+        return value
+
+    def keep(self, alive: Callable[[K], bool]) -> None:
+        """Drop all others."""
+        for key in [k for k in self if not alive(k)]:
+            del self[key]
+
 
 Ints = npt.NDArray[np.int64]
 
@@ -100,9 +139,11 @@ class Matcher:
         self.winnowed = Winnowed()
         self.seconds = 0.0
         # what a closed map is matched by: made when it is first asked for
-        self._targets: dict[int, Target | None] = {}
+        self._targets: Recent[int, Target | None] = Recent(lambda t: 0 if t is None else POINT_BYTES * len(t))
         # fine and coarse, of one of all particles' maps of the same steps
-        self._fields: dict[tuple[int, int], tuple[SearchField, SearchField]] = {}
+        self._fields: Recent[tuple[int, int], tuple[SearchField, SearchField]] = Recent(
+            lambda pair: pair[0].nbytes + pair[1].nbytes
+        )
 
     def attempt(self, step: int, poses: Array, ahead: Ahead, seed: SeedTree) -> Attempt:
         """Try to match all particles, and draw.
@@ -241,23 +282,26 @@ class Matcher:
 
     def _target(self, m: int, segment: int) -> Target | None:
         """The map's cloud, None if there is too little of it."""
-        if m not in self._targets:
+
+        def made() -> Target | None:
             points = self.segmap.map_of(segment)[0].binned_cloud(self.config.search.cloud_level).points
-            self._targets[m] = Target(points) if len(points) >= self.config.registration.least_points else None
-        return self._targets[m]
+            return Target(points) if len(points) >= self.config.registration.least_points else None
+
+        return self._targets.of(m, made)
 
     def _search(self, source: Array, segment: int, T: Array, half: list[float]) -> list[Array]:
         """Starts of registrations: the distinct best places, if any is good enough to be the true one."""
         s = self.config.search
         known = (self._begin(segment), int(self.segmap.table.end[segment]))
-        if known not in self._fields:
-            occupied = self.segmap.map_of(segment)[0].occupied_cloud()
-            cell = s.grid / 4.0
-            self._fields[known] = (
+
+        def made() -> tuple[SearchField, SearchField]:
+            occupied, cell = self.segmap.map_of(segment)[0].occupied_cloud(), s.grid / 4.0
+            return (
                 SearchField(occupied, cell=cell, sigma=s.sigma),
                 SearchField(occupied, cell=2.0 * cell, sigma=2.0 * s.sigma),
             )
-        fine, coarse = self._fields[known]
+
+        fine, coarse = self._fields.of(known, made)
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
         found = correlative_search(source, fine, T, half, steps, s.starts, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
@@ -266,9 +310,9 @@ class Matcher:
     def forget(self) -> None:
         """Drop what belongs to maps that are gone."""
         segmap = self.segmap
-        self._targets = {m: v for m, v in self._targets.items() if segmap.maps.grids[m] is not None}
+        self._targets.keep(lambda m: segmap.maps.grids[m] is not None)
         ends = set(segmap.table.end[segmap.alive].tolist())
-        self._fields = {key: v for key, v in self._fields.items() if key[1] in ends}
+        self._fields.keep(lambda known: known[1] in ends)
 
     # --- what is drawn ---------------------------------------------------------------------------------------
 

@@ -30,6 +30,7 @@ from graphslam.refine.nodes import find_nodes, path_between, scans_at
 from graphslam.refine.problem import Problem, Solved, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
+from graphslam.registration.plane_kernels import Pairs
 
 log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
@@ -271,6 +272,10 @@ def _reach(steps: Scans) -> float:
     return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
 
 
+NOTHING = Association(Pairs(*np.zeros((4, 0), np.int64)), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+"""No pairs."""
+
+
 class _Work:
     """A refinement while it goes on."""
 
@@ -296,6 +301,7 @@ class _Work:
         self.poses = start.copy()
         self.states = self.first_states()
         self.rounds: list[Round] = []
+        self.found = NOTHING
         self.surfaces: Surfaces | None = None
         self.first: Surfaces | None = None
         self.length = float(steps.path_length[-1])
@@ -315,15 +321,14 @@ class _Work:
         other = None
         assert self.surfaces is not None
         odometry = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
-        at_odometry = find_surfaces(self.raw, odometry, self.config.surface)
-        self.reckoned = self.agreement(self.raw, at_odometry, odometry, self.noise)
+        self.reckoned = self.agreement_along(odometry)
         contradicted = np.any(~taken & guides.far(self.poses))
         if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
             why = "the start contradicts the scans between" if contradicted else "the odometry alone agrees better"
             self.tell(f"{why}: once more from the odometry")
             other = self.from_odometry()
             taken = taken & (not other.taken)
-            self.reckoned = self.agreement(self.raw, at_odometry, odometry, self.noise)
+            self.reckoned = self.agreement_along(odometry)
         found = self.result(guides.steps[~taken & guides.far(self.poses)], other)
         if not found.input_better or self.fixes is not None:  # fixes hold a path, and odometry knows none of them
             return found
@@ -419,10 +424,14 @@ class _Work:
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
         """Associate anew, and Gauss–Newton steps; without a σ the noise comes from the residuals."""
-        give_back()
+        # what is made anew is let go of first: never two of them
+        self.found = NOTHING
         if passes:
+            self.cloud = self.problem.cloud = self.raw
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
+        give_back()
         if again or self.surfaces is None:
+            self.surfaces = None
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
             if self.first is None:
                 self.first = self.surfaces
@@ -507,10 +516,15 @@ class _Work:
         weight = 1.0 / found.spent[:, 1]
         return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
+    def agreement_along(self, poses: Array) -> float:
+        """The same of the raw scans at another path, with surfaces made there."""
+        return self.agreement(self.raw, find_surfaces(self.raw, poses, self.config.surface), poses, self.noise)
+
     def result(self, refused: Index, other: Other | None) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
         assert self.first is not None
+        give_back()
         before = self.agreement(self.raw, self.first, self.start, self.noise)
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
