@@ -2,6 +2,8 @@
 
 Over windows of about a second the gyro's turn and the mean specific force are compared with what a path says of them,
 ``m = A r + b T`` and ``f = A Rᵀ (0, 0, g)``, for all 48 ways A in which three axes can be exchanged and turned round.
+Between the ends of a window the gyro tells, by the same A, how the body leans: a robot that balances leans to and fro
+about once a second, and the mean of its two ends may be the opposite of the mean over the window.
 What moves the body cancels out of f over many windows; the bias b is solved for. Ways that nothing tells apart (x and y
 of a body that stays level) are no reproach: only what contradicts the stated mounting is. Where no way
 explains gyro and accelerometer alike, the one that contradicts is named: a path that was made of a turned gyro agrees
@@ -132,12 +134,17 @@ def check_imu_axes(
     q = se3.quat_multiply(path.interpolate(edges)[:, 3:], np.broadcast_to(imu.T_base_imu[3:], (n + 1, 4)))
     R = se3.quat_to_matrix(q)
     turn = se3.so3_log(se3.quat_multiply(_conjugate(q[:-1]), q[1:]))[full] / window
-    up = (0.5 * (R[:-1] + R[1:]))[full, 2, :] * GRAVITY
+    ups = R[:, 2, :] * GRAVITY
     rate, force = mean(imu.angular_rate), mean(imu.specific_force)
     ways = signed_permutations()
     r = rate - np.einsum("aij,kj->aki", ways, turn)
     r -= r.mean(axis=1, keepdims=True)  # the bias
-    f = force - np.einsum("aij,kj->aki", ways, up)
+    turned = _turned(imu)
+    ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
+    since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
+    since, left = (np.einsum("aji,kj->aki", ways, x) for x in (since, left))  # in the axes that A says
+    up = 0.5 * (ups[:-1][full] - np.cross(since, ups[:-1][full]) + ups[1:][full] + np.cross(left, ups[1:][full]))
+    f = force - np.einsum("aij,akj->aki", ways, up)
     gyro, pull = (r**2).sum(axis=(1, 2)), (f**2).sum(axis=(1, 2))
     # what the best way of each sensor leaves is its noise, path errors and all
     rows = 3.0 * len(rate)
@@ -151,6 +158,12 @@ def check_imu_axes(
     best = int(np.argmin(chi2))
     excess = float(chi2[0] - chi2[best])
     return AxesCheck(excess > limit, ways[best], excess, int(np.sum(chi2 - chi2[best] <= limit)), len(rate), sensor)
+
+
+def _turned(imu: Imu) -> Array:
+    """Integral of the rates ``(n, 3)`` by the trapezoidal rule [rad]."""
+    steps = 0.5 * np.diff(imu.times)[:, None] * (imu.angular_rate[1:] + imu.angular_rate[:-1])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _conjugate(q: Array) -> Array:
