@@ -35,6 +35,8 @@ from graphslam.frontends.scan_window.exits import relative_covariance
 
 BENT = 0.1
 """Way of points in the time from scan to scan from which it matters that they have no times [m]."""
+UNEVEN = 0.03
+"""Points that an uneven motion displaces by more than the noise of a range, as data sheets have it [m], are bent."""
 MANY = 0.05
 """Share of lost scans of a submap from which a line of the verdict says so."""
 FIRST = 5
@@ -183,7 +185,7 @@ class LidarFrontEnd(FrontEnd):
             n = len(kept) - 1
             full = odometry.way - way >= config.length and n >= config.scans
             if k == scans - 1 or full or n >= config.most_scans:
-                bent = [] if told else _bent(key, kept)
+                bent = [] if told else [*_bent(key, kept), *_uneven(key, kept)]
                 told = told or bool(bent)
                 if n and key >= first:
                     ended = "end-of-log" if k == scans - 1 else "length"
@@ -364,6 +366,29 @@ def _bent(key: int, kept: list[Follow]) -> list[Finding]:
         "path nor covariance knows of it. Give the points their times, as a field t, time or offset_time."
     )
     return [Finding("look", "points-without-times", text)]
+
+
+def _uneven(key: int, kept: list[Follow]) -> list[Finding]:
+    """Does the motion change so much from scan to scan that scans straightened by an even one stay bent?
+
+    If the velocity changes evenly over a scan, by Δ in all, points in its middle are off by Δ / 8 times its duration.
+    """
+    off = []
+    for a, b, c in zip(kept, kept[1:], kept[2:]):
+        if c.timed and not c.seen.aided and len(c.points):
+            before, now = se3.se3_between(np.stack([a.pose, b.pose]), np.stack([b.pose, c.pose]))
+            change = np.asarray(se3.se3_log(se3.se3_between(before, now)))
+            far = float(np.median(np.linalg.norm(c.points, axis=1)))
+            off.append(float(np.linalg.norm(change[3:]) + far * np.linalg.norm(change[:3])) / 8.0)
+    if not off or np.median(off) <= UNEVEN:
+        return []
+    text = (
+        "Without readings of an IMU scans are straightened as if the motion was even. In submap "
+        f"{key} it changes from scan to scan by so much that points in the middle of a scan are off by "
+        f"{np.median(off):.2f} m. Neither path nor covariance knows of it: the path is less exact than its covariance "
+        "says, above all where it is refined. To do: log the lidar's IMU, or move it more steadily."
+    )
+    return [Finding("bad", "uneven-motion", text)]
 
 
 def _stamped(made: list[Follow]) -> tuple[Array, Array]:

@@ -203,8 +203,9 @@ def move(grids: Sequence[EvidenceGrid]) -> None:
     pools: dict[int, GridPool] = {}
     for grid in grids:
         levels = grid.pool.levels
-        pool = pools.setdefault(levels, GridPool(levels))
-        grid.take(grid_of(grid.empty(pool), pieces_of(grid)))
+        if levels not in pools:
+            pools[levels] = GridPool(levels)
+        grid.take(grid_of(grid.empty(pools[levels]), pieces_of(grid)))
 
 
 def overlap(pieces: Pieces) -> str | None:

@@ -1,6 +1,6 @@
 """Numba kernels: products of large dense matrices by products of small blocks. Plain arrays only.
 
-BLAS multiplies blocks of 64 x 64 about five times as fast as compiled loops do, and products of that size never spread
+BLAS multiplies blocks of 64 × 64 two to four times as fast as compiled loops do, and products of that size never spread
 over threads: the result has the same bytes whatever the number of threads.
 """
 

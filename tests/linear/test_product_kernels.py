@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from graphslam.linear.product_kernels import subtract_product
 
@@ -27,3 +28,14 @@ def test_upper_blocks_only(rng: np.random.Generator) -> None:
     wanted = -A.T @ A
     np.testing.assert_allclose(np.triu(C), np.triu(wanted), rtol=0, atol=1e-12)
     assert not C[64:, :64].any()
+
+
+def test_threads_change_no_byte(rng: np.random.Generator) -> None:
+    A, B = rng.standard_normal((300, 700)), rng.standard_normal((300, 500))
+    found = []
+    for threads in (1, 2):
+        C = np.zeros((700, 500))
+        with threadpool_limits(limits=threads, user_api="blas"):
+            subtract_product(A, B, C, False)
+        found.append(C.tobytes())
+    assert found[0] == found[1]

@@ -177,6 +177,21 @@ def test_scans_of_a_shaking_hand_are_straight_with_an_imu(paths, plain):
         assert odometry.inertial.believed
 
 
+def test_scans_that_stay_bent_are_named(logs):
+    """Shaken without an IMU: said once. With it, or carried steadily: not."""
+
+    def named(log):
+        submaps = LidarFrontEnd().submaps(log, seed=SeedTree(0))
+        return [f["code"] for s in submaps for f in s.report.get("findings", ())].count("uneven-motion")
+
+    def without_imu(log):
+        return replace(log, streams={k: v for k, v in log.streams.items() if k != "imu"})
+
+    assert named(without_imu(logs[0])) == 1
+    assert named(logs[0]) == 0
+    assert named(without_imu(carried(2, sway=0.0, bob=0.0))) == 0
+
+
 def test_bias_velocity_and_gravity_are_learned(paths):
     for log, _, odometry in paths:
         unit, truth = odometry.inertial, log.truth.trajectory
