@@ -139,7 +139,9 @@ def check_imu_axes(
     ways = signed_permutations()
     r = rate - np.einsum("aij,kj->aki", ways, turn)
     r -= r.mean(axis=1, keepdims=True)  # the bias
-    turned = _turned(imu)
+    # a gyro that no way brings near the path (degrees for radians) tells nothing of how the body leans
+    believed = float((r**2).sum(axis=(1, 2)).min()) < 0.5 * float(((rate - rate.mean(axis=0)) ** 2).sum())
+    turned = _turned(imu) if believed else np.zeros((len(imu.times), 3))
     ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
     since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
     since, left = (np.einsum("aji,kj->aki", ways, x) for x in (since, left))  # in the axes that A says
