@@ -51,7 +51,8 @@ def save_map_server(grid: EvidenceGrid, path: str | os.PathLike[str]) -> tuple[P
     if dense.values.size == 0:
         raise GridError("a map in which nothing is known cannot be written as an image", where=str(path))
     occupied = dense.values >= grid.model.threshold_step  # UNKNOWN is below any threshold
-    pixels = np.where(dense.values == UNKNOWN, NOT_KNOWN, np.where(occupied, OCCUPIED, FREE)).astype(np.uint8)
+    pixels = np.full(occupied.shape, FREE, np.uint8)
+    pixels[occupied], pixels[dense.values == UNKNOWN] = OCCUPIED, NOT_KNOWN
     rows = np.ascontiguousarray(pixels.T[::-1])  # the first row of an image is its top, the largest y
     image = target.with_suffix(".pgm")
     with atomic_open(image) as stream:

@@ -15,6 +15,8 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.map_server import save_map_server
 from graphslam.evidence.octomap import write_octomap
+from graphslam.evidence.pool import GridPool
+from graphslam.maps.coarse import drawable, within_octomap
 
 STOREY_GAP = 1.5
 """Heights of a path that lie farther apart than this are of different storeys [m]."""
@@ -87,7 +89,7 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
     some = (plan != UNKNOWN).any(axis=1)
     bricks = np.full((int(some.sum()), BRICK_VOXELS), UNKNOWN, np.int16)
     bricks[:, : BRICK_EDGE**2] = plan[some]
-    out = EvidenceGrid(grid.voxel_size, model=grid.model, dim=2)
+    out = EvidenceGrid(grid.voxel_size, model=grid.model, dim=2, pool=GridPool(grid.pool.levels))
     out.write_bricks(np.column_stack([columns[some], np.zeros(int(some.sum()), np.int64)]), bricks)
     return out
 
@@ -147,12 +149,13 @@ def save_maps(
 
     Returns
     -------
-    list of paths written; a band in which nothing is known is left out.
+    list of paths written; a band in which nothing is known is left out. Floor plans of too many pixels, and a map that
+    reaches beyond OctoMap's cube, are of larger voxels (:mod:`graphslam.maps.coarse`), as the files themselves say.
 
     Raises
     ------
     GridError
-        An empty map, or one that reaches beyond OctoMap's cube.
+        An empty map.
     """
     target = Path(folder)
     if grid.voxel_counts().known == 0:
@@ -160,11 +163,11 @@ def save_maps(
     target.mkdir(parents=True, exist_ok=True)
     made = [save_ply(grid, target / f"{name}.ply")]
     if grid.dim == 2:
-        return made + list(save_map_server(grid, target / f"{name}.yaml"))
-    write_octomap(grid, target / f"{name}.bt")
+        return made + list(save_map_server(drawable(grid), target / f"{name}.yaml"))
+    write_octomap(within_octomap(grid), target / f"{name}.bt")
     made.append(target / f"{name}.bt")
     for band, (low, high) in (bands or {}).items():
         plan = floor_plan(grid, low, high)
         if plan.voxel_counts().known:
-            made += save_map_server(plan, target / f"{name}-{band}.yaml")
+            made += save_map_server(drawable(plan), target / f"{name}-{band}.yaml")
     return made

@@ -27,11 +27,12 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import compact
 from graphslam.evidence.contents import entropy_of_counts
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import BRICK_VOXELS
+from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, MAX_LEVELS, half_edge
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import pose_rows
+from graphslam.maps.coarse import levels_for
 from graphslam.maps.fuse_kernels import count_changes, find_bricks
-from graphslam.maps.pieces import Piece, PieceId, checked_poses
+from graphslam.maps.pieces import MARGIN, Piece, PieceId, checked_poses
 from graphslam.maps.posed import Posed, Poser
 
 Ints = npt.NDArray[np.int64]
@@ -80,7 +81,8 @@ class FusedMap:
         A piece stays where it is until some point of it would move by more than this [voxels]. Distances are from
         where it *is*, so that many small moves do not add up. 0 follows every move.
     pool : GridPool, optional
-        Storage of the grid; give one of more levels for a world beyond ± 819 m of 0.2 m voxels.
+        Storage of the grid. Its levels say how far the map may reach; by default it has a pool of its own, to which
+        levels are added where pieces lie beyond it: ± 13 km of 0.2 m voxels.
     threads : int
         That put pieces on the lattice; the map is the same with any number.
 
@@ -118,6 +120,7 @@ class FusedMap:
         if not (np.isfinite(tolerance) and tolerance >= 0):
             raise ConfigError(f"tolerance of a fused map is {tolerance} voxels; wanted ≥ 0")
         self._grid = EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim)
+        self._grows = pool is None
         self.tolerance = float(tolerance)
         if not (isinstance(threads, int) and threads >= 1):
             raise ConfigError(f"a fused map of {threads} threads; wanted ≥ 1")
@@ -189,7 +192,7 @@ class FusedMap:
     def copy(self) -> FusedMap:
         """A second map of the same pieces, for another hypothesis: shares all that neither changes."""
         twin = FusedMap.__new__(FusedMap)
-        twin._grid = self._grid.copy()
+        twin._grid, twin._grows = self._grid.copy(), self._grows
         twin.tolerance = self.tolerance
         twin._posers = [Poser(self.voxel_size, self.dim, self._grid.pool.half) for _ in self._posers]
         twin._pieces, twin._posed, twin._wanted = dict(self._pieces), dict(self._posed), dict(self._wanted)
@@ -256,6 +259,7 @@ class FusedMap:
         wanted = dict(zip(poses, self._checked(poses)))
         movers = [name for name in wanted if name not in add]
         moved = self._beyond(movers, wanted, limit)
+        self._make_room(add, wanted)
         with self._grid.pool.lock:
             fresh = self._pose({**{n: self._pieces[n] for n in moved}, **add}, wanted)
             old = [self._posed[name] for name in (*gone, *moved)]
@@ -323,6 +327,20 @@ class FusedMap:
         far = np.linalg.norm(corners @ R.transpose(0, 2, 1) + t[:, None], axis=2).max(axis=1)
         return [n for n, f in zip(names, far.tolist()) if f > limit * self.voxel_size]
 
+    def _make_room(self, add: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> None:
+        """Begin anew in a pool of more levels where pieces would reach out of this one."""
+        reach = max((reach_of(add.get(n) or self._pieces[n], T) for n, T in wanted.items()), default=0.0)
+        levels = levels_for(reach)
+        if not self._grows or levels <= self._grid.pool.levels or reach > half_edge(MAX_LEVELS):
+            return
+        larger = FusedMap(
+            self.voxel_size, dim=self.dim, model=self._grid.model, pool=GridPool(levels), threads=len(self._posers)
+        )
+        larger.add(self._pieces, {n: p.T_world_node for n, p in self._posed.items()})
+        self._grid, self._posers, self._posed = larger._grid, larger._posers, larger._posed
+        self._counts, self._counted = larger._counts, larger._counted
+        self._uncounted, self._empty = larger._uncounted, 0
+
     def _pose(self, pieces: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> dict[PieceId, Posed]:
         """Pieces on the lattice of the world."""
         if not pieces:
@@ -369,6 +387,14 @@ class FusedMap:
             counts[0] = 0  # the unknown
             self._counts, self._counted, self._uncounted = counts, self._grid.copy(), []
         return self._counts
+
+
+def reach_of(piece: Piece, T_world_node: Array) -> float:
+    """How far from the origin a piece reaches at most, wherever it is turned [voxels]."""
+    if not piece.known:
+        return 0.0
+    far = np.linalg.norm(T_world_node[: piece.dim]) + np.linalg.norm(piece.corners, axis=1).max()
+    return float(far) / piece.voxel_size + MARGIN * BRICK_EDGE
 
 
 def fuse(

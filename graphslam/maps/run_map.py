@@ -15,10 +15,12 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.layout import MAX_LEVELS, half_edge
 from graphslam.evidence.views import has_view, view_of
 from graphslam.maps.clouds import fused_points
+from graphslam.maps.coarse import coarse_piece
 from graphslam.maps.export import storeys
-from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.fuse import FusedMap, fuse, reach_of
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
@@ -72,6 +74,8 @@ class RunMap:
         poses.
     points : (n, dim) or None
         Of the submaps' clouds at the solved poses [m]; None where they have none.
+    coarsened : int
+        Of the voxels of the submaps so many make an edge of one of the map: 1 unless it would be too wide for any pool.
     knows_space : bool
         False where some submap cannot tell free space: entropies and volumes are then of surfaces alone.
     """
@@ -86,6 +90,16 @@ class RunMap:
     move_s: float
     points: Array | None = None
     knows_space: bool = True
+    coarsened: int = 1
+
+    def said(self) -> str:
+        """What became of a map too wide for its voxels, in words; empty where nothing did."""
+        if self.coarsened == 1:
+            return ""
+        size = self.fused.voxel_size
+        return (
+            f"The fused map is too wide for the voxels of its submaps: its own are of {size:g} m, {self.coarsened} ×."
+        )
 
     def facts(self) -> dict[str, Any]:
         """What ``fused_map.json`` holds."""
@@ -195,17 +209,39 @@ def make_run_map(
     divide_s, begin = time.perf_counter() - begin, time.perf_counter()
     grid = submaps[0].grid
     model = grid.model if isinstance(grid, EvidenceGrid) else None
+    at = solved_poses(divided, nodes)
+    divided, coarsened = _held(divided, at)
     fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
     fuse_s = time.perf_counter() - begin
     open_entropy, open_volume = fused.entropy(), fused.known_volume()
     begin = time.perf_counter()
-    fused.move(solved_poses(divided, nodes))
+    fused.move(at)
     fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
     knows_space = all(view_of(s).knows_space for s in submaps)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
-    return RunMap(fused, divided, bands, open_entropy, open_volume, divide_s, fuse_s, move_s, points, knows_space)
+    return RunMap(
+        fused,
+        divided,
+        bands,
+        open_entropy,
+        open_volume,
+        divide_s,
+        fuse_s,
+        move_s,
+        points,
+        knows_space,
+        coarsened,
+    )
+
+
+def _held(divided: DividedSubmaps, at: Mapping[PieceId, Array]) -> tuple[DividedSubmaps, int]:
+    """Pieces that a pool of most levels holds, along the open chain and at ``at``, and by how much they are coarser."""
+    coarsened, pieces = 1, divided.pieces
+    while max(reach_of(p, T[n]) for T in (divided.poses, at) for n, p in pieces.items()) > half_edge(MAX_LEVELS):
+        coarsened, pieces = 2 * coarsened, {n: coarse_piece(p) for n, p in pieces.items()}
+    return dataclasses.replace(divided, pieces=pieces), coarsened
 
 
 def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, float]]:

@@ -187,7 +187,7 @@ def test_what_is_refused_changes_nothing(rng: np.random.Generator) -> None:
     fused = fuse({"a": piece, "b": piece}, {"a": SE3.identity, "b": some_pose(rng, 3)})
     before, poses = fused.grid, fused.poses
     nan = np.full(7, np.nan)
-    far = np.r_[5000.0, 0, 0, 0, 0, 0, 1]
+    far = np.r_[20_000.0, 0, 0, 0, 0, 0, 1]
     flat = whole(scanned(rng, 2))
     fine = whole(scanned(rng, 3, size=0.5))
     cases = [

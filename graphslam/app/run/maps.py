@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.maps.coarse import drawable
 from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
 
@@ -46,7 +47,7 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
     from graphslam.plots.fused_map import plot_cut, plot_storey
     from graphslam.plots.save import save
 
-    grid = run_map.fused.grid
+    grid = drawable(run_map.fused.grid)
     if grid.dim == 2:
         ax = plot_section(grid, title=f"{name}: fused map")
         if truth is not None:

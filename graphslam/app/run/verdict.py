@@ -88,7 +88,7 @@ def stated(figures: Figures) -> list[Finding]:
 
 
 _STATED = frozenset(
-    {"state", "chi2", "nees", "consistency-test", "certificate", "map-left-out", "flagged", "imu-axes"}
+    {"state", "chi2", "nees", "consistency-test", "certificate", "map-left-out", "map-coarser", "flagged", "imu-axes"}
     | {"imu-contradicted", "session"}
 )
 
@@ -317,6 +317,8 @@ def _left_out(figures: Figures) -> list[Finding]:
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
         out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
+    if figures.report.get("map_coarser"):
+        out.append(Finding("look", "map-coarser", str(figures.report["map_coarser"])))
     out += _flagged(figures)
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
