@@ -29,7 +29,7 @@ from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.lidar_odometry.cells import evenly
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam.frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
-from graphslam.frontends.lidar_odometry.odometry import MAPPED, LidarOdometry, Seen
+from graphslam.frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, Seen
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.exits import relative_covariance
 
@@ -168,7 +168,7 @@ class LidarFrontEnd(FrontEnd):
         self._made[:] = [feed, seen, unit]
         config = self.config.submap
         kept: list[Follow] = []
-        k, key, way, told = -1, 0, 0.0, False
+        k, key, way, told, mapped, most = -1, 0, 0.0, False, False, 0
         while True:
             while not feed.ended and (feed.count(name) <= k + 2 or not unit.reaches(feed.part(name, k + 1, k + 2))):
                 yield None
@@ -178,6 +178,7 @@ class LidarFrontEnd(FrontEnd):
             clouds = self._checked(name, feed.part(name, k, k + 1))
             unit.hear(float(clouds.times[0]))
             seen.append(self._follow(odometry, clouds, 0))
+            mapped, most = mapped or seen[-1].seen.state in MAPPED, max(most, seen[-1].seen.points)
             feed.let_go(name, k + 1)
             if k == 0:
                 odometry.errors.begin()
@@ -196,6 +197,14 @@ class LidarFrontEnd(FrontEnd):
                     yield _submap((name, unit.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
                 kept, key, way = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
+        if scans and not mapped:
+            c = self.config.odometry
+            raise DataError(
+                "no scan has points enough to be followed",
+                where=f"{feed.name}/{name}",
+                got=f"{scans} scans, of which the fullest has {most} points {c.min_range:g} to {c.max_range:g} m away",
+                wanted=f"at least {FEW} points, in metres",
+            )
         if key == 0:
             raise DataError("too few scans for a submap", where=f"{feed.name}/{name}", got=scans, wanted="at least 2")
 
@@ -424,7 +433,8 @@ def _submap(
         origins.append(se3.se3_transform(T, origin))
     states = Counter(f.seen.state for f in kept[int(key > 0) :])
     overlaps = [f.seen.overlap for f in kept if np.isfinite(f.seen.overlap)]
-    lost = states["lost"] + states["empty"]
+    # nothing holds a scan that is lost, nor one of which the map tells nothing yet
+    lost = sum(f.seen.unheld == 6 for f in kept[int(key > 0) :])
     report: dict[str, Any] = {
         "ended": ended,
         "scans": len(kept) - 1,

@@ -71,6 +71,8 @@ LASTING = 4.0
 residuals. Found on simulated lidars (`tests/frontends/lidar_odometry`)."""
 ACCELERATION = (3.0, 2.0)
 """What speeds may change by, beside what was seen lately [rad/s²], [m/s²]: a hand-held lidar, a car that brakes."""
+LONGEST = 30.0
+"""Of a longer time nothing less is known than of this [s]: a kilometre either way."""
 GIVEN_UP = 10
 """Scans lost in a row after which a new map begins."""
 
@@ -344,16 +346,17 @@ class LidarOdometry:
         if self.scan == 0:
             return
         self.loose = self.loose + 1 if fit is None or seen.unheld else 1
+        dt = min(dt, LONGEST)
         turn2, shift2 = np.mean(self.missed, axis=0) if self.missed else (0.0, 0.0)
         turn2 = max(turn2, (0.5 * ACCELERATION[0] * dt**2) ** 2, 1e-6)
         shift2 = max(shift2, (0.5 * ACCELERATION[1] * dt**2) ** 2, 1e-6)
         self.spread = np.diag([turn2] * 3 + [shift2] * 3)
         # a speed that nothing holds is off for as long as nothing holds it
         Q = self.loose**2 * self.spread
-        if fit is None or not self.errors.ends:
-            H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
-        else:
+        H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
+        if fit is not None and self.errors.ends and fit.overlap > 0:
             H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
+        if M.any():  # or no cell of the finest tells anything of this scan
             M *= np.interp(fit.misfit, *SPREADS)
             # how far residuals of a whole part of the scan agree, beside what those of one cell would
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
