@@ -356,7 +356,7 @@ class LidarOdometry:
         H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
         if fit is not None and self.errors.ends and fit.overlap > 0:
             H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
-        if M.any():  # or no cell of the finest tells anything of this scan
+        if fit is not None and M.any():  # or no cell of the finest tells anything of this scan
             M *= np.interp(fit.misfit, *SPREADS)
             # how far residuals of a whole part of the scan agree, beside what those of one cell would
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
