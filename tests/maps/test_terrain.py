@@ -14,12 +14,12 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryE
 from graphslam.core.geometry import Array
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.terrain.learning import fit_weights, ratios_of
+from graphslam.maps.terrain.learning import fit_calibration, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
 from graphslam.maps.terrain.plan import cost_map, plan_way, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
-from graphslam.maps.terrain.tables import BINS, Tables, dampened, fixed_tables, noisy_or, read_tables
+from graphslam.maps.terrain.tables import BINS, Tables, calibrated, dampened, fixed_tables, noisy_or, read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 from graphslam.sim.street import StreetRobot, draw_street, drive_street
 from tests.reference.plain_terrain import plain_rows
@@ -28,7 +28,7 @@ H = 1.1
 ELEVATION = np.deg2rad(-65.0 + 0.5 * np.arange(181))
 SENSOR, VEHICLE = LineSensor(), Vehicle()
 BOX = (-2.0, -2.0, 14.0, 2.0)
-FIXED = np.array([-3.0, 0.0, 8.0, -3.0, 0.0, 8.0, 0.7])
+FIXED = np.array([-3.0, 0.0, 8.0, -3.0, 0.0, 8.0, 0.7, 0.0, 1.0])
 DRIVEN = Tables(fixed_tables(4, 0.85, 0.4), np.array([FIXED] * 4), FIXED, 0.5, {})
 
 
@@ -204,7 +204,9 @@ def test_classes() -> None:
     assert classes[5.05] is TerrainClass.OBSTACLE
     assert classes[7.05] is TerrainClass.UNKNOWN
     assert abs(found.ground[iy, math.floor((4.05 - found.origin[0]) / 0.1)] - 0.12) < 0.01
-    assert found.provisional[iy, math.floor((4.55 - found.origin[0]) / 0.1)] == (SENSOR.hole_reach(VEHICLE) <= 3.55)
+    assert SENSOR.hole_reach(VEHICLE, VEHICLE.clearance) < SENSOR.band_edges()[0]
+    assert found.provisional[iy, math.floor((4.55 - found.origin[0]) / 0.1)]
+    assert not found.provisional[iy, math.floor((2.05 - found.origin[0]) / 0.1)]
 
 
 def test_sums_do_not_depend_on_the_order_and_pyramids_add() -> None:
@@ -236,13 +238,20 @@ def test_bands_end_where_beams_are_a_cell_apart() -> None:
     assert np.allclose(edges[:3] ** 2 * SENSOR.beam_step / SENSOR.height, CELLS[:3])
     assert edges[3] == pytest.approx(12.05, abs=0.01)
     assert SENSOR.hole_reach(VEHICLE) == pytest.approx(4.105, abs=1e-3)
-    speed = SENSOR.speed_bound(VEHICLE)
-    assert speed * SENSOR.sweep_time + VEHICLE.braking_distance(speed) == pytest.approx(SENSOR.hole_reach(VEHICLE))
+    for depth in (0.25, 0.3, 1.0):
+        reach = SENSOR.hole_reach(VEHICLE, depth)
+        down = reach * depth / SENSOR.height  # from the edge to where the beam over it meets the ground below
+        assert depth - math.tan(VEHICLE.max_slope) * down == pytest.approx(VEHICLE.climbable_step)
+        speed = SENSOR.speed_bound(VEHICLE, depth)
+        way = speed * SENSOR.sweep_time + VEHICLE.braking_distance(speed) + 0.5 * VEHICLE.width
+        assert way == pytest.approx(reach)
+    assert SENSOR.speed_bound(VEHICLE) == SENSOR.speed_bound(VEHICLE, VEHICLE.clearance)
+    assert SENSOR.hole_reach(VEHICLE, 0.05) == SENSOR.speed_bound(VEHICLE, 0.05) == 0.0
     assert VEHICLE.braking_distance(VEHICLE.safe_speed(3.0)) == pytest.approx(3.0)
 
 
 def test_probability_is_a_noisy_or() -> None:
-    w = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.5])
+    w = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.5, 0.0, 1.0])
     zero = np.zeros((2, 1))
 
     def p(ratios: Array, *counts: int) -> float:
@@ -255,9 +264,24 @@ def test_probability_is_a_noisy_or() -> None:
     assert dampened(np.array(1e6)) == pytest.approx(5.0, rel=1e-4)  # many lines count as five
 
 
+def test_a_calibrated_probability_is_as_often_right_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    p = rng.random(60_000)
+    hazard = rng.random(60_000) < calibrated(p, 0.8, 1.5)
+    u, v = fit_calibration(p, hazard)
+    assert u == pytest.approx(0.8, abs=0.05)
+    assert v == pytest.approx(1.5, abs=0.05)
+    for low in (0.1, 0.4, 0.7):
+        q = calibrated(p, u, v)
+        some = (q > low) & (q < low + 0.2)
+        assert np.mean(hazard[some]) == pytest.approx(float(q[some].mean()), abs=0.02)
+    assert calibrated(np.array([0.3]), 0.0, 1.0)[0] == pytest.approx(0.3)
+    assert np.isnan(calibrated(np.array([np.nan]), 0.0, 1.0)[0])
+
+
 def test_weights_are_found_again() -> None:
     rng = np.random.default_rng(2)
-    w = np.array([-2.0, 0.3, 0.8, -3.0, -0.2, 1.2, 0.6])
+    w = np.array([-2.0, 0.3, 0.8, -3.0, -0.2, 1.2, 0.6, 0.0, 1.0])
     counts = np.stack([*rng.poisson(2.0, (2, 40_000)), rng.poisson(0.3, 40_000)])
     ratios = rng.normal(0, 2, (2, 40_000)) * counts[:2]
     hazard = rng.random(40_000) < noisy_or(ratios, counts, w)
@@ -295,7 +319,7 @@ def test_tables_of_the_package_and_their_file(tmp_path: Path) -> None:
     assert np.array_equal(again.ratios, tables.ratios)
     text = (tmp_path / "t.json").read_text()
     for old, new, said_ in (
-        ('"graphslam.terrain-tables/1"', '"other/1"', "unknown format"),
+        ('"graphslam.terrain-tables/2"', '"other/1"', "unknown format"),
         (f'"threshold": {tables.threshold}', '"threshold": 2.0', "do not fit"),
         ('"support"', '"supports"', "missing"),
     ):

@@ -132,7 +132,7 @@ def doctor(as_json: bool = JSON) -> None:
 
 def terrain_tables(
     out: Path = typer.Option(..., help="File to write the tables to (.json)."),
-    drives: int = typer.Option(5, help="Number of simulated drives towards each kind of target."),
+    drives: int = typer.Option(10, help="Number of simulated drives towards each kind of target."),
     seed: int = typer.Option(10_000, help="Seed of the first drive; the others follow."),
     as_json: bool = JSON,
 ) -> None:

@@ -135,6 +135,7 @@ def conditions(configs: dict[str, TerrainTrialConfig], worlds: list[str]) -> pd.
                 "braking [m/s²]": v.deceleration,
                 "braking distance at 1 m/s [m]": v.braking_distance(1.0),
                 "holes are seen up to [m]": s.hole_reach(v),
+                f"falls of {v.clearance:g} m up to [m]": s.hole_reach(v, v.clearance),
                 "speed bound [m/s]": s.speed_bound(v),
                 "two beams on 10 cm up to [m]": s.step_reach(0.1),
                 "learnt on seeds": ", ".join(str(k) for k in tables.provenance.get("seeds", [])),

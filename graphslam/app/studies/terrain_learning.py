@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from graphslam.app.studies.terrain_trial import (
 )
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.maps.terrain.learning import count_values, fit_weights, ratios_of
+from graphslam.maps.terrain.learning import count_values, fit_calibration, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
 from graphslam.maps.terrain.lines import Rows, lines_of_scans
 from graphslam.maps.terrain.pyramid import Pyramid
@@ -36,7 +36,9 @@ FIRST_SEED = 10_000
 """Of the teaching drives; test drives have the seeds of their study."""
 ASKED = (7.0, 4.5, 2.0)
 """Distances to the target at which the cells of a drive are taken [m]."""
-CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
+JUDGED = 11.0
+"""So far from the sensor cells teach, and are judged in a study [m]."""
+CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 RAMP_ROUND = 0.4
 """Cells so near before the foot and behind the top of a ramp go with it [m]: as wide as the widest but one."""
 MOST_FALSE = 0.03
@@ -57,9 +59,23 @@ class Drive:
     """Columns of the cells of each band that lie on or beside a legal ramp ``(nx,)``."""
 
 
+class LabelledCells(NamedTuple):
+    """Cells of a band and their truth."""
+
+    ratios: Array
+    """Sums of ratios of steps and of support ``(2, k)``."""
+    counts: Array
+    """Statements about steps, about support, and lines that saw something hang ``(3, k)``."""
+    hazard: npt.NDArray[np.bool_]
+    slope: npt.NDArray[np.bool_]
+    """Free cells on a slope that may be driven ``(k,)``."""
+    probability: Array
+    """That the map gives to them ``(k,)``."""
+
+
 def learn_tables(
     *,
-    seeds: Sequence[int] = tuple(range(FIRST_SEED, FIRST_SEED + 5)),
+    seeds: Sequence[int] = tuple(range(FIRST_SEED, FIRST_SEED + 10)),
     targets: Sequence[str] = tuple(TARGETS),
     config: TerrainTrialConfig | None = None,
     progress: bool = True,
@@ -107,8 +123,14 @@ def learn_tables(
         kept_wide.append(Drive(target, _until(wide_rows, ends), places, flat, _on_ramp(street, wide)))
     ratios = ratios_of(histograms)
     learnt = Tables(ratios, np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
-    weights = np.array([fit_weights(*of) for of in labelled_cells(kept, learnt, c)])
-    single = fit_weights(*labelled_cells(kept_wide, learnt, c, SINGLE)[0])
+    cells, wide_cells = labelled_cells(kept, learnt, c), labelled_cells(kept_wide, learnt, c, SINGLE)
+    weights = np.array([fit_weights(of.ratios, of.counts, of.hazard, of.slope) for of in cells])
+    of = wide_cells[0]
+    single = fit_weights(of.ratios, of.counts, of.hazard, of.slope)
+    learnt = Tables(ratios, weights, single, 0.5, {})
+    cells, wide_cells = labelled_cells(kept, learnt, c), labelled_cells(kept_wide, learnt, c, SINGLE)
+    for row, of in zip([*weights, single], [*cells, wide_cells[0]]):
+        row[-2:] = fit_calibration(of.probability, of.hazard)
     learnt = Tables(ratios, weights, single, 0.5, {})
     rates = false_alarms(kept, learnt, c)
     good = [t for t in CANDIDATES if rates[t][0] <= MOST_FALSE and rates[t][1] <= MOST_FALSE_FLAT]
@@ -131,7 +153,7 @@ def learn_tables(
 
 
 def write_learnt_tables(
-    path: str | Path, *, drives: int = 5, first_seed: int = FIRST_SEED, progress: bool = True
+    path: str | Path, *, drives: int = 10, first_seed: int = FIRST_SEED, progress: bool = True
 ) -> Tables:
     """Learn the tables of the simulated robot and write them."""
     if drives < 1:
@@ -184,22 +206,30 @@ def _pyramids(
 
 def labelled_cells(
     kept: list[Drive], tables: Tables, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
-) -> list[tuple[Array, Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
-    """Of every band: sums of ratios, numbers of statements, the truth of its cells and which free ones lie on a legal
-    slope, at all distances asked.
+) -> list[LabelledCells]:
+    """Of every band: cells for which it speaks of steps, ahead of the sensor and within 11 m, at all distances asked.
 
     Of cells with a wire, only those in which a beam met it.
     """
     parts: list[list[tuple[Array, ...]]] = [[] for _ in range(tables.bands)]
-    for pyramid, drive, _ in _pyramids(kept, tables, c, cells):
+    for pyramid, drive, place in _pyramids(kept, tables, c, cells):
+        found = pyramid.classify()
         for b, truth in enumerate(drive.labels):
             counts, ratios = pyramid.band_of(pyramid.counts, b), pyramid.band_of(pyramid.ratios, b) / SCALE
-            judged = (truth >= 0) & (counts[: OVERHANG + 1].sum(axis=0) > 0)
+            k = round(float(pyramid.cells[b] / pyramid.cells[0]))
+            x, y = (
+                (pyramid.first[b, axis] + np.arange(pyramid.shapes[b, 1 - axis]) + 0.5) * pyramid.cells[b]
+                for axis in (0, 1)
+            )
+            near = (x[None] > place) & (np.hypot(x[None] - place, y[:, None]) < JUDGED)
+            judged = (truth >= 0) & (found.band[::k, ::k] == b) & near
             if drive.target.startswith("wire"):  # a wire between two beams teaches nothing
                 judged &= (truth != OBSTACLE) | (counts[OVERHANG] > 0)
             slope = (truth == 0) & drive.slopes[b]
-            parts[b].append((ratios[:, judged], counts[: OVERHANG + 1, judged], truth[judged] > 0, slope[judged]))
-    return [tuple(np.concatenate(part, axis=-1) for part in zip(*of)) for of in parts]  # type: ignore[misc]
+            p = found.probability[::k, ::k]
+            of = (ratios[:, judged], counts[: OVERHANG + 1, judged], truth[judged] > 0, slope[judged], p[judged])
+            parts[b].append(of)
+    return [LabelledCells(*(np.concatenate(part, axis=-1) for part in zip(*of))) for of in parts if of]
 
 
 def false_alarms(kept: list[Drive], tables: Tables, c: TerrainTrialConfig) -> dict[float, tuple[float, float]]:

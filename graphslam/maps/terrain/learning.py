@@ -63,7 +63,7 @@ def fit_weights(
     hazard: npt.NDArray[np.bool_],
     slope: npt.NDArray[np.bool_] | None = None,
 ) -> Array:
-    """Weights ``(7,)`` of one band by maximum likelihood.
+    """Weights ``(9,)`` of one band by maximum likelihood, not yet calibrated.
 
     Legal slopes count as much as all even ground, however rare they were.
 
@@ -96,7 +96,7 @@ def fit_weights(
         share[slope], share[even] = _SLOPES * free.sum() / slope.sum(), (1.0 - _SLOPES) * free.sum() / even.sum()
 
     def weights(x: Array) -> Array:
-        return np.array([x[0], x[1], np.exp(x[2]), x[3], x[4], np.exp(x[5]), np.exp(x[6])])
+        return np.array([x[0], x[1], np.exp(x[2]), x[3], x[4], np.exp(x[5]), np.exp(x[6]), 0.0, 1.0])
 
     def cost(x: Array) -> float:
         p = np.clip(noisy_or(ratios, counts, weights(x)), 1e-6, 1.0 - 1e-6)
@@ -107,3 +107,26 @@ def fit_weights(
     # a single line that saw something hang is never certain of it
     bounds = [(-8, -1), (-3, 3), (-4, 2), (-8, -1), (-3, 3), (-4, 2), (-4, math.log(2.0))]
     return weights(minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10, "gtol": 1e-8}).x)
+
+
+def fit_calibration(probability: Array, hazard: npt.NDArray[np.bool_]) -> Array:
+    """Weights ``u, v`` of :func:`~graphslam.maps.terrain.tables.calibrated` by maximum likelihood, ``v > 0``.
+
+    The noisy-OR was fitted to cells in which slopes weigh more than they are many; here every cell counts once.
+
+    Parameters
+    ----------
+    probability : (k,)
+        That the noisy-OR gives to cells.
+    hazard : (k,) bool
+        The truth.
+    """
+    p = np.clip(probability, 1e-4, 1.0 - 1e-4)
+    odds = np.log(p / (1.0 - p))
+
+    def cost(x: Array) -> float:
+        z = x[0] + np.exp(x[1]) * odds
+        return float(np.mean(np.logaddexp(0.0, z) - hazard * z)) + 1e-5 * float(x @ x)
+
+    u, log_v = minimize(cost, np.zeros(2), method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-9}).x
+    return np.array([u, np.exp(log_v)])

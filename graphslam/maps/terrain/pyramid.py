@@ -19,7 +19,7 @@ from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, add_rows
 from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
-from graphslam.maps.terrain.tables import SCALE, Tables, hazard_factors
+from graphslam.maps.terrain.tables import SCALE, Tables, calibrated, hazard_factors
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 
 Box = tuple[float, float, float, float]
@@ -196,7 +196,7 @@ class Pyramid:
         return own if k == 1 else own.repeat(k, axis=-2).repeat(k, axis=-1)
 
     def weights_of(self, b: int) -> Array:
-        """Weights ``(7,)`` of band ``b``, or of a map of a single resolution."""
+        """Weights ``(9,)`` of band ``b``, or of a map of a single resolution."""
         return self.tables.single if self.single else self.tables.weights[b]
 
     def classify(self, threshold: float | None = None) -> TerrainMap:
@@ -247,7 +247,9 @@ class Pyramid:
             rough[fresh] = bend[fresh] / number[fresh] / 1000.0
         # what is seen of a cell only high above it says nothing of its ground
         any_known = known.any(axis=0)
-        probability = np.where(any_known, 1.0 - free.prod(axis=0), np.nan)
+        speaks = np.where(band >= 0, band, np.where(support_band >= 0, support_band, self.bands - 1))
+        u, v = np.array([self.weights_of(b)[-2:] for b in range(self.bands)]).T
+        probability = np.where(any_known, calibrated(1.0 - free.prod(axis=0), u[speaks], v[speaks]), np.nan)
         classes = np.full((ny, nx), TerrainClass.UNKNOWN, np.int8)
         classes[any_known] = TerrainClass.FREE
         classes[any_known & above] = TerrainClass.ABOVE_REACH
@@ -257,7 +259,7 @@ class Pyramid:
         classes[hazard & (kind == 0) & self._steep(ground)] = TerrainClass.STEEP
         classes[hazard & (kind == 1)] = TerrainClass.HOLE
         classes[hazard & (kind == 2)] = TerrainClass.OBSTACLE
-        reach = self.sensor.hole_reach(self.vehicle)
+        reach = self.sensor.hole_reach(self.vehicle, self.vehicle.clearance)
         far = np.concatenate([[0.0], self.edges[:-1]])  # where each band begins
         near = (support_band >= 0) & (far[np.maximum(support_band, 0)] < reach)
         provisional = any_known & ~hazard & ~near

@@ -17,12 +17,12 @@ from graphslam.core.atomic import read_json, write_json
 from graphslam.core.errors import ConfigError, FormatError
 from graphslam.core.geometry import Array
 
-FORMAT = "graphslam.terrain-tables/1"
+FORMAT = "graphslam.terrain-tables/2"
 BINS = 48
 """Of 1 cm; the last one holds all that is more."""
 SCALE = 256
 """Ratios are stored as whole numbers in units of 1/256, so that sums do not depend on their order."""
-WEIGHTS = 7
+WEIGHTS = 9
 """Of a band."""
 DEFAULT = Path(__file__).with_name("tables.json")
 Ints = npt.NDArray[np.int64]
@@ -36,9 +36,9 @@ class Tables:
     ----------
     ratios : (2, b, 48) int32
         Log-likelihood ratios of a step [cm] and of missing support [cm], hazard against free, in units of 1/256.
-    weights : (b, 7)
-        Of every band ``p, a0, a1, q, b0, b1, c``; see `hazard_factors`.
-    single : (7,)
+    weights : (b, 9)
+        Of every band ``p, a0, a1, q, b0, b1, c``, see `hazard_factors`, and ``u, v``, see `calibrated`.
+    single : (9,)
         The same for a map of a single resolution.
     threshold : float
         Probability above which a cell is not driven, fixed on the drives that the tables were learnt on.
@@ -143,9 +143,9 @@ def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
         Sums of log-likelihood ratios of steps and of support.
     counts : (3, ...)
         Statements about steps, about support, and lines that saw something at the height of the vehicle.
-    weights : (7,)
+    weights : (9,)
     """
-    p, a0, a1, q, b0, b1, c = weights
+    p, a0, a1, q, b0, b1, c = weights[:7]
     out = np.ones(counts.shape)
     for k, (prior, shift, slope) in enumerate(((p, a0, a1), (q, b0, b1))):
         n = counts[k].astype(np.float64)
@@ -158,3 +158,17 @@ def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
 def noisy_or(ratios: Array, counts: Array, weights: Array) -> Array:
     """Probability ``(...)`` of a hazard: that not all of `hazard_factors` hold."""
     return np.asarray(1.0 - hazard_factors(ratios, counts, weights).prod(axis=0))
+
+
+def calibrated(p: Array, u: Array | float, v: Array | float) -> Array:
+    """Probability whose log-odds are ``u + v · log-odds(p)``: as often a hazard as it says (Platt's scaling).
+
+    Parameters
+    ----------
+    p : (...)
+        Of the noisy-OR, NaN where nothing is known; taken to be 0.0001 at least and 0.9999 at most.
+    u, v : (...)
+        The last two weights.
+    """
+    q = np.clip(p, 1e-4, 1.0 - 1e-4)
+    return np.asarray(1.0 / (1.0 + np.exp(-(u + v * np.log(q / (1.0 - q))))))

@@ -92,9 +92,20 @@ class LineSensor:
         edges[-1] *= 1.2
         return edges
 
-    def hole_reach(self, vehicle: Vehicle) -> float:
-        """Range [m] beyond which a hole looks like a slope that may be driven: ``H / tan α``."""
-        return self.height / math.tan(vehicle.max_slope)
+    def hole_reach(self, vehicle: Vehicle, depth: float = math.inf) -> float:
+        """Range [m] within which a fall of this depth does not look like a slope that may be driven.
+
+        A beam that passes the edge at range ``r`` meets the ground below ``r · depth / H`` farther on. The steepest
+        slope α that may be driven leads ``tan α`` times that down. The rest, ``depth · (1 − r tan α / H)``, tells a
+        fall when it is more than the vehicle climbs: ``r = H / tan α · (1 − step / depth)``.
+
+        Parameters
+        ----------
+        vehicle : Vehicle
+        depth : float
+            [m]; without end by default, which is the limit for any fall.
+        """
+        return self.height / math.tan(vehicle.max_slope) * max(1.0 - vehicle.climbable_step / depth, 0.0)
 
     def step_reach(self, height: float, beams: float = 2.0) -> float:
         """Range [m] within which so many beams meet a riser of this height: ``b / (k δ)``."""
@@ -104,11 +115,20 @@ class LineSensor:
         """How deep [m] one sees into a hole of this length from this distance: ``L H / r``."""
         return length * self.height / distance
 
-    def speed_bound(self, vehicle: Vehicle) -> float:
-        """Highest speed [m/s] from which the vehicle stops before a hole: the last look was a sweep ago."""
-        reach, low, high = self.hole_reach(vehicle), 0.0, 20.0
-        for _ in range(60):
-            speed = 0.5 * (low + high)
-            fits = speed * self.sweep_time + vehicle.braking_distance(speed) <= reach
-            low, high = (speed, high) if fits else (low, speed)
-        return low
+    def speed_bound(self, vehicle: Vehicle, depth: float | None = None) -> float:
+        """Highest speed [m/s] from which the vehicle stops before a fall.
+
+        The last look at a place may be a sweep ago, and then the place was just out of reach. So the way of a sweep,
+        the braking distance and half the width of the vehicle, by which its front is ahead of the sensor, lie within
+        `hole_reach`.
+
+        Parameters
+        ----------
+        vehicle : Vehicle
+        depth : float, optional
+            Of the fall [m]; default the vehicle's clearance, over which it would hang.
+        """
+        reach = self.hole_reach(vehicle, vehicle.clearance if depth is None else depth) - 0.5 * vehicle.width
+        a = vehicle.deceleration  # v (sweep + reaction) + v² / 2a = reach
+        b = a * (self.sweep_time + vehicle.reaction_time)
+        return max(math.sqrt(b**2 + 2.0 * a * max(reach, 0.0)) - b, 0.0)
