@@ -12,15 +12,13 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from graphslam.app.memory import MemoryProbe
-from graphslam.core.errors import DataError, UnknownNameError
+from graphslam.core.errors import DataError
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.submap import Submap
-from graphslam.evaluate.consistency import consistency_index, joint_nees, vector_pose_error
+from graphslam.core.poses import group_of
+from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error, vector_pose_error
 from graphslam.evaluate.map_error import match_ids
 from graphslam.join.association import Association
-from graphslam.join.polish import polish as polish_join
-from graphslam.join.registry import JOINERS, SOLVERS, association_of, identify
-from graphslam.join.submap_blocks import scale_covariances
+from graphslam.join.registry import Material, association_of, identify, methods_for, prepared
 from graphslam.join.submap_solver import SubmapEstimate
 
 logger = logging.getLogger(__name__)
@@ -28,8 +26,20 @@ logger = logging.getLogger(__name__)
 DEFAULT_METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
 JSON_COLUMNS = (
     *("method", "objective", "objective_polished", "seconds", "peak_mb", "states", "landmarks", "nnz"),
-    *("nees", "nees_dof", "ci"),
+    *("dof", "nees_unpolished", "nees", "nees_dof", "ci_unpolished", "ci"),
 )
+
+
+def default_methods(submaps: Material) -> tuple[str, ...]:
+    """All five, but no dense filter where it has no room."""
+    if isinstance(submaps, Sequence):
+        return DEFAULT_METHODS
+    from graphslam.join.pose_ekf import MOST
+
+    if submaps.states <= MOST:
+        return DEFAULT_METHODS
+    logger.warning("no EKF: %d states are more than the %d that a dense filter has room for", submaps.states, MOST)
+    return tuple(m for m in DEFAULT_METHODS if m != "ekf")
 
 
 def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[float, int]:
@@ -58,15 +68,25 @@ def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> 
 
 def _errors(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[np.ndarray, np.ndarray]:
     """Errors of all scalars of known truth, and where they stand in the state vector."""
+    exits = getattr(estimate, "exits", None)
+    if exits is not None:  # of dense submaps: in the right tangents of their exits
+        i, j = match_ids(np.asarray(keys), truth.keys)
+        rows, have = exits[i], truth.exit_poses[j]
+        if have.shape[1] != estimate.poses.shape[1]:
+            raise DataError(
+                "truth is of another dimension", got=have.shape, wanted=(len(have), estimate.poses.shape[1])
+            )
+        d = group_of(have).dof
+        return pose_error(estimate.poses[rows], have).ravel(), (d * (rows[:, None] - 1) + np.arange(d)).ravel()
     if truth.exit_poses.shape[1] != 3:
         raise DataError("truth is not two-dimensional", got=truth.exit_poses.shape, wanted="(m, 3)")
     m = len(estimate.poses) - 1
     i, j = match_ids(np.asarray(keys), truth.keys)
-    pose_error = vector_pose_error(estimate.poses[1 + i], truth.exit_poses[j])
+    ends = vector_pose_error(estimate.poses[1 + i], truth.exit_poses[j])
     a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
     landmark_error = truth.landmarks[b] - estimate.landmarks[a]
     at = [(3 * i[:, None] + np.arange(3)).ravel(), (3 * m + 2 * a[:, None] + np.arange(2)).ravel()]
-    return np.concatenate([pose_error.ravel(), landmark_error.ravel()]), np.concatenate(at)
+    return np.concatenate([ends.ravel(), landmark_error.ravel()]), np.concatenate(at)
 
 
 def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:
@@ -74,19 +94,21 @@ def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None
         return {"nees": None, "nees_dof": None, "ci": None, "rmse_poses": None, "rmse_landmarks": None}
     d2, dof = map_nees(estimate, keys, truth)
     error, known = _errors(estimate, keys, truth)
-    pose = (known < 3 * len(keys)) & (known % 3 < 2)
-    landmark = known >= 3 * len(keys)
+    g = group_of(estimate.poses)
+    poses = g.dof * (len(estimate.poses) - 1)
+    position = (known < poses) & np.isin(known % g.dof, np.arange(g.dof)[g.position])
+    landmark = known >= poses
     return {
         "nees": d2,
         "nees_dof": dof,
         "ci": float(consistency_index(d2, dof)),
-        "rmse_poses": math.sqrt(2.0 * float(np.mean(error[pose] ** 2))) if pose.any() else None,
-        "rmse_landmarks": math.sqrt(2.0 * float(np.mean(error[landmark] ** 2))) if landmark.any() else None,
+        "rmse_poses": math.sqrt(g.dim * float(np.mean(error[position] ** 2))) if position.any() else None,
+        "rmse_landmarks": math.sqrt(g.dim * float(np.mean(error[landmark] ** 2))) if landmark.any() else None,
     }
 
 
 def compare(
-    submaps: Sequence[Submap],
+    submaps: Material,
     methods: Sequence[str] = DEFAULT_METHODS,
     *,
     truth: MapTruth | None = None,
@@ -100,11 +122,13 @@ def compare(
 
     Parameters
     ----------
-    submaps : sequence of Submap
+    submaps : sequence of Submap, or PoseProblem
+        See :func:`join`.
     methods : sequence of str
         See :func:`join`.
     truth : MapTruth, optional
-        Gives NEES, its dimension, CI (eq. 20) and root-mean-square errors, all in the gauge "first base fixed".
+        Gives NEES, its dimension, CI (eq. 20) and root-mean-square errors, all in the gauge "first base fixed"; of
+        dense submaps those of their exits, in right tangents.
     polish : bool
         Take every method on to the least-squares optimum.
     associate, covariance_scale
@@ -120,34 +144,36 @@ def compare(
     pandas.DataFrame
         ``objective`` is that of the method itself, ``objective_polished`` that of the optimum reached from it.
         ``nees``, ``ci`` and the errors judge the map that is handed over: the polished one where there is a polish;
-        ``nees_unpolished`` the joiner's own. ``seconds`` is wall time, polish included; ``nnz`` the stored entries of
-        the information matrix (of the dense covariance for an unpolished EKF).
+        ``nees_unpolished`` and ``ci_unpolished`` the method's own. ``dof`` are the scalars measured less the free ones.
+        ``seconds`` is wall time, polish included; ``nnz`` the stored entries of the information matrix (of the dense
+        covariance for an unpolished EKF).
     """
-    unknown = [m for m in methods if m not in JOINERS and m not in SOLVERS]
-    if unknown:
-        raise UnknownNameError("method", unknown[0], [*JOINERS, *SOLVERS])
+    submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
+    way = methods_for(submaps)
+    for m in methods:
+        way.check(m)
     association = association_of(associate)
-    submaps = list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
-    if association is not None:
+    if association is not None and isinstance(submaps, Sequence):
         submaps = identify(submaps, association, progress=progress)
         # Recognised landmarks have names of their own; only the poses can be held against the truth.
         truth = None if truth is None else _poses_only(truth)
-    keys = [s.key for s in submaps]
+    keys = keys_of(submaps)
     rows = []
     for method in tqdm(methods, desc="compare", unit="method", disable=not progress):
         own: dict[str, Any] = {}
-        if method in JOINERS:
-            joined = JOINERS[method](submaps)
+        if method in way.joiners:
+            joined = way.joiners[method](submaps)
             if polish:
                 own = _judge(joined, keys, truth)
-            estimate: SubmapEstimate = polish_join(submaps, joined) if polish else joined
+            estimate: SubmapEstimate = way.polish(submaps, joined) if polish else joined
         else:
-            estimate = SOLVERS[method](submaps, polish=polish, progress=False)
+            estimate = way.solvers[method](submaps, polish=polish, progress=False)
         rows.append(
             {
-                **_describe(method, estimate),
+                **_describe(method, submaps, estimate),
                 **_judge(estimate, keys, truth),
                 "nees_unpolished": own.get("nees"),
+                "ci_unpolished": own.get("ci"),
                 "iterations": estimate.iterations,
                 "converged": estimate.converged,
             }
@@ -158,7 +184,19 @@ def compare(
     return pd.DataFrame(rows)
 
 
-def _describe(method: str, estimate: SubmapEstimate) -> dict[str, Any]:
+def keys_of(submaps: Material) -> list[int]:
+    """Keys of the submaps."""
+    return [s.key for s in submaps] if isinstance(submaps, Sequence) else submaps.keys.tolist()
+
+
+def dof_of(submaps: Material, estimate: SubmapEstimate) -> int:
+    """Scalars that submaps and their ties measure, less the free ones."""
+    if not isinstance(submaps, Sequence):
+        return submaps.dof
+    return sum(3 + 2 * (0 if s.landmarks is None else len(s.landmarks)) for s in submaps) - estimate.states
+
+
+def _describe(method: str, submaps: Material, estimate: SubmapEstimate) -> dict[str, Any]:
     return {
         "method": method,
         "objective": estimate.objective,
@@ -168,6 +206,7 @@ def _describe(method: str, estimate: SubmapEstimate) -> dict[str, Any]:
         "states": estimate.states,
         "landmarks": len(estimate.landmark_ids),
         "nnz": estimate.nnz,
+        "dof": dof_of(submaps, estimate),
     }
 
 
@@ -189,7 +228,7 @@ def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
             values[name] = None
         elif name == "method":
             values[name] = str(value)
-        elif name in ("states", "landmarks", "nnz", "nees_dof"):
+        elif name in ("states", "landmarks", "nnz", "dof", "nees_dof"):
             values[name] = int(value)
         else:
             values[name] = float(value)
@@ -197,8 +236,25 @@ def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def join_json(
-    submaps: Sequence[Submap], method: str, estimate: SubmapEstimate, *, truth: MapTruth | None = None
+    submaps: Material,
+    method: str,
+    estimate: SubmapEstimate,
+    *,
+    truth: MapTruth | None = None,
+    own: SubmapEstimate | None = None,
 ) -> dict[str, list[dict[str, Any]]]:
-    """One joined map in the same form as :func:`methods_json`; memory is not measured."""
-    row = {**_describe(method, estimate), **_judge(estimate, [s.key for s in submaps], truth)}
+    """One joined map in the same form as :func:`methods_json`; memory is not measured.
+
+    Parameters
+    ----------
+    own : SubmapEstimate, optional
+        The map before its refinement.
+    """
+    before = {} if own is None else _judge(own, keys_of(submaps), truth)
+    row = {
+        **_describe(method, submaps, estimate),
+        **_judge(estimate, keys_of(submaps), truth),
+        "nees_unpolished": before.get("nees"),
+        "ci_unpolished": before.get("ci"),
+    }
     return {"methods": [_json_row(row)]}

@@ -22,13 +22,14 @@ from types import TracebackType
 
 import graphslam
 from graphslam.core.heap import give_back
-from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.registry import join
+from graphslam.join.registry import Material, join
 
 logger = logging.getLogger(__name__)
 
 _TIMEOUT_S = 3600.0
+_PROBLEM = "problem.npz"
+"""File of dense submaps and their ties."""
 
 
 class MemoryProbe:
@@ -38,18 +39,21 @@ class MemoryProbe:
 
     Parameters
     ----------
-    submaps : sequence of Submap or None
+    submaps : sequence of Submap, PoseProblem or None
         None: measure nothing.
     """
 
-    def __init__(self, submaps: Sequence[Submap] | None) -> None:
+    def __init__(self, submaps: Material | None) -> None:
         self._submaps = submaps if Path("/proc/self/clear_refs").exists() else None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> MemoryProbe:
         if self._submaps is not None:
             self._folder = tempfile.TemporaryDirectory(prefix="graphslam-")
-            write_submaps(self._folder.name, list(self._submaps))
+            if isinstance(self._submaps, Sequence):
+                write_submaps(self._folder.name, list(self._submaps))
+            else:
+                self._submaps.save(Path(self._folder.name) / _PROBLEM)
         return self
 
     def __exit__(
@@ -92,10 +96,19 @@ def _status(field: str) -> int:
     raise ValueError(f"/proc/self/status has no {field}")
 
 
+def _read(folder: Path) -> Material:
+    if not (folder / _PROBLEM).is_file():
+        return read_submaps(folder)
+    from graphslam.join.pose_problem import PoseProblem
+
+    return PoseProblem.load(folder / _PROBLEM)
+
+
 def _measure_here(folder: str, method: str, polish: bool) -> float:
     """Load, settle, reset the high-water mark, join, read the mark [MB]."""
-    submaps = read_submaps(folder)
-    join(submaps[:2], method, polish=polish)  # modules and thread pools that load on first use
+    submaps = _read(Path(folder))
+    first = submaps[:2] if isinstance(submaps, Sequence) else submaps.part(0, min(2, len(submaps.keys)))
+    join(first, method, polish=polish)  # modules and thread pools that load on first use
     gc.collect()
     give_back()  # or the join would reuse it unseen
     before = _status("VmRSS")

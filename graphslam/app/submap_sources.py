@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.app.dense_ties import problem_of_folder, problem_of_run
 from graphslam.app.folders.generations import consistent
 from graphslam.app.run.files import read_options
 from graphslam.app.run.outputs import identified_submaps
@@ -18,7 +19,10 @@ from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.io.catalog import load
+from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import read_truth
+from graphslam.join.pose_problem import PoseProblem
+from graphslam.join.registry import Material, is_dense
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +36,26 @@ class SubmapSource:
         Landmarks only where the submaps' identities are the truth's.
     covariance_scale : float
         Factor that the run used in its own join; 1 elsewhere.
+    problem : PoseProblem or None
+        Dense submaps with all that ties them: a run's matches and loops, a pose-graph file that was cut.
     """
 
     submaps: list[Submap]
     truth: MapTruth | None = None
     covariance_scale: float = 1.0
+    problem: PoseProblem | None = None
+
+    @property
+    def material(self) -> Material:
+        """What is to be joined."""
+        return self.submaps if self.problem is None else self.problem
+
+    @property
+    def times(self) -> list[float]:
+        """Of the nodes of a joined map [s]."""
+        if self.problem is not None:
+            return self.problem.times.tolist()
+        return [s.interval[0] for s in self.submaps] + [self.submaps[-1].interval[1]]
 
     @property
     def identified(self) -> bool:
@@ -52,15 +71,30 @@ def poses_only(truth: MapTruth | None) -> MapTruth | None:
     return replace(truth, landmark_ids=none, landmarks=np.zeros((0, truth.landmarks.shape[1])))
 
 
-def submap_source(source: Run | SubmapSource | str | Path | Sequence[Submap]) -> SubmapSource:
+def submap_source(
+    source: Run | SubmapSource | PoseProblem | str | Path | Sequence[Submap], *, submap_poses: int | None = None
+) -> SubmapSource:
     """Submaps from a run, a run folder, a submap store, a card, or a sequence.
+
+    Parameters
+    ----------
+    source : Run, path, card, sequence of Submap, or PoseProblem
+    submap_poses : int, optional
+        A pose-graph file is cut into submaps of so many poses.
 
     Raises
     ------
-    UnknownNameError, MissingDataError, FormatError
+    UnknownNameError, MissingDataError, FormatError, DataError
     """
     if isinstance(source, SubmapSource):
         return source
+    if isinstance(source, PoseProblem):
+        return SubmapSource([], problem=source)
+    if isinstance(source, Run) and is_dense(source.submaps):
+        if source.graph is not None:
+            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=problem_of_run(source))
+        if source.folder is not None:
+            return submap_source(source.folder)
     if isinstance(source, Run):
         truth = source.truth if source.report.get("identities") == "truth" else poses_only(source.truth)
         return SubmapSource(list(source.submaps), truth, float(source.report.get("covariance_scale", 1.0)))
@@ -70,13 +104,20 @@ def submap_source(source: Run | SubmapSource | str | Path | Sequence[Submap]) ->
     if (path / "submaps").is_dir() or (path / "index.json").is_file():
         root = path if (path / "submaps").is_dir() else path.parent
 
-        def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap]]:
+        def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap], PoseProblem | None]:
             submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
-            return *_run_facts(root), read_truth(files), submaps
+            tied = is_dense(submaps) and (files / "graph.g2o").is_file()
+            problem = problem_of_folder(root, files, submaps) if tied else None
+            return *_run_facts(root), read_truth(files), submaps, problem
 
-        scale, identities, truth, submaps = consistent(root, read)
-        return SubmapSource(submaps, truth if identities != "run" else poses_only(truth), scale)
-    loaded: Any = load(source)
+        scale, identities, truth, submaps, problem = consistent(root, read)
+        known = truth if identities != "run" and problem is None else poses_only(truth)
+        return SubmapSource(submaps, known, scale if problem is None else 1.0, problem)
+    loaded: Any = path if path.is_file() else load(source)
+    if isinstance(loaded, Path) and loaded.is_file():
+        if submap_poses is None:
+            raise MissingDataError(f"{source} holds no submaps; a pose-graph file is cut into some by --submap-poses")
+        return SubmapSource([], problem=PoseProblem.of_network(read_network(loaded), submap_poses))
     if not (isinstance(loaded, list) and loaded and isinstance(loaded[0], Submap)):
         raise MissingDataError(
             f"{source} holds no submaps", got=type(loaded).__name__, wanted="a store, a run or a card of them"

@@ -178,20 +178,23 @@ def refine_path(
 
 def compare(
     source: Run | str | Path | Sequence[Submap],
-    methods: Sequence[str] = comparing.DEFAULT_METHODS,
+    methods: Sequence[str] | None = None,
     *,
     truth: MapTruth | None = None,
+    submap_poses: int | None = None,
     **options: Any,
 ) -> pd.DataFrame:
     """Join the same submaps by several methods: objective, time, memory, non-zeros, and NEES where truth is known.
 
     Parameters
     ----------
-    source : Run, run folder, submap store, card of submaps, or sequence of Submap
+    source : Run, run folder, submap store, card of submaps, pose-graph file, or sequence of Submap
     methods : sequence of str
-        Of ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
+        By default ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
     truth : MapTruth, optional
         Instead of the source's own.
+    submap_poses : int, optional
+        A pose-graph file is cut into submaps of so many poses.
     **options
         See :func:`graphslam.app.compare.compare`.
 
@@ -204,37 +207,50 @@ def compare(
     --------
     >>> gs.compare(run, ["isam2", "eif-tree", "ekf"])
     """
-    s = submap_source(source)
+    s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
+    methods = comparing.default_methods(s.material) if methods is None else methods
     with one_blas_thread():
-        return comparing.compare(s.submaps, methods=methods, truth=truth or s.truth, **options)
+        return comparing.compare(s.material, methods=methods, truth=truth or s.truth, **options)
 
 
-def join_submaps(source: Run | str | Path | Sequence[Submap], method: str = "eif-tree", **options: Any) -> Any:
+def join_submaps(
+    source: Run | str | Path | Sequence[Submap],
+    method: str = "eif-tree",
+    *,
+    polish: bool = True,
+    submap_poses: int | None = None,
+    **options: Any,
+) -> Any:
     """Join submaps into one map by one method.
 
     Parameters
     ----------
-    source : Run, run folder, submap store, card of submaps, or sequence of Submap
+    source : Run, run folder, submap store, card of submaps, pose-graph file, or sequence of Submap
     method : str
         One of :func:`joiners`.
+    polish : bool
+        Go on from the joined map to the least-squares optimum; ``objective`` stays that of the joined map.
+    submap_poses : int, optional
+        A pose-graph file is cut into submaps of so many poses.
     **options
         See :func:`graphslam.join.registry.join`.
 
     Returns
     -------
     SubmapEstimate
-        Poses ``(m + 1, 3)``, landmarks ``(n, 2)`` and their joint information, in the frame of the first base.
+        Poses ``(m + 1, 3)``, landmarks ``(n, 2)`` and their joint information, in the frame of the first base; of
+        submaps without landmarks a :class:`~graphslam.join.pose_estimate.PoseEstimate`.
 
     Examples
     --------
     >>> joined = gs.join_submaps(run, "eif-tree")
     >>> joined.poses[-1]
     """
-    s = submap_source(source)
+    s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
-        return joining.join(s.submaps, method, **options)
+        return joining.join(s.material, method, polish=polish, **options)
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.submap import Submap
@@ -14,6 +15,9 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish as polish_join
 from graphslam.join.submap_blocks import relabel, scale_covariances
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
+
+if TYPE_CHECKING:
+    from graphslam.join.pose_problem import PoseProblem
 
 
 def _isam2(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> SubmapEstimate:
@@ -37,6 +41,67 @@ JOINERS: dict[str, Callable[..., JoinResult]] = {
 SOLVERS: dict[str, Callable[..., SubmapEstimate]] = {"isam2": _isam2, "batch": _batch}
 
 
+Material: TypeAlias = Union[Sequence[Submap], "PoseProblem"]
+"""What is joined: submaps with landmarks or without; or the latter with all their ties, which is no sequence.
+
+(The module of a :class:`~graphslam.join.pose_problem.PoseProblem` loads gtsam, which landmark submaps do not need.)
+"""
+
+
+class Methods(NamedTuple):
+    """The methods of one kind of material: those that filter, those that solve, and the way on to the optimum."""
+
+    joiners: dict[str, Callable[..., Any]]
+    solvers: dict[str, Callable[..., Any]]
+    polish: Callable[[Any, Any], Any]
+
+    def check(self, method: str) -> None:
+        """Refuse an unknown name.
+
+        Raises
+        ------
+        UnknownNameError
+        """
+        if method not in self.joiners and method not in self.solvers:
+            raise UnknownNameError("method", method, [*self.joiners, *self.solvers])
+
+
+def is_dense(submaps: Sequence[Submap]) -> bool:
+    """Whether submaps are to be joined by their poses: those in space, and those of which none has landmarks."""
+    return bool(submaps) and (any(s.dim == 3 for s in submaps) or all(s.landmarks is None for s in submaps))
+
+
+def methods_for(material: Material) -> Methods:
+    """The methods that take landmark submaps, or those that take dense ones."""
+    if not isinstance(material, Sequence):
+        from graphslam.join.pose_estimate import polish_poses
+        from graphslam.join.pose_join import POSE_JOINERS, POSE_SOLVERS
+
+        return Methods(POSE_JOINERS, POSE_SOLVERS, polish_poses)
+    return Methods(JOINERS, SOLVERS, polish_join)
+
+
+def prepared(submaps: Material, *, associate: str | Association = "given", covariance_scale: float = 1.0) -> Material:
+    """Submaps with their covariances as they are to be joined; dense ones with the matches that tie them.
+
+    Raises
+    ------
+    ConfigError, DataError, GeometryError
+    """
+    association = association_of(associate)
+    if isinstance(submaps, Sequence) and not is_dense(submaps):
+        return list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
+    if association is not None:
+        raise ConfigError(f"dense submaps have no landmarks to be associated; got {associate!r}, wanted 'given'")
+    if isinstance(submaps, Sequence):
+        from graphslam.join.pose_problem import PoseProblem
+
+        return PoseProblem.of_submaps(submaps, covariance_scale=covariance_scale)
+    if covariance_scale != 1.0:
+        raise ConfigError("the covariances of dense submaps with ties are those of their graph: wanted scale 1")
+    return submaps
+
+
 def association_of(associate: str | Association) -> Association | None:
     if isinstance(associate, Association):
         return associate
@@ -48,7 +113,7 @@ def association_of(associate: str | Association) -> Association | None:
 
 
 def join(
-    submaps: Sequence[Submap],
+    submaps: Material,
     method: str = "eif-tree",
     *,
     polish: bool = False,
@@ -62,8 +127,9 @@ def join(
 
     Parameters
     ----------
-    submaps : sequence of Submap
-        In order; submap k+1 starts where submap k ends.
+    submaps : sequence of Submap, or PoseProblem
+        In order; submap k+1 starts where submap k ends. Those without landmarks are joined by their poses: with the
+        matches that they carry, or with all ties of a :class:`~graphslam.join.pose_problem.PoseProblem`.
     method : str
         ``eif-tree``, ``eif-sequential`` or ``ekf``: once linearised. ``eif-online``: in sequence, linearised afresh
         when a loop closes or a heading moves. ``batch``, ``isam2``: least squares.
@@ -82,20 +148,28 @@ def join(
     Returns
     -------
     SubmapEstimate
-        A :class:`~graphslam.join.joined_map.JoinResult` for the joiners.
+        A :class:`~graphslam.join.joined_map.JoinResult` for the joiners; of dense submaps a
+        :class:`~graphslam.join.pose_estimate.PoseEstimate`.
 
     Raises
     ------
-    UnknownNameError, ConfigError, DataError, CovarianceError
+    UnknownNameError, ConfigError, DataError, GeometryError, CovarianceError
     """
-    if method not in JOINERS and method not in SOLVERS:
-        raise UnknownNameError("method", method, [*JOINERS, *SOLVERS])
+    submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
+    methods = methods_for(submaps)
+    methods.check(method)
     if (workers is not None or cluster is not None) and method != "eif-tree":
         raise ConfigError(f"only eif-tree can be joined by several workers; got {method!r}")
     if workers is not None and cluster is not None:
         raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
     association = association_of(associate)
-    submaps = list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
+    if not isinstance(submaps, Sequence):
+        if workers is not None or cluster is not None:
+            raise ConfigError("dense submaps are joined in one process; wanted neither workers nor a cluster")
+        if method in methods.solvers:
+            return methods.solvers[method](submaps, polish=polish, progress=progress)
+        found = methods.joiners[method](submaps, progress=progress)
+        return methods.polish(submaps, found) if polish else found
     if method in SOLVERS:
         if association is not None:
             submaps = identify(submaps, association, progress=progress)

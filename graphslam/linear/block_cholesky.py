@@ -35,7 +35,8 @@ class BlockSymbolic:
         Scalars of each node; node i begins at ``sum(width[:i])`` in vectors.
     ptr : (N + 1,)
     neighbours : (nb,)
-        Pairs of nodes that share a block, each at least one way; the diagonal is included.
+        Pairs of nodes that share a block, each at least in the list of the node that is eliminated first; the diagonal
+        is included.
 
     Attributes
     ----------
@@ -78,8 +79,7 @@ class BlockSymbolic:
         ----------
         block : (nb,)
             Where the block of each pair of ``neighbours`` begins in ``value``: rows of the node whose list it is in,
-            columns of the neighbour, row-major. Of a pair that is given both ways the one of the node that is
-            eliminated first is read.
+            columns of the neighbour, row-major. Of a pair the one of the node that is eliminated first is read.
         value : (k,)
         damping : float
 

@@ -411,7 +411,8 @@ def study_folder(root: Path) -> None:
 
 
 def joined(root: Path) -> None:
-    write_joined(root, TIMES, np.zeros((6, 3)), np.arange(4), rng().normal(size=(4, 2)))
+    A = sp.csc_matrix(np.diag(np.arange(1.0, 24.0)))  # 5 free poses, 4 landmarks
+    write_joined(root, TIMES, np.zeros((6, 3)), np.arange(4), rng().normal(size=(4, 2)), information=A)
 
 
 def network(lines: str, name: str, pack: Callable[[bytes], bytes] | None = None) -> Callable[[Path], None]:

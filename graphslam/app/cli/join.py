@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import emit, table, verdict_text
 
-COLUMNS = [
-    *("method", "objective", "objective_polished", "seconds", "peak_mb", "states", "landmarks", "nnz"),
-    *("nees", "nees_dof", "ci"),
-]
+SUBMAP_POSES = typer.Option(
+    None, "--submap-poses", help="Number of poses of a submap, into which a pose-graph file is cut."
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -23,13 +23,13 @@ def register(app: typer.Typer) -> None:
 
 
 def join(
-    source: str = typer.Argument(..., help="Folder of submaps, folder of a run, or name of a card of submaps."),
+    source: str = typer.Argument(
+        ..., help="Folder of submaps, folder of a run, name of a card of submaps, or pose-graph file."
+    ),
     method: str = typer.Option(
         "eif-tree", help="Name of the method: eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."
     ),
-    polish: bool = typer.Option(
-        False, "--polish", help="Continue from the joined map to the least-squares optimum by Gauss-Newton."
-    ),
+    polish: bool = typer.Option(True, help="Continue from the joined map to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."
     ),
@@ -38,38 +38,58 @@ def join(
     ),
     workers: int | None = typer.Option(None, help="Number of processes that share the joins of eif-tree."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the joins of eif-tree."),
+    submap_poses: int | None = SUBMAP_POSES,
     out: Path | None = typer.Option(None, help="Folder for the results joined.npz and nodes.tum."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Join submaps into one map with one method."""
-    from graphslam.app.compare import join_json
+    """Join submaps into one map with one method, refine it, and say whether its covariances are honest."""
+    from graphslam.app.compare import JSON_COLUMNS, join_json
+    from graphslam.app.join_verdict import join_verdict
     from graphslam.app.submap_sources import submap_source
     from graphslam.io.joined_map import write_joined
     from graphslam.join.registry import join as join_by
+    from graphslam.join.registry import methods_for, prepared
 
-    s = submap_source(source)
+    s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
-    estimate = join_by(
-        s.submaps,
+    material = prepared(s.material, associate=associate, covariance_scale=factor)
+    way = methods_for(material)
+    filters = method in way.joiners
+    estimate = own = join_by(
+        material,
         method,
-        polish=polish,
+        polish=polish and not filters,
         associate=associate,
-        covariance_scale=factor,
         workers=workers,
         cluster=cluster,
         progress=not as_json,
     )
+    if polish and filters:
+        estimate = way.polish(material, own)
     truth = s.truth if associate == "given" else None
-    value = join_json(s.submaps, method, estimate, truth=truth)
+    value: dict[str, Any] = join_json(material, method, estimate, truth=truth, own=own if polish and filters else None)
     if out is not None:
-        times = [m.interval[0] for m in s.submaps] + [s.submaps[-1].interval[1]]
-        write_joined(out, times, estimate.poses, estimate.landmark_ids, estimate.landmarks)
-    emit(value, table(value["methods"], COLUMNS), as_json=as_json)
+        write_joined(
+            out,
+            s.times,
+            estimate.poses,
+            estimate.landmark_ids,
+            estimate.landmarks,
+            information=estimate.information,
+            covariance=estimate.covariance,
+            state="vector" if isinstance(material, Sequence) else "tangent",
+        )
+    found = join_verdict(value["methods"][0], estimate, () if s.problem is None else s.problem.left_out)
+    value["verdict"] = [f.as_row() for f in found]
+    text = "\n".join([table(value["methods"], JSON_COLUMNS), *verdict_text(found)])
+    emit(value, text, as_json=as_json)
 
 
 def compare(
-    source: str = typer.Argument(..., help="Folder of submaps, folder of a run, or name of a card of submaps."),
+    source: str = typer.Argument(
+        ..., help="Folder of submaps, folder of a run, name of a card of submaps, or pose-graph file."
+    ),
     methods: str | None = typer.Option(
         None, help="Names of methods, separated by commas. Default: all except eif-online."
     ),
@@ -81,6 +101,7 @@ def compare(
         None, help="Factor on the covariances of the submaps. Default: that of the run."
     ),
     memory: bool = typer.Option(True, help="Measure the peak memory of every method in a process of its own."),
+    submap_poses: int | None = SUBMAP_POSES,
     figure: Path | None = typer.Option(None, help="PNG file for a figure that compares the objectives."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
@@ -89,11 +110,11 @@ def compare(
     from graphslam.app import compare as comparing
     from graphslam.app.submap_sources import submap_source
 
-    s = submap_source(source)
+    s = submap_source(source, submap_poses=submap_poses)
     options: dict[str, Any] = {"covariance_scale": s.covariance_scale if scale is None else scale}
-    names = tuple(m.strip() for m in methods.split(",")) if methods else comparing.DEFAULT_METHODS
+    names = tuple(m.strip() for m in methods.split(",")) if methods else comparing.default_methods(s.material)
     found = comparing.compare(
-        s.submaps,
+        s.material,
         names,
         truth=s.truth,
         polish=polish,
@@ -108,4 +129,4 @@ def compare(
 
         save(plot_comparison(None, found, "objective", log=True, label="objective before polishing"), figure)
     value = comparing.methods_json(found)
-    emit(value, table(value["methods"], COLUMNS), as_json=as_json)
+    emit(value, table(value["methods"], comparing.JSON_COLUMNS), as_json=as_json)

@@ -26,6 +26,16 @@ from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.variables import gtsam_key
 
 
+def between_terms(T_ij: Array, x_i: Array, x_j: Array) -> tuple[Array, Array]:
+    """Residuals ``(m, d)`` and Jacobians ``(m, d, 2 d)`` on (i, j) of relative poses ``(m, 3|7)``, not whitened."""
+    G = group_of(T_ij)
+    h = G.between(x_i, x_j)
+    r = G.log(G.between(T_ij, h))
+    J_j = np.linalg.inv(G.right_jacobian(r))  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
+    J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
+    return r, np.concatenate([J_i, J_j], axis=2)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BetweenRecord:
     """``T_ij`` between two nodes, right-tangent noise.
@@ -125,12 +135,7 @@ class BetweenBatch(UniformBatch):
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""
-        G, (x_i, x_j) = self._group, blocks
-        h = G.between(x_i, x_j)
-        r = G.log(G.between(self._T, h))
-        J_j = np.linalg.inv(G.right_jacobian(r))  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
-        J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
-        return r, np.concatenate([J_i, J_j], axis=2)
+        return between_terms(self._T, *blocks)
 
     @cached_property
     def natives(self) -> list[gtsam.NonlinearFactor]:

@@ -15,7 +15,7 @@ import pytest
 
 from graphslam.app.worlds import simulate
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.joined_map import read_joined
+from graphslam.io.joined_map import information_of, read_joined
 from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum, write_tum
 
@@ -63,21 +63,33 @@ def test_join_and_compare_print_the_documented_json(run_folder):
         "states",
         "landmarks",
         "nnz",
+        "dof",
+        "nees_unpolished",
         "nees",
         "nees_dof",
+        "ci_unpolished",
         "ci",
     }
-    done = graphslam(
-        "join", run_folder, "--method", "eif-sequential", "--polish", "--json", "--out", run_folder.parent / "joined"
-    )
+    done = graphslam("join", run_folder, "--method", "eif-sequential", "--json", "--out", run_folder.parent / "joined")
     assert done.returncode == 0, done.stderr
-    (row,) = json.loads(done.stdout)["methods"]
+    value = json.loads(done.stdout)
+    (row,) = value["methods"]
+    assert [line["code"] for line in value["verdict"]] == ["state", "chi2", "nees"]
+    assert "least-squares optimum" in value["verdict"][0]["text"]
+    assert f"({row['dof']} degrees of freedom)" in value["verdict"][1]["text"]
+    assert row["nees_unpolished"] != row["nees"]
     assert set(row) == keys
     assert row["objective_polished"] <= row["objective"]
     joined = read_joined(run_folder.parent / "joined")
     assert len(joined["landmarks"]) == len(joined["landmark_ids"]) == row["landmarks"]
+    A = information_of(joined)
+    assert A.shape == (row["states"], row["states"])
+    assert (np.diag(np.linalg.inv(A.toarray())) > 0).all()
     nodes = read_tum(run_folder.parent / "joined" / "nodes.tum", dim=2)
     np.testing.assert_allclose(nodes.poses, joined["poses"], atol=1e-8)
+    alone = graphslam("join", run_folder, "--method", "ekf", "--no-polish", "--out", run_folder.parent / "filtered")
+    assert "not refined" in alone.stdout
+    assert read_joined(run_folder.parent / "filtered")["covariance"].shape == A.shape
     done = graphslam("compare", run_folder / "submaps", "--methods", "batch,eif-tree", "--no-memory", "--json")
     rows = json.loads(done.stdout)["methods"]
     assert [r["method"] for r in rows] == ["batch", "eif-tree"]

@@ -1,0 +1,274 @@
+"""Five ways of joining dense submaps, in the plane and in space: one optimum, and covariances that are honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphslam.app.compare import compare, default_methods
+from graphslam.core.errors import ConfigError, DataError, GeometryError, UnknownNameError
+from graphslam.core.gaussian import chi2_mean_bounds
+from graphslam.core.geometry import Array
+from graphslam.core.map_truth import MapTruth
+from graphslam.core.submap import LandmarkMap, Match, Submap
+from graphslam.evaluate.consistency import joint_nees, pose_error
+from graphslam.graph.noise import Robust
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.io.network_file import read_network
+from graphslam.join.pose_ekf import MOST
+from graphslam.join.pose_estimate import PoseEstimate, polish_poses
+from graphslam.join.pose_join import POSE_JOINERS, join_poses_sequential, join_poses_tree
+from graphslam.join.pose_problem import PoseProblem
+from graphslam.join.registry import join
+from graphslam.solve.batch import BatchSolver, optimise_graph
+from tests.reference.best_known import BEST_KNOWN
+from tests.reference.pose_ramp import pose_ramp
+
+CASES = [{"dim": 2}, {"dim": 3}, {"dim": 3, "level_sigma": 0.01}]
+METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
+
+
+def truth_of(problem: PoseProblem, poses: Array) -> MapTruth:
+    exits = poses[problem.bases[1:]]
+    none = np.zeros(0, dtype=np.int64)
+    return MapTruth(keys=problem.keys, exit_poses=exits, landmark_ids=none, landmarks=np.zeros((0, problem.dim)))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_five_methods_one_optimum_and_the_price_of_filtering_before_it(case: dict) -> None:
+    problem, truth = pose_ramp(2, submaps=7, radians=0.03, **case)  # an odd one goes up the tree by itself
+    table = compare(problem, truth=truth_of(problem, truth), memory=False).set_index("method")
+    assert list(table.index) == list(METHODS)
+    best = table["objective_polished"]["batch"]
+    np.testing.assert_allclose(table["objective_polished"], best, rtol=1e-9)
+    assert (table["objective"].drop("batch") > best * (1 + 1e-7)).all()
+    assert table["converged"].all()
+    assert table["objective"]["eif-sequential"] < table["objective"]["eif-tree"]
+    # one linearisation at the same values: the dense filter and the sparse one are one map
+    for name in ("objective", "nees_unpolished"):
+        assert table[name]["ekf"] == pytest.approx(table[name]["eif-sequential"], rel=1e-9)
+    np.testing.assert_allclose(table["nees"], table["nees"]["batch"], rtol=1e-4)
+    assert table["nees_unpolished"]["eif-tree"] != pytest.approx(table["nees"]["batch"], rel=1e-6)
+    d, n = problem.group.dof, len(problem.times)
+    assert set(table["states"]) == {d * (n - 1) + 2 * problem.levelled}
+    assert set(table["nees_dof"]) == {d * len(problem.keys)}
+    rows = d * len(problem.ends) + 2 * len(problem.level_nodes)
+    assert set(table["dof"]) == {rows - problem.states}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
+    problem, _ = pose_ramp(6, submaps=5, radians=0.05, **case)
+    sparse, dense = join(problem, "eif-sequential"), join(problem, "ekf")
+    np.testing.assert_allclose(dense.poses, sparse.poses, atol=1e-9)
+    poses = slice(None, problem.group.dof * (len(problem.times) - 1))
+    P = dense.joint_covariance()
+    np.testing.assert_allclose(P, P.T, atol=1e-12 * np.abs(P).max())
+    np.testing.assert_allclose(P[poses, poses], sparse.joint_covariance()[poses, poses], atol=1e-8 * np.abs(P).max())
+    k = len(problem.times) - 1
+    np.testing.assert_allclose(sparse.pose_covariance(k), dense.pose_covariance(k), atol=1e-8 * np.abs(P).max())
+
+
+def test_more_passes_come_nearer_to_the_optimum() -> None:
+    problem, _ = pose_ramp(3, submaps=8, loops=40, radians=0.03)
+    for way in (join_poses_tree, join_poses_sequential):
+        once, thrice = way(problem), way(problem, passes=3)
+        best = polish_poses(problem, once).objective_polished
+        assert once.objective - best > 3 * (thrice.objective - best) > 0
+
+
+def test_where_loops_bend_each_submap_only_the_refinement_helps() -> None:
+    problem, _ = pose_ramp(7, submaps=10, loops=60, radians=0.1)
+    tree = join(problem, "eif-tree")
+    best = polish_poses(problem, tree)
+    assert tree.objective > 1.2 * best.objective_polished
+    assert best.objective_polished == pytest.approx(join(problem, "batch").objective, rel=1e-8)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_covariances_are_honest(case: dict) -> None:
+    """Joint NEES of all nodes over 16 draws, two-sided; and a covariance a third too small is found out."""
+    values: dict[str, list[float]] = {m: [] for m in METHODS}
+    dof = 0
+    for seed in range(16):
+        problem, truth = pose_ramp(
+            100 + seed, submaps=4, steps=4, around=8, loops=8, radians=0.005, metres=0.03, **case
+        )
+        dof = problem.group.dof * (len(truth) - 1)
+        for method in METHODS:
+            found = join(problem, method, polish=method == "isam2")
+            error = pose_error(found.poses[1:], truth[1:]).ravel()
+            P = found.covariance_block(np.arange(dof))
+            values[method].append(joint_nees(error, covariance=P))
+    low, high = chi2_mean_bounds(
+        dof, 16, confidence=0.999
+    )  # five methods, three cases: one test in 67 would be unlucky
+    for method, nees in values.items():
+        assert low < np.mean(nees) < high, method
+        assert not low < np.mean(nees) * 1.5 < high
+
+
+def test_ties_enter_whatever_their_direction_and_order() -> None:
+    problem, _ = pose_ramp(9, submaps=6, loops=20)
+    rng = np.random.default_rng(0)
+    g, order = problem.group, rng.permutation(len(problem.ends))
+    back = rng.random(len(order)) < 0.5
+    T = np.where(back[:, None], g.inverse(problem.measured), problem.measured)
+    W = problem.whiteners.copy()
+    W[back] = W[back] @ g.adjoint(T[back])  # the residual of the inverse is -Ad(T) that of the measurement
+    ends = np.where(back[:, None], problem.ends[:, ::-1], problem.ends)
+    other = replace(problem, ends=ends[order], measured=T[order], whiteners=W[order])
+    a, b = join(problem, "batch"), join(other, "batch")
+    np.testing.assert_allclose(a.poses, b.poses, atol=1e-7)
+    for method in ("eif-tree", "eif-sequential"):
+        there, here = join(other, method), join(problem, method)
+        assert there.objective == pytest.approx(here.objective, rel=1e-9)
+        np.testing.assert_allclose(there.poses, here.poses, atol=1e-7)
+
+
+def dense_submaps(dim: int = 3) -> tuple[list[Submap], PoseProblem]:
+    """The ramp as submaps: exits with covariances, and its loops between bases as matches."""
+    problem, _ = pose_ramp(12, dim=dim, submaps=10, steps=1, around=4, loops=6)
+    chain = {int(min(e)): k for k, e in enumerate(problem.ends) if abs(e[0] - e[1]) == 1}
+    P = [np.linalg.inv(W.T @ W) for W in problem.whiteners]
+    ties: dict[int, list[Match]] = {}
+    g = problem.group
+    for k, (i, j) in enumerate(problem.ends.tolist()):
+        if abs(i - j) > 1 and max(i, j) < 10:
+            T, C = problem.measured[k], P[k]
+            if i > j:
+                Ad = g.adjoint(T)
+                i, j, T, C = j, i, g.inverse(T), Ad @ C @ Ad.T
+            ties.setdefault(j, []).append(Match(target=i, T_target_here=T, covariance=C, fitness=0.9, support=0.9))
+    submaps = [
+        Submap(
+            key=k, interval=(float(k), k + 1.0), exit_pose=problem.measured[chain[k]],
+            exit_covariance=P[chain[k]], matches=tuple(ties.get(k, ())),
+        )
+        for k in range(10)
+    ]  # fmt: skip
+    return submaps, problem
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_submaps_are_joined_by_their_exits_and_matches(dim: int) -> None:
+    submaps, problem = dense_submaps(dim)
+    assert any(s.matches for s in submaps)
+    found = join(submaps, "eif-tree", polish=True)
+    assert isinstance(found, PoseEstimate)
+    assert found.states == problem.group.dof * 10
+    graph = PoseGraph(dim)
+    for s in submaps:
+        graph.add_submap(s)
+        for m in s.matches:
+            graph.add_match(s.key, m)
+    best = optimise_graph(graph)
+    assert found.objective_polished == pytest.approx(best.objective, rel=1e-9)
+    np.testing.assert_allclose(found.poses, best.values.poses, atol=1e-6)
+    wide = join(submaps, "eif-tree", polish=True, covariance_scale=4.0)
+    assert wide.objective_polished < found.objective_polished
+    doubted = [replace(s, matches=tuple(replace(m, support=0.1) for m in s.matches)) for s in submaps]
+    assert join(doubted, "batch").dof == 0
+
+
+def test_a_tie_counts_with_the_weight_that_its_kernel_gives_it() -> None:
+    """The weighted optimum is that of the graph with its kernels, a wrong loop among them."""
+    submaps, problem = dense_submaps()
+    graph = PoseGraph(3)
+    for s in submaps:
+        graph.add_submap(s)
+    far = problem.group.exp(np.array([0, 0, 1.0, 3, 3, 0]))
+    for i, j in ((0, 6), (1, 9)):
+        graph.add_between(
+            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=Robust("cauchy", 1.0)
+        )
+    solver = BatchSolver(graph)
+    solver.solve_to_optimum()
+    weighted = PoseProblem.of_graph(graph)
+    found = join(weighted, "eif-tree", polish=True)
+    np.testing.assert_allclose(found.poses, graph.values.poses, atol=1e-5)
+    assert found.objective_polished < graph.objective().total
+
+
+def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
+    submaps, problem = dense_submaps()
+    n = 1
+    marks = LandmarkMap(
+        ids=np.arange(n), exit_pose=submaps[0].exit_pose, positions=np.zeros((n, 3)), covariance=np.eye(6 + 3 * n)
+    )
+    mixed = [replace(submaps[0], landmarks=marks), *submaps[1:]]
+    refused = [
+        (lambda: join(mixed, "eif-tree"), GeometryError, "landmarks in space"),
+        (lambda: join(problem, "eif-online"), UnknownNameError, "eif-online"),
+        (lambda: compare(problem, ["magic"], memory=False), UnknownNameError, "magic"),
+        (lambda: join(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),
+        (lambda: join(problem, "eif-tree", workers=2), ConfigError, "one process"),
+        (lambda: join(problem, "eif-tree", covariance_scale=2.0), ConfigError, "scale 1"),
+        (lambda: PoseProblem.of_graph(PoseGraph(3)), DataError, "no submaps"),
+        (lambda: two_sessions(submaps), DataError, "one chain"),
+    ]
+    for call, kind, said in refused:
+        with pytest.raises(kind, match=said) as error:
+            call()
+        assert "\n" not in str(error.value)
+    large, _ = pose_ramp(1, dim=3, submaps=2, steps=MOST // 12 + 1, loops=0)
+    with pytest.raises(DataError, match="no room"):
+        join(large, "ekf")
+    assert default_methods(large) == tuple(m for m in METHODS if m != "ekf")
+    assert default_methods(problem) == METHODS
+
+
+def two_sessions(submaps: list[Submap]) -> PoseProblem:
+    graph = PoseGraph(3)
+    for s in submaps[:3]:
+        graph.add_submap(replace(s, matches=()))
+    graph.start_session(graph.values.poses[0])
+    for s in submaps[3:6]:
+        graph.add_submap(replace(s, matches=()))
+    return PoseProblem.of_graph(graph)
+
+
+def test_a_problem_on_disk_is_the_same_problem(tmp_path: Path) -> None:
+    problem, _ = pose_ramp(5, level_sigma=0.01)
+    problem.save(tmp_path / "p.npz")
+    again = PoseProblem.load(tmp_path / "p.npz")
+    assert join(again, "eif-tree").objective == join(problem, "eif-tree").objective
+    part = problem.part(0, 3)
+    assert len(part.keys) == 3
+    assert part.level_nodes.tolist() == [k for k in problem.level_nodes if k <= part.bases[-1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "submaps", "tree", "sequence"), [("parking-garage", 34, 1.664, 1.493), ("sphere2500", 50, 1771, 1436)]
+)
+def test_published_graphs_cut_into_submaps(
+    data_dir: Path, name: str, submaps: int, tree: float, sequence: float
+) -> None:
+    file = f"posegraphs/{name}.g2o.xz"
+    problem = PoseProblem.of_network(read_network(data_dir / file), 50)
+    assert len(problem.keys) == submaps
+    own = POSE_JOINERS["eif-tree"](problem)
+    assert own.objective < tree
+    assert join_poses_sequential(problem).objective < sequence
+    best = polish_poses(problem, own)
+    assert best.converged
+    assert best.objective_polished == pytest.approx(BEST_KNOWN[file], rel=1e-6)
+
+
+def test_pose_graph_files_that_cannot_be_cut(data_dir: Path) -> None:
+    network = read_network(data_dir / "posegraphs/intel.g2o.xz")
+    with pytest.raises(DataError, match="no step"):
+        PoseProblem.of_network(network, 0)
+    with pytest.raises(DataError, match="one vertex"):
+        PoseProblem.of_network(replace(network, fixed=np.arange(len(network)) < 2), 50)
+    chain = np.abs(np.diff(network.edges, axis=1).ravel()) == 1
+    keep = ~(chain & (network.edges.min(axis=1) == 41))
+    cut = replace(
+        network, edges=network.edges[keep], measurements=network.measurements[keep],
+        information=network.information[keep],
+    )  # fmt: skip
+    with pytest.raises(DataError, match="nodes 41 and 42 are not tied to each other"):
+        PoseProblem.of_network(cut, 50)
