@@ -38,7 +38,8 @@ def calibrate_streams(
         The log says nothing.
     """
     if kind == "sightings":
-        return calibrate_sightings(Seen.of(log, *landmark_stream(log, config.detector)), effort, seed=seed)
+        seen = Seen.of(log, *landmark_stream(log, config.detector))
+        return calibrate_sightings(seen, effort, seed=seed, noise=getattr(config, "motion", None))
     wanted = replace(config.steps, match_scans=False, yaw_per_metre=0.0)
     if log.of_type(LaserScans) is None:
         wanted = replace(wanted, most_points=max(wanted.most_points, POINTS))

@@ -96,11 +96,19 @@ class Corrections:
         """The same with the noise of the motion left as it is."""
         return replace(self, along_metre=None, widen_only=False, **dict.fromkeys(NOISE, 0.0))
 
+    def without_constants(self) -> Corrections:
+        """Its noise alone."""
+        return replace(self, **{k: getattr(Corrections(), k) for k in CONSTANT})
+
     def without_sensor_noise(self) -> Corrections:
         """The same with the σ of the sightings left as they are."""
         return replace(self, range_sigma=None, bearing_sigma=None, range_visit=0.0, bearing_visit=0.0)
 
 
+CONSTANT = (
+    *("yaw_bias", "distance_scale", "turn_per_metre", "turn_scale", "clock"),
+    *("range_scale", "range_offset", "sensor_yaw"),
+)
 NOISE = ("along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
 
 

@@ -85,6 +85,43 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """How data that an estimate was not made from fit it, and fit what the log states.
+
+    Parameters
+    ----------
+    what : str
+        Of what.
+    count : int
+        How many.
+    gains : mapping of str to float
+        By how much likelier they are than under what the log states [nats]: under ``all`` of the estimate, and under
+        its ``noise`` without its constants, where it has any.
+    """
+
+    what: str
+    count: int
+    gains: dict[str, float]
+
+    @property
+    def taken(self) -> str:
+        """``all``, ``noise``, or ``nothing`` of the estimate."""
+        best = max(self.gains, key=lambda k: self.gains[k])
+        return best if self.gains[best] > 0.0 else "nothing"
+
+    def in_words(self) -> str:
+        """What they say."""
+        said = f"{self.count} {self.what} are"
+        gain = self.gains["all"]
+        if self.taken == "all":
+            return f"{said} likelier under it than under what the log states, by {gain:.0f} nats"
+        if self.taken == "noise":
+            less = self.gains["noise"] - gain
+            return f"{said} likelier under its noise alone than with its lasting errors, by {less:.0f} nats"
+        return f"{said} likelier under what the log states, by {-gain:.0f} nats"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """What a log says of its own noise.
 
@@ -101,6 +138,8 @@ class Calibration:
         What else is to be said.
     data : str
         Of how much of the log it is made.
+    prediction : Prediction or None
+        Of data that it was not made from; what they refuse is not applied. None: it was not asked.
     """
 
     kind: str
@@ -109,6 +148,16 @@ class Calibration:
     noise: dict[str, float] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
     data: str = ""
+    prediction: Prediction | None = None
+
+    def judged(self, prediction: Prediction) -> Calibration:
+        """The same without what withheld data refuse."""
+        found = replace(self, prediction=prediction)
+        if prediction.taken == "all":
+            return found
+        refused = [replace(e, why_not=prediction.in_words()) if e.applied else e for e in self.estimates]
+        kept = self.corrections.without_constants() if prediction.taken == "noise" else Corrections()
+        return replace(found, estimates=tuple(refused), corrections=kept)
 
     def findings(self) -> list[Finding]:
         """Lines of a verdict: what is applied, what is not, and why."""
@@ -121,6 +170,15 @@ class Calibration:
             text += "defaults of the noise are used. To do: `graphslam data check`."
             return [Finding("bad", "calibration-contradiction", text)]
         out = []
+        taken = "all" if self.prediction is None else self.prediction.taken
+        if self.prediction is not None:
+            text = f"From {self.data}: {self.prediction.in_words()}"
+            text += {"all": ".", "noise": ": the lasting errors are left as they are.", "nothing": ": it is refused."}[
+                taken
+            ]
+            out.append(
+                Finding("", "calibrated", text) if taken == "all" else Finding("look", "calibration-refused", text)
+            )
         for e in self.estimates:
             said = in_words(e.name, e.value, e.sigma)
             if e.applied:
@@ -133,7 +191,7 @@ class Calibration:
         if chance:
             out.append(Finding("", "calibrated", f"No lasting error was found of {' or '.join(chance)}."))
         if self.noise:
-            text = f"Noise from {self.data}: {noise_in_words(self.noise)}."
+            text = f"Noise from {self.data}: {noise_in_words(self.noise)}{', not used' * (taken == 'nothing')}."
             if self.corrections.widen_only:
                 text += " Where the log states a larger one, that one counts."
             out.append(Finding("", "calibrated", text))
@@ -160,6 +218,9 @@ class Calibration:
                 for e in self.estimates
             ],
             "noise": {k: float(v) for k, v in self.noise.items()},
+            "prediction": None
+            if self.prediction is None
+            else as_dict(self.prediction) | {"taken": self.prediction.taken},
             "lines": [f.as_row() for f in self.findings()],
         }
 

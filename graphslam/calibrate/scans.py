@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import gammaln
 
-from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate
+from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate, Prediction
 from graphslam.calibrate.sighted import Effort, calibration_of
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
@@ -31,6 +31,9 @@ APART = {2: (1, 3), 3: (1, 3, 8)}
 """Key scans between those of a pair."""
 HELD = (0.06, 0.03)
 """A match that holds its weakest direction, or its heading, worse than this is left out [m, rad]: corridors."""
+BLOCK = 10
+"""Matches, one after the other, that are held out together."""
+_MATCHES = (math.log(1e-4), math.log(0.3))
 FREEDOM = 4.0
 """Of Student's distribution of the errors."""
 ALIKE = 0.9
@@ -58,6 +61,8 @@ class Pairs:
         In motion, driven, and turned (with its sign), by the odometry between them; ``turned`` without sign.
     chord : (n,)
         Way between them by the match, in the direction of the odometry [m].
+    stated_heading, stated_along : (n,)
+        Variances of the odometry between them, as the log or the front end states them [rad², m²].
     heading, along, side : (n,)
         Odometry less match [rad, m, m].
     """
@@ -67,6 +72,8 @@ class Pairs:
     metres: Array
     turn: Array
     turned: Array
+    stated_heading: Array
+    stated_along: Array
     chord: Array
     heading: Array
     along: Array
@@ -96,7 +103,9 @@ def matched_pairs(steps: Steps, most: int) -> Pairs:
             way = turned = 0.0
     dt = np.concatenate([[0.0], np.diff(steps.times)])[: len(steps)]
     moving = (d > 0.005 * np.maximum(dt, 1e-9)) | (np.abs(turns) > 0.005 * np.maximum(dt, 1e-9))
-    sums = {k: np.cumsum(v) for k, v in (("t", dt * moving), ("d", d), ("s", turns), ("a", np.abs(turns)))}
+    variances = np.diagonal(o.covariances, axis1=1, axis2=2)
+    growing = (dt * moving, d, turns, np.abs(turns), variances[:, g.heading], variances[:, g.position].mean(axis=1))
+    sums = [np.cumsum(v) for v in growing]
     targets: dict[int, Target] = {}
     rows = []
     config = MATCHING[steps.dim]
@@ -128,7 +137,7 @@ def matched_pairs(steps: Steps, most: int) -> Pairs:
             side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
             # the way that the match says: noise in the regressor would make the scale too large
             chord = float(np.asarray(found.T_target_source[: steps.dim]) @ direction)
-            gone = [float(s[b] - s[a]) for s in sums.values()]
+            gone = [float(s[b] - s[a]) for s in sums]
             rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
         raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
@@ -186,10 +195,7 @@ def regress(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regressio
                 c = np.linalg.lstsq(H, (A[keep] * w[:, None]).T @ e[keep], rcond=None)[0]
             r2 = (e[keep] - A[keep] @ c) ** 2 / v
             w = (FREEDOM + 1.0) / (FREEDOM + r2) / v
-        n = float(keep.sum())
-        constant = gammaln(0.5 * FREEDOM) - gammaln(0.5 * (FREEDOM + 1.0)) + 0.5 * math.log(FREEDOM * math.pi)
-        score = 0.5 * (FREEDOM + 1.0) * float(np.log1p(r2 / FREEDOM).sum()) + 0.5 * float(np.log(v).sum())
-        return score + n * constant, c, H
+        return student(e[keep] - A[keep] @ c, v * FREEDOM / (FREEDOM - 2.0)), c, H
 
     for _ in range(2 if trim else 1):
         found = minimize(
@@ -239,13 +245,69 @@ def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
     estimates.append(scale)
     noise |= moved
     data = f"{len(p)} matches of scans"
+    kind = "scans" if steps.dim == 2 else "clouds"
     if steps.dim == 3:
         text = (
             f"Scan matching cannot measure odometry better than this; it is an upper limit: {noise['along_metre']:.3g}"
         )
         text += f" m/√m and {math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m."
         notes.append(Finding("", "calibrated", text))
-    return calibration_of("scans" if steps.dim == 2 else "clouds", estimates, noise, notes, data)
+    found = calibration_of(kind, estimates, noise, notes, data)
+    return found if found.contradictions() else found.judged(predicted(p, found, widen=kind == "scans"))
+
+
+def predicted(p: Pairs, found: Calibration, *, widen: bool) -> Prediction:
+    """Matches of one half of the log held against what the other half tells of the constants and the noise.
+
+    Blocks of the log take turns: each is predicted from those of the other kind.
+
+    Parameters
+    ----------
+    p : Pairs
+    found : Calibration
+        Whose applied constants are asked; each half estimates them anew.
+    widen : bool
+        The noise is at least what the log states.
+    """
+    applied = {e.name for e in found.estimates if e.applied}
+    turning, along = (
+        np.column_stack([x for n, x in of.items() if n in applied] or [p.metres[:, None][:, :0]])
+        for of in (
+            {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn},
+            {"distance_scale": p.chord},
+        )
+    )
+    grows = np.column_stack([p.metres, p.turned, p.seconds])
+    half = np.arange(len(p)) // BLOCK % 2 == 0
+    gains = {"all": 0.0, "noise": 0.0}
+    for train in (half, ~half):
+        for e, A, g, stated in (
+            (p.heading, turning, grows, p.stated_heading),
+            (p.along, along, grows[:, :1], p.stated_along),
+        ):
+            test = ~train
+            match = _match_noise(e[train], stated[train])
+            before = student(e[test], match**2 + stated[test])
+            for name, columns in (("all", A), ("noise", A[:, :0])):
+                r = regress(e[train], columns[train], g[train])
+                v = g[test] @ r.sigmas[1:] ** 2
+                v = r.sigmas[0] ** 2 + (np.maximum(v, stated[test]) if widen else v)
+                gains[name] += before - student(e[test] - columns[test] @ r.value, v)
+    return Prediction(what="matches, each half of the log foretold from the other,", count=len(p), gains=gains)
+
+
+def student(e: Array, variances: Array) -> float:
+    """Negative log likelihood of errors ``(n,)`` under Student's distribution with these variances [nats]."""
+    v = variances * (FREEDOM - 2.0) / FREEDOM
+    constant = gammaln(0.5 * FREEDOM) - gammaln(0.5 * (FREEDOM + 1.0)) + 0.5 * math.log(FREEDOM * math.pi)
+    terms = 0.5 * (FREEDOM + 1.0) * np.log1p(e**2 / (FREEDOM * v)) + 0.5 * np.log(v)
+    return float(terms.sum()) + len(e) * float(constant)
+
+
+def _match_noise(e: Array, stated: Array) -> float:
+    """σ of a match that makes errors likeliest whose other noise is as stated."""
+    found = minimize_scalar(lambda x: student(e, math.exp(2.0 * x) + stated), bounds=_MATCHES, method="bounded")
+    return math.exp(found.x)
 
 
 def _turning(p: Pairs, noise: dict[str, float]) -> float:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from graphslam.calibrate import landmarks as L
-from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, rounded
-from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Smoothing, Window
-from graphslam.calibrate.windows import Seen
+from graphslam.calibrate.foretold import foretold
+from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, Window, rebuilt
+from graphslam.calibrate.windows import Seen, stretches
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.records import SteeringControls
-from graphslam.frontends.odometry.motion import motion_stream
+from graphslam.frontends.odometry.motion import MotionNoise, motion_stream
 
 SHORT, LONG = 15.0, 60.0
 """Lengths of the windows [s]."""
@@ -49,17 +51,65 @@ QUICK = Effort()
 FULL = Effort(windows=60, poses=6000)
 
 
-def calibrate_sightings(seen: Seen, effort: Effort = QUICK, *, seed: int = 0) -> Calibration:
-    """What wheels and sightings say of their own noise and lasting errors.
+def calibrate_sightings(
+    seen: Seen, effort: Effort = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
+) -> Calibration:
+    """What wheels and sightings say of their own noise and lasting errors, as far as it foretells what was withheld.
+
+    Parameters
+    ----------
+    seen : Seen
+    effort : Effort
+    seed : int
+    noise : MotionNoise, optional
+        Of controls, as it is without a calibration.
 
     Raises
     ------
     DataError
         Too little is seen twice, or nothing moves.
     """
+    held, noise = seen.holding(), noise or MotionNoise()
     if not np.any(seen.sightings.has_bearing):
-        return _ranges_alone(seen, effort, seed)
-    return _range_and_bearing(seen, effort)
+        found, whole = _ranges_alone(held, effort, seed)
+        scans = [stretches(seen, 1e9)[0][: len(whole.windows[0].poses)]]
+        start = partial(_along, whole, seen.sightings.ids)
+        foretell = partial(foretold, held, found, scans, noise, start)
+    else:
+        found = _range_and_bearing(held, effort)
+        foretell = partial(foretold, held, found, _tested(held, effort), noise)
+    prediction = None if found.contradictions() else foretell()
+    return found if prediction is None else found.judged(prediction)
+
+
+def _tested(held: Seen, effort: Effort) -> list[Ints]:
+    """Scans of long windows in which something is withheld, spread over the log."""
+    s = held.sightings
+    assert held.withheld is not None
+    hidden = np.concatenate([[0], np.cumsum(held.withheld)])[s.offsets]
+    there = [k for k in stretches(held, LONG) if np.any(hidden[k + 1] > hidden[k])]
+    count = max(int(0.5 * effort.poses / max(_rate(held) * LONG, 1.0)), 3)
+    return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(count, len(there))).round().astype(int))]
+
+
+def _along(whole: Smoothing, ids: Ints | None, w: Window) -> Window | None:
+    """A window of ranges with its states where those of a fitted one are; None where that has none of its beacons."""
+    first = whole.windows[0]
+    if ids is None:
+        return None
+    names = np.full(len(first.nuisance), -1)
+    names[first.slots[:, 0]] = ids[first.rows]
+    place = dict(zip(names.tolist(), first.nuisance))
+    own = ids[w.rows]
+    w = rebuilt(replace(w, poses=first.poses.copy()), np.isin(own, names))
+    for j, name in zip(w.slots[:, 0].tolist(), ids[w.rows].tolist()):
+        w.nuisance[j] = place[name]
+    return w if len(w.rows) else None
+
+
+def _rate(seen: Seen) -> float:
+    """Scans a second."""
+    return len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
 
 
 def _range_and_bearing(seen: Seen, effort: Effort, held: tuple[str, ...] = ()) -> Calibration:
@@ -104,18 +154,16 @@ def _range_and_bearing(seen: Seen, effort: Effort, held: tuple[str, ...] = ()) -
 
 def _again(seen: Seen, clock: Estimate, effort: Effort, held: tuple[str, ...]) -> Calibration:
     """The calibration with the motion's clock put right."""
-    mended = Seen.of(calibrated(seen.log, Corrections(clock=rounded(clock.value))), seen.name, seen.sightings)
-    found = _range_and_bearing(mended, replace(effort, clock=False), held)
+    found = _range_and_bearing(seen.mended(Corrections(clock=rounded(clock.value))), replace(effort, clock=False), held)
     if found.contradictions():
         return found
     corrections = replace(found.corrections, clock=rounded(clock.value))
     return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
 
 
-def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> Calibration:
+def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> tuple[Calibration, Smoothing]:
     begin, end = seen.span
-    rate = len(seen.sightings.times) / max(end - begin, 1e-9)
-    until = end - begin if effort.windows is None else min(effort.poses / max(rate, 1e-9), end - begin)
+    until = end - begin if effort.windows is None else min(effort.poses / max(_rate(seen), 1e-9), end - begin)
     found = L.ranged(seen, until, seed=seed)
     if found is None:
         raise DataError("too few ranges to calibrate with", where=seen.log.name)
@@ -130,7 +178,8 @@ def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> Calibration:
         notes.append(Finding("", "calibrated", text))
     if lasts or alike > ALIKE:
         notes.append(_lasting_note(half, whole, alike))
-    return calibration_of("ranges", estimates, noise, notes, f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})")
+    data = f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})"
+    return calibration_of("ranges", estimates, noise, notes, data), whole
 
 
 def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
@@ -226,8 +275,7 @@ def two_levels(
     The windows hold several visits of a landmark, or its place could not be told from the constant. Constants that
     passed the gates must pass them again: errors of visits may have feigned them.
     """
-    rate = len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
-    count = max(int(effort.poses / max(rate * VISITS, 1.0)), 1)
+    count = max(int(effort.poses / max(_rate(seen) * VISITS, 1.0)), 1)
     values, fits = [], []
     for visits in (False, True):
         s = L.sighted(seen, VISITS, count, long.free, visits=visits)
@@ -257,7 +305,8 @@ def two_levels(
         for of_fit, of_noise in ((k, f"{k}_sigma"), (f"visit_{k}", f"{k}_visit")):
             if of_fit in s.fitted:
                 out[of_noise] = s.sigmas[of_fit]
-    return out | {"visit_sightings": sightings_of_a_visit(s.windows)} | motion_noise(s), again
+    there = 1.0 if seen.withheld is None else 1.0 - float(seen.withheld.mean())
+    return out | {"visit_sightings": sightings_of_a_visit(s.windows) / there} | motion_noise(s), again
 
 
 def motion_noise(s: Smoothing) -> dict[str, float]:
@@ -318,8 +367,7 @@ def _count(seen: Seen, seconds: float, effort: Effort) -> int | None:
     """Windows that keep the number of poses within bounds."""
     if effort.windows is None:
         return None
-    rate = len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
-    return int(np.clip(effort.poses / max(rate * seconds, 1.0), 6, effort.windows))
+    return int(np.clip(effort.poses / max(_rate(seen) * seconds, 1.0), 6, effort.windows))
 
 
 def _enough(s: Smoothing, seen: Seen) -> None:

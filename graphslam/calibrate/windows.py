@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.corrections import visits_of
+from graphslam.calibrate.corrections import Corrections, calibrated, corrected_sightings, visits_of
 from graphslam.calibrate.smoothing import Ints, Window, numbered, rebuilt
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
@@ -18,6 +19,9 @@ from graphslam.frontends.odometry.motion import Motion, MotionNoise, dead_reckon
 LONGEST = 1.0
 """A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
 _HOLD = 0.5
+HELD, EVERY = 2.5, 20.0
+"""Of every twenty seconds the sightings of so many are withheld from an estimate, to be foretold by it [s]. That is
+shorter than what ends a visit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,18 +36,35 @@ class Seen:
     sightings : LandmarkObservations
     clock : Array
         Stamps of the motion's records, and at them the seconds in motion and the metres since the first (3, r).
+    withheld : (q,) bool, optional
+        Sightings that no window has; None: all are there.
+    stated : MotionNoise, optional
+        Windows have the variances of the motion that the log states, with this noise of controls; None: no variances.
     """
 
     log: SensorLog
     name: str
     sightings: LandmarkObservations
     clock: Array
+    withheld: npt.NDArray[np.bool_] | None = None
+    stated: MotionNoise | None = None
 
     @classmethod
     def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> Seen:
         """Of a log whose sightings are in the stream ``name``, or were detected in it."""
         _, motion = motion_stream(log)
         return cls(log, name, sightings, driven(motion))
+
+    def mended(self, c: Corrections) -> Seen:
+        """The same with corrections applied, and what is withheld."""
+        made = Seen.of(calibrated(self.log, c), self.name, corrected_sightings(self.sightings, c))
+        return replace(made, withheld=self.withheld, stated=self.stated)
+
+    def holding(self) -> Seen:
+        """The same without the sightings of some seconds now and then."""
+        s = self.sightings
+        times = np.repeat(s.times, np.diff(s.offsets))
+        return replace(self, withheld=np.mod(times - self.span[0], EVERY) > EVERY - HELD)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -56,7 +77,7 @@ class Seen:
         return float(np.median(np.diff(self.clock[0])))
 
     def steps(self, stamps: Array, shift: float = 0.0) -> Array:
-        """Motion between stamps ``(n, 8)``: dx, dy, turn, seconds in motion, metres, no variances; row 0 is zero.
+        """Motion between stamps ``(n, 8)``: dx, dy, turn, seconds in motion, metres, variances; row 0 is zero.
 
         Parameters
         ----------
@@ -66,8 +87,10 @@ class Seen:
             The motion's clock is ahead of that of the sightings by it [s].
         """
         t = np.asarray(stamps) + shift
-        odometry, _ = dead_reckoning(self.log, t, MotionNoise(), hold=_HOLD + abs(shift))
+        odometry, _ = dead_reckoning(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
         out = np.zeros((len(t), 8))
+        if self.stated is not None:
+            out[1:, 5:] = np.diagonal(odometry.covariances[1:], axis1=1, axis2=2)
         out[1:, :3] = odometry.increments[1:]
         for column in (1, 2):
             out[1:, 2 + column] = np.diff(np.interp(t, self.clock[0], self.clock[column]))
@@ -110,6 +133,12 @@ def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = 
     visits : bool
         With a constant for each visit of a landmark.
     """
+    made = (make_window(seen, scans, visits=visits) for scans in stretches(seen, seconds, count))
+    return [w for w in made if w is not None]
+
+
+def stretches(seen: Seen, seconds: float, count: int | None = None) -> list[Ints]:
+    """Scans of each window that :func:`cut` makes."""
     s, (begin, end) = seen.sightings, seen.span
     used = np.flatnonzero((np.diff(s.offsets) > 0) & (s.times >= begin - _HOLD) & (s.times <= end + _HOLD))
     if len(used) < 5:
@@ -131,13 +160,7 @@ def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = 
         moved = moved or list(range(len(starts)))
         chosen = np.unique(np.linspace(0, len(moved) - 1, min(count, len(moved))).round().astype(int))
         starts = [starts[moved[i]] for i in chosen]
-    out = []
-    for a, b in starts:
-        scans = used[a:b]
-        made = make_window(seen, scans, visits=visits)
-        if made is not None:
-            out.append(made)
-    return out
+    return [used[a:b] for a, b in starts]
 
 
 def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
@@ -155,7 +178,7 @@ def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
         track = s.ids[rows].astype(np.int64)
     else:
         track = follow(points, k)
-    good = track >= 0
+    good = track >= 0 if seen.withheld is None else (track >= 0) & ~seen.withheld[rows]
     names, landmark = np.unique(track[good], return_inverse=True)
     rows, k, z, points = rows[good], k[good], z[good], points[good]
     if not len(rows):

@@ -26,6 +26,7 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.frontends.grid.rbpf_grid import run_rbpf
 from graphslam.frontends.odometry.recorded import chain
@@ -36,7 +37,6 @@ from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.catalog import load
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save
-from tests.reference.relations import consecutive_pairs, covered, random_pairs, relation_error
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",

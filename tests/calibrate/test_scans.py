@@ -9,7 +9,8 @@ import pytest
 
 import graphslam as gs
 from graphslam.calibrate.corrections import Corrections, calibrated
-from graphslam.calibrate.scans import calibrate_scans, regress
+from graphslam.calibrate.estimate import Calibration, Estimate
+from graphslam.calibrate.scans import BLOCK, Pairs, calibrate_scans, predicted, regress
 from graphslam.calibrate.sighted import QUICK
 from graphslam.core.errors import DataError
 from graphslam.frontends.odometry.step_config import StepConfig
@@ -35,6 +36,8 @@ def test_added_scale_noise_and_turning_are_found(log) -> None:
     heading = c.heading_metre**2 * step + c.heading_radian**2 * 0.09 + c.heading_second**2 * 0.5
     assert np.sqrt(heading) == pytest.approx(NOISE * np.sqrt(step), rel=0.35)
     assert any("distances of the motion" in f.text for f in found.findings())
+    assert found.prediction is not None
+    assert found.prediction.taken == "all"
 
 
 def test_run_of_a_front_end_on_grids_is_calibrated(log) -> None:
@@ -82,3 +85,42 @@ def test_regression_finds_noise_that_grows_and_is_not_led_by_outliers() -> None:
     assert found.value[0] == pytest.approx(0.05, abs=4 * np.sqrt(found.covariance[0, 0]))
     assert found.sigmas[1] == pytest.approx(0.03, rel=0.25)
     assert not found.keep[::20].any()
+
+
+def drawn_pairs(bend, *, stated, seed=4) -> Pairs:
+    """Pairs of a robot whose heading errs by so much a metre, with 0.02 rad/√m and 0.03 m/√m of noise."""
+    rng = np.random.default_rng(seed)
+    d = np.tile([0.4, 4.0], 120)
+    zero, n = np.zeros(len(d)), len(d)
+    heading = bend * d + np.sqrt(0.005**2 + 0.02**2 * d) * rng.standard_normal(n)
+    along = np.sqrt(0.01**2 + 0.03**2 * d) * rng.standard_normal(n)
+    columns = {"apart": zero, "seconds": d, "metres": d, "turn": zero, "turned": zero, "chord": d, "side": zero}
+    variances = {"stated_heading": stated**2 * 0.02**2 * d, "stated_along": stated**2 * 0.03**2 * d}
+    return Pairs(**columns, **variances, heading=heading, along=along)
+
+
+def judged(p: Pairs) -> Calibration:
+    bend = Estimate(name="turn_per_metre", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
+    raw = Calibration(kind="scans", corrections=Corrections(turn_per_metre=0.1, along_metre=0.03), estimates=(bend,))
+    return raw.judged(predicted(p, raw, widen=True))
+
+
+def test_halves_that_contradict_each_other_refuse_what_the_whole_says() -> None:
+    """A robot that bends to one side in half of the blocks and to the other in the rest has no lasting bend."""
+    side = np.where(np.arange(240) // BLOCK % 2 == 0, 0.1, -0.1)
+    lasting = judged(drawn_pairs(0.1, stated=0.25))
+    assert lasting.prediction.taken == "all"
+    assert lasting.corrections.turn_per_metre == 0.1
+    refused = judged(drawn_pairs(side, stated=0.25))
+    assert refused.prediction.taken == "noise"
+    assert refused.corrections == Corrections(along_metre=0.03)
+    assert not refused.estimates[0].applied
+    assert any(f.code == "calibration-refused" for f in refused.findings())
+
+
+def test_noise_that_is_stated_rightly_is_not_changed_for_a_worse_one() -> None:
+    """What halves of the log tell of the noise is worth much where the log states too little, and nothing otherwise."""
+    right = judged(drawn_pairs(0.0, stated=1.0))
+    small = judged(drawn_pairs(0.0, stated=0.25))
+    assert small.prediction.gains["noise"] > 10.0
+    assert right.prediction.gains["noise"] < 3.0

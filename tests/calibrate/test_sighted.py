@@ -15,12 +15,14 @@ from graphslam.app.cli.run import join_note
 from graphslam.app.studies.calibration_robot import draw_robot, drive
 from graphslam.calibrate.corrections import Corrections, calibrated
 from graphslam.calibrate.estimate import Estimate
+from graphslam.calibrate.foretold import foretold
 from graphslam.calibrate.landmarks import fitted, sighted
-from graphslam.calibrate.sighted import QUICK, RAN_AWAY, SHORT, calibrate_sightings
+from graphslam.calibrate.sighted import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
 from graphslam.calibrate.smoothing import CONSTANTS
-from graphslam.calibrate.windows import Seen
+from graphslam.calibrate.windows import Seen, stretches
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
+from graphslam.frontends.odometry.motion import MotionNoise
 from graphslam.io.log_store import save_log
 
 ROBOT = draw_robot(3)
@@ -48,9 +50,34 @@ def test_drawn_robot_is_found_again(found) -> None:
     assert e["yaw_bias"].value == pytest.approx(ROBOT.yaw_bias, abs=np.deg2rad(0.5))
     assert c.yaw_bias == 0.0  # no more than chance in a minute of these wheels
     assert e["sensor_yaw"].value == pytest.approx(ROBOT.sensor_yaw, abs=np.deg2rad(0.8))
-    assert c.range_offset == pytest.approx(ROBOT.range_offset, abs=0.08)
+    assert c.range_offset == pytest.approx(ROBOT.range_offset, abs=3.0 * e["range_offset"].sigma)
+    assert e["range_offset"].sigma < 0.05
     assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.1)
     assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.1)
+
+
+def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
+    assert found.prediction.taken == "all"
+    assert found.prediction.gains["all"] > 100.0
+    seen = Seen.of(log, "landmarks", log["landmarks"]).holding()
+    share = float(seen.withheld.mean())
+    assert 0.0 < share < 0.2
+    scans = stretches(seen, LONG)
+    bent = dataclasses.replace(found.corrections.without_constants(), yaw_bias=0.2)
+    blunt = dataclasses.replace(bent, range_sigma=1e5, bearing_sigma=1e4)
+    for c, taken in ((bent, "noise"), (blunt, "nothing")):
+        wrong = found.judged(foretold(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise()))
+        assert wrong.prediction.taken == taken
+        assert not any(e.applied for e in wrong.estimates)
+        assert "calibration-refused" in {f.code for f in wrong.findings()}
+        assert wrong.corrections == (found.corrections.without_constants() if taken == "noise" else Corrections())
+
+
+def test_corrections_that_change_nothing_foretell_nothing_better(log, found) -> None:
+    seen = Seen.of(log, "landmarks", log["landmarks"]).holding()
+    none = dataclasses.replace(found, corrections=Corrections())
+    gains = foretold(seen, none, stretches(seen, LONG), MotionNoise()).gains
+    assert gains["all"] == pytest.approx(0.0, abs=0.01)
 
 
 def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:

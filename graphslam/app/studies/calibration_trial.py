@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import process_time
 from typing import Any
 
@@ -15,16 +15,13 @@ from graphslam.app.run.config import preset
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.studies.calibration_robot import DrawnRobot, draw_robot, drive
+from graphslam.app.studies.calibration_scanned import UNKNOWN, Added, faulty, scanned
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import Calibration
 from graphslam.core.config import as_dict
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import group_of
-from graphslam.core.records import Odometry, VelocityControls
 from graphslam.evaluate.montecarlo import Measurement
 
-UNKNOWN = "unknown"
-"""Name of a recorded log here: no preset is made for it."""
 OPTIONS: dict[str, Any] = {
     "frontend": {"association": "known", "particles": 20, "stopping": {"max_distance": 20.0}},
     "backend": {"associate": False, "merge_every": 0},
@@ -48,10 +45,12 @@ class CalibrationTrialConfig:
     """Of a drawn robot's drive."""
     lasting: bool = False
     """Do its wheels err for seconds on end?"""
-    bias: float = 0.0
-    """Added to the yaw rate of a recorded log while it moves [rad/s]."""
-    scale: float = 1.0
-    """Its distances are multiplied by this."""
+    added: Added | None = field(default_factory=Added)
+    """To the motion of a recorded log; None: drawn in each run."""
+    first: float | None = None
+    """Seconds of a log of scans that are used; None: all."""
+    ways: tuple[str, ...] = ()
+    """Maps that are made of a log of scans."""
     presets: str = ""
     """Preset whose map is compared, and whose way of reading the log is taken over without its noise."""
     frontend: str = "rbpf-ekf"
@@ -62,7 +61,11 @@ def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Mea
     with one_blas_thread():
         if not config.source:
             return list(_drawn(config, seed))
-        return list(_recorded(config, seed) if config.frontend == "rbpf-ekf" else _scanned(config, seed))
+        if config.frontend == "rbpf-ekf":
+            return list(_recorded(config, seed))
+        return list(
+            scanned(config.source, config.presets, config.frontend, config.added, config.first, config.ways, seed)
+        )
 
 
 def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
@@ -129,48 +132,14 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], seed: int) ->
             yield Measurement(name, short, float(values[key]))
 
 
-def faulty(log: SensorLog, config: CalibrationTrialConfig) -> SensorLog:
-    """A recorded log with errors added to its motion, under a name that no preset knows."""
-    streams = dict(log.streams)
-    for name, s in log.streams.items():
-        if isinstance(s, VelocityControls):
-            moving = (s.speed != 0.0) | (s.yaw_rate != 0.0)
-            streams[name] = replace(s, speed=s.speed * config.scale, yaw_rate=s.yaw_rate + config.bias * moving)
-        elif isinstance(s, Odometry):
-            g = group_of(s.increments)
-            xi = g.log(s.increments)
-            dt = np.concatenate([[0.0], np.diff(s.times)])
-            moving = (np.linalg.norm(xi[:, g.position], axis=1) > 1e-6) | (np.abs(xi[:, g.heading]) > 1e-6)
-            xi[:, g.position] *= config.scale
-            xi[:, g.heading] += config.bias * dt * moving
-            streams[name] = replace(s, increments=g.exp(xi))
-    return replace(log, name=UNKNOWN, streams=streams)
-
-
 def _recorded(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     """A log of landmarks as if unknown, and as its preset has it (without the errors that were added)."""
-    recorded = load_log_source(config.source)
-    log, own = faulty(recorded, config), preset(config.presets)
+    recorded, added = load_log_source(config.source), config.added or Added.drawn(seed)
+    log, own = faulty(recorded, added), preset(config.presets)
     begin = process_time()
     found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
     yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
     bias = next((e.value for e in found.estimates if e.name == "yaw_bias"), np.nan)
-    yield Measurement("calibrated", "yaw_bias_error", float(bias - config.bias))
+    yield Measurement("calibrated", "yaw_bias_error", float(bias - added.bias))
     yield from _mapped("calibrated", log, {**without_noise(own), "calibrate": found.config()}, seed)
     yield from _mapped("preset", replace(recorded, name=UNKNOWN), {**own, "calibrate": {"use": "none"}}, seed)
-
-
-def _scanned(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
-    """What a log of scans says before and after errors were added to its odometry."""
-    recorded = load_log_source(config.source)
-    options = without_noise(preset(config.presets))
-    values = []
-    for log in (replace(recorded, name=UNKNOWN), faulty(recorded, config)):
-        begin = process_time()
-        found = calibrate_log(log, frontend=config.frontend, config=options, seed=seed, quick=True)
-        yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
-        e = {x.name: x for x in found.estimates}
-        values.append((np.exp(e["distance_scale"].value), e["yaw_bias"].value if "yaw_bias" in e else np.nan))
-    yield Measurement("calibrated", "distance_scale_error", float(values[1][0] / values[0][0] - config.scale))
-    yield Measurement("calibrated", "yaw_bias_error", float(values[1][1] - values[0][1] - config.bias))
-    yield Measurement("calibrated", "yaw_bias_told", float(np.isfinite(values[0][1]) and np.isfinite(values[1][1])))
