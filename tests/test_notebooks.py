@@ -67,6 +67,7 @@ def test_there_are_notebooks() -> None:
         "07_one_set_of_submaps",
         "08_outdoors_and_indoors",
         "09_ten_to_the_eighth",
+        "10_where_to_drive",
         "11_your_lidar",
     } <= {p.stem for p in NOTEBOOKS}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,6 +23,14 @@ from graphslam.sim.raycast import RayCaster
 
 _BEAMS_AT_ONCE = 1 << 18
 Nearer: TypeAlias = Callable[[int, Array, Array, Array], Array]
+
+
+class Posed(Protocol):
+    """Something whose pose in the world is known at every time."""
+
+    def poses(self, t: ArrayLike) -> Array:
+        """``(n, 7)`` at times ``(n,)``."""
+        ...
 
 
 def scan_world(
@@ -62,7 +70,7 @@ def scan_world(
 
 def cast_scans(
     scans: RangeScans,
-    motion: Motion,
+    motion: Posed,
     caster: RayCaster,
     config: CrawlerConfig,
     seeds: SeedTree,
@@ -76,7 +84,7 @@ def cast_scans(
     ----------
     scans : RangeScans
         Stamps, directions and angles of the head; its ranges are not read.
-    motion : Motion
+    motion : Posed
     caster : RayCaster
     config : CrawlerConfig
     seeds : SeedTree
@@ -110,7 +118,7 @@ def cast_scans(
     return dataclasses.replace(scans, ranges=ranges)
 
 
-def scan_rays(scans: RangeScans, motion: Motion, part: slice = slice(None)) -> Array:
+def scan_rays(scans: RangeScans, motion: Posed, part: slice = slice(None)) -> Array:
     """Beams of scans in the world ``(k · m, 6)``: origins [m] and unit directions, each at its own time."""
     origin, directions = scans.head_rays(part)
     flat = directions.reshape(-1, 3)

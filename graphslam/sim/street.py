@@ -40,6 +40,8 @@ WIRE = 0.012
 """Thickness of a wire [m]."""
 RAMP_LENGTH = 3.0
 """Of a ramp along the street [m]."""
+PASSAGE = 2.0
+"""Width of a passage through a target that reaches across the street [m]."""
 FALL = 0.4
 """Beyond the edge of a drop or of stairs down so much of the ground counts as the hazard [m]."""
 _FINE = 0.025
@@ -91,6 +93,8 @@ class Street:
     """Amplitude [m], wave numbers along x and y [rad/m], phase."""
     parked: tuple[float, float] = (8.0, 3.9)
     """A parked car: along x, and distance from the middle on the side without a curb [m]."""
+    passage: float | None = None
+    """Middle along y of a passage through curbs, stairs, drops and ramps, where the ground goes on level [m]."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -105,17 +109,23 @@ class Street:
 
     def raised(self, x: Array, y: Array) -> Array:
         """What curb and target add to it."""
-        out = np.where(self.side * y > self.side_at, self.side_height, 0.0)
         u, f = x - self.target_at, self.figures
+        target: Array = np.zeros(np.broadcast(x, y).shape)
         if self.kind == "curb":
-            out = out + np.where(u > 0, f["height"], 0.0)
+            target = np.where(u > 0, f["height"], 0.0)
         elif self.kind == "stairs":
-            out = out + f["height"] * np.clip(np.ceil(u / 0.28), 0, 8)
+            target = f["height"] * np.clip(np.ceil(u / 0.28), 0, 8)
         elif self.kind == "ramp":
-            out = out + np.tan(np.deg2rad(f["angle"])) * np.clip(u, 0.0, RAMP_LENGTH)
+            target = np.tan(np.deg2rad(f["angle"])) * np.clip(u, 0.0, RAMP_LENGTH)
         elif self.kind == "hole":
-            out = out - np.where((u > 0) & (u < f["length"]) & (np.abs(y) < 0.8), f["depth"], 0.0)
-        return np.asarray(out)
+            target = -np.where((u > 0) & (u < f["length"]) & (np.abs(y) < 0.8), f["depth"], 0.0)
+        return np.asarray(np.where(self.side * y > self.side_at, self.side_height, 0.0) + self._across(y) * target)
+
+    def _across(self, y: Array) -> npt.NDArray[np.bool_]:
+        """Where along y a target that reaches across the street is."""
+        if self.passage is None:
+            return np.ones(np.shape(y), np.bool_)
+        return np.asarray(np.abs(y - self.passage) > 0.5 * PASSAGE)
 
     def height(self, x: Any, y: Any) -> Array:
         """Of the ground [m]."""
@@ -140,6 +150,8 @@ class Street:
         if self.kind == "hole":
             x.append(self.target_at + f["length"])
         y = [self.side * self.side_at] + ([-0.8, 0.8] if self.kind == "hole" else [])
+        if self.passage is not None:
+            y += [self.passage - 0.5 * PASSAGE, self.passage + 0.5 * PASSAGE]
         return np.array(x), np.array(y)
 
     def mesh(self) -> tuple[Array, npt.NDArray[np.int32]]:
@@ -208,13 +220,14 @@ class Street:
         edge = rise > step
         fine[edge] = STEP
         small = (rise > 0.5 * step) & ~edge
+        reaches = self._across(Y)
         if self.kind in ("curb", "stairs") and self.figures["height"] < -step:
-            fine[(edge & (u > -0.2)) | ((u > 0) & (u < FALL))] = HOLE
+            fine[(edge & (u > -0.2)) | (reaches & (u > 0) & (u < FALL))] = HOLE
         if self.kind == "hole":
             inside = (u > 0) & (u < self.figures["length"]) & (np.abs(Y) < 0.8)
             fine[(maximum_filter(inside.astype(np.int8), 3) > 0) & (self.figures["depth"] > step)] = HOLE
         if self.kind == "ramp" and abs(np.deg2rad(self.figures["angle"])) > slope:
-            fine[(u > 0) & (u < RAMP_LENGTH)] = STEEP
+            fine[reaches & (u > 0) & (u < RAMP_LENGTH)] = STEEP
         if self.kind == "wire" and self.figures["height"] < height:
             fine[np.abs(u) < 0.5 * WIRE + 0.5 * _FINE] = OBSTACLE
         for cx, cy, yaw in self.cars():
@@ -231,7 +244,7 @@ class Street:
         out[(out == 0) & unsure] = NEITHER
         if self.kind in ("curb", "stairs") and self.figures["height"] < -step:
             # level again below a fall, but not to be reached, and hidden in part: not judged
-            below = np.sum((u > 0).reshape(ny, k, nx, k), axis=(1, 3)) > 0
+            below = np.sum((reaches & (u > 0)).reshape(ny, k, nx, k), axis=(1, 3)) > 0
             out[(out == 0) & below] = NEITHER
         out[beyond.reshape(ny, k, nx, k).any(axis=(1, 3))] = NEITHER
         return out
@@ -328,6 +341,36 @@ class StreetRobot:
                 f"stand {self.stand}; wanted ≥ 2, in [0, 1), ≥ 0, ≥ 0"
             )
 
+    def scans(self, times: Array, *, panning: bool = True) -> RangeScans:
+        """Lines of the laser at times ``(n,)`` [s], not yet measured; one that does not pan looks to the left."""
+        elevation = np.deg2rad(self.lowest + self.beam_step * np.arange(self.beams))
+        zeros = np.zeros(self.beams)
+        if panning:
+            phase = np.mod(times / self.sweep + 0.5, 2.0)
+            spin = math.radians(self.pan) * (1.0 - 2.0 * np.abs(phase - 1.0))
+            rate = np.where(phase < 1.0, 2.0, -2.0) * math.radians(self.pan) / self.sweep
+            mount = np.array([0.0, 0.0, self.height, *PANNING_MOUNT[3:]])
+            directions = np.column_stack([np.sin(elevation), np.cos(elevation), zeros])
+        else:
+            spin = rate = np.zeros(len(times))
+            mount = np.array([0.0, 0.0, self.height, 0.0, 0.0, 0.0, 1.0])
+            directions = np.column_stack([zeros, np.cos(elevation), np.sin(elevation)])
+        return RangeScans(
+            times=times,
+            ranges=np.zeros((len(times), self.beams), np.float32),
+            directions=directions,
+            beam_times=np.linspace(0.0, 0.8 / self.line_rate, self.beams),
+            max_range=self.max_range,
+            sigma=self.range_sigma,
+            T_base_mount=mount,
+            spin=spin,
+            spin_rate=rate,
+        )
+
+    def noise(self) -> CrawlerConfig:
+        """How the laser measures."""
+        return CrawlerConfig(range_sigma=self.range_sigma, drop_out=self.drop_out, max_range=self.max_range)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetDrive:
@@ -392,42 +435,20 @@ def drive_street(
     )
     config = DriveConfig(rate=100.0, ramp=0.5, stand=robot.stand)
     motion = Balancing(way, robot.speed, config, math.radians(robot.lean), 1.0, tree.child("lean"))
-    elevation = np.deg2rad(robot.lowest + robot.beam_step * np.arange(robot.beams))
     count = int((motion.duration - 1.0 / robot.line_rate) * robot.line_rate)
-    times = np.arange(count) / robot.line_rate
-    zeros = np.zeros(robot.beams)
-    beam_times = np.linspace(0.0, 0.8 / robot.line_rate, robot.beams)
-    if aside is None:
-        phase = np.mod(times / robot.sweep + 0.5, 2.0)
-        spin = math.radians(robot.pan) * (1.0 - 2.0 * np.abs(phase - 1.0))
-        rate = np.where(phase < 1.0, 2.0, -2.0) * math.radians(robot.pan) / robot.sweep
-        mount = np.array([0.0, 0.0, robot.height, *PANNING_MOUNT[3:]])
-        directions = np.column_stack([np.sin(elevation), np.cos(elevation), zeros])
-    else:
-        spin = rate = np.zeros(count)
-        mount = np.array([0.0, 0.0, robot.height, 0.0, 0.0, 0.0, 1.0])
-        directions = np.column_stack([zeros, np.cos(elevation), np.sin(elevation)])
-    scans = RangeScans(
-        times=times,
-        ranges=np.zeros((count, robot.beams), np.float32),
-        directions=directions,
-        beam_times=beam_times,
-        max_range=robot.max_range,
-        sigma=robot.range_sigma,
-        T_base_mount=mount,
-        spin=spin,
-        spin_rate=rate,
-    )
-    sensors = CrawlerConfig(range_sigma=robot.range_sigma, drop_out=robot.drop_out, max_range=robot.max_range)
-    cast = cast_scans(scans, motion, RayCaster(*street.mesh()), sensors, tree.child("beams"))
+    scans = robot.scans(np.arange(count) / robot.line_rate, panning=aside is None)
+    cast = cast_scans(scans, motion, RayCaster(*street.mesh()), robot.noise(), tree.child("beams"))
     truth = motion.trajectory()
-    return StreetDrive(street, robot, cast, truth, _believed(truth, robot.pose_scale, tree.child("pose")))
-
-
-def _believed(truth: Trajectory, scale: float, tree: SeedTree) -> Trajectory:
-    """The path with the errors that a pose from scans, IMU and wheels has."""
-    rng, n = tree.generator(), len(truth.times)
     dt = float(np.median(np.diff(truth.times)))
+    error = pose_errors(len(truth.times), dt, robot.pose_scale, tree.child("pose"))
+    believed = Trajectory(truth.times, se3.se3_compose(truth.poses, se3.se3_exp(error)))
+    return StreetDrive(street, robot, cast, truth, believed)
+
+
+def pose_errors(n: int, dt: float, scale: float, tree: SeedTree) -> Array:
+    """Errors ``(n, 6)`` that a pose from scans, IMU and wheels has, every ``dt`` [s]: rotation [rad] and place [m]
+    in the frame of the body, times ``scale``; see `StreetRobot.pose_scale`."""
+    rng = tree.generator()
     white = np.repeat(rng.standard_normal((n, 6)), 1, axis=0) * [*[math.radians(0.05)] * 3, *[0.002] * 3]
     slow = [
         ornstein_uhlenbeck(rng, (n, 1), sigma, time, dt)
@@ -436,8 +457,7 @@ def _believed(truth: Trajectory, scale: float, tree: SeedTree) -> Trajectory:
             *((s, 3.0) for s in (0.02, 0.02, 0.01)),
         )
     ]
-    error = scale * (white + np.hstack(slow))
-    return Trajectory(truth.times, se3.se3_compose(truth.poses, se3.se3_exp(error)))
+    return scale * np.asarray(white + np.hstack(slow))
 
 
 def simulate_street(target: str, seed: int, robot: StreetRobot = StreetRobot()) -> SensorLog:

@@ -17,7 +17,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.learning import fit_calibration, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
-from graphslam.maps.terrain.plan import cost_map, plan_way, save_cost_map
+from graphslam.maps.terrain.plan import CostConfig, cost_map, plan_way, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
 from graphslam.maps.terrain.tables import BINS, Tables, calibrated, dampened, fixed_tables, noisy_or, read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
@@ -86,7 +86,7 @@ def test_a_hole_lacks_support_and_the_ground_before_and_behind_it_does_not() -> 
     # the beam over the edge meets the far wall 0.44 m below; a legal slope would lead 0.27 m down
     assert max(support[ix] for ix in range(27, 34)) >= 15
     assert all(value == 0 for ix, value in support.items() if ix < 24 or ix > 37)
-    assert all(ix in support for ix in range(8, 24))
+    assert all(ix in support for ix in range(13, 24))
 
 
 def test_stairs_down_lack_support() -> None:
@@ -403,7 +403,7 @@ def test_what_lies_ahead_on_a_simulated_street(target: str, kind: TerrainClass |
     x, y = found.centres()
     lane = np.abs(y) < 0.5
     ahead = found.classes[lane][:, (x > 15.5) & (x < 17.2)]
-    before = found.classes[lane][:, (x > 12.0) & (x < 15.0)]
+    before = found.classes[lane][:, (x > 13.5) & (x < 15.0)]
     assert np.mean(before != TerrainClass.UNKNOWN) > 0.85
     assert np.mean(before > TerrainClass.ABOVE_REACH) < 0.01
     if kind is None:
@@ -436,6 +436,34 @@ def test_ways_lead_round_hazards_and_never_through_them() -> None:
     assert plan_way(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
     with pytest.raises(DataError, match="outside the terrain map"):
         plan_way(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
+    # of several goals the cheapest to reach, closed ones left out
+    near = np.array([[5.0, 0.0], [2.0, 0.5], [3.05, -0.5]])
+    to_one = plan_way(costs, np.array([1.0, 0.0]), near)
+    assert to_one is not None
+    assert np.hypot(*(to_one.points[-1] - near[1])) < 0.1
+    # a vehicle that stands too near to a wall leaves it on its own side
+    stands = np.array([2.75, -0.5])
+    assert not np.isfinite(costs.cost[costs.index(stands)])
+    out = plan_way(costs, stands, near[1])
+    assert out is not None
+    assert np.array_equal(out.points[0], stands)
+    assert np.all(out.points[:, 0] <= 2.8)
+    assert plan_way(costs, np.array([3.05, -0.5]), near[1]) is None  # … but nothing leads out of a hazard
+
+
+def test_what_only_coarse_bands_say_costs_but_does_not_close() -> None:
+    p = Pyramid(BOX, DRIVEN, VEHICLE, SENSOR)
+    p.add(np.concatenate([row(0, 2.05, STEP, 30, many=20), row(3, 9.2, STEP, 30, many=20)]))
+    found = p.classify()
+    near, far = (2.05, 0.05), (9.2, 0.05)
+    for bands, open_ in ((None, False), (2, True), (4, False)):
+        costs = cost_map(found, VEHICLE, CostConfig(closing_bands=bands))
+        assert np.isfinite(costs.cost[costs.index(np.array(far))]) == open_
+        assert not np.isfinite(costs.cost[costs.index(np.array(near))])
+    costs = cost_map(found, VEHICLE, CostConfig(closing_bands=2))
+    assert costs.cost[costs.index(np.array(far))] > 15.0
+    with pytest.raises(ConfigError, match="closing_bands"):
+        CostConfig(closing_bands=0)
 
 
 def test_cost_maps_are_files_of_a_map_server(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ class DetectorConfig:
 
     smooth: float = 0.05
     """Heights are means over neighbours within this: of close beams, the ranges are noisier than the ground."""
-    nearest: float = 0.8
+    nearest: float = 1.3
     """Nothing is said of ground nearer than this: seen from straight above, heights are as noisy as ranges."""
     window: float = 0.3
     """Points within this of each other make a step, or neighbouring ones that are farther apart."""

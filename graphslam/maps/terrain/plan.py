@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import ConfigError, DataError, FormatError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
 from graphslam.maps.terrain.vehicle import Vehicle
+
+_LEAVE = 0.5
+"""A vehicle that stands in closed cells goes so far to an open one [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,11 +33,16 @@ class CostConfig:
     """Where a hole is not yet excluded."""
     margin: float = 0.3
     """Cost falls off over this distance from where the vehicle just fits [m]."""
+    closing_bands: int | None = None
+    """Hazards that only coarser bands than the first so many know cost, but do not close: their cells may be wider than
+    a gap between two of them, and a nearer look will tell. None: all close, as in a map that is not looked at again."""
 
     def __post_init__(self) -> None:
         for name in ("hazard", "unknown", "provisional", "margin"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"cost of terrain: {name} = {getattr(self, name)}; wanted ≥ 0")
+        if self.closing_bands is not None and self.closing_bands < 1:
+            raise ConfigError(f"cost of terrain: closing_bands = {self.closing_bands}; wanted ≥ 1, or none")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +86,8 @@ def cost_map(found: TerrainMap, vehicle: Vehicle, config: CostConfig | None = No
     """Costs of a terrain map: hazards grown by half the width of the vehicle are closed."""
     c = config or CostConfig()
     lethal = np.isin(found.classes, [int(k) for k in HAZARDS])
+    if c.closing_bands is not None:
+        lethal &= found.band < c.closing_bands
     known = found.known
     cost = 1.0 + c.hazard * np.nan_to_num(found.probability) + c.provisional * found.provisional
     cost = np.where(known, cost, 1.0 + c.unknown)
@@ -101,51 +109,59 @@ class PlannedWay:
 
 
 def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
-    """The cheapest way between two places; None where there is none.
+    """The cheapest way from a place to another one, or to one of several; None where there is none.
 
     Moves go to the eight neighbours; the cost of a move is its length times the mean cost of both cells.
 
     Parameters
     ----------
     costs : CostMap
-    start, goal : (2,)
-        [m]. The start may lie in closed cells: a vehicle stands where it stands.
+    start : (2,)
+        [m]. It may lie in closed cells, because a vehicle stands where it stands: then the way begins with a straight
+        line to the nearest open cell, if that is within 0.5 m and no hazard lies on it.
+    goal : (2,) or (k, 2)
+        [m]
 
     Raises
     ------
     DataError
         A place outside the map.
     """
-    a, b = costs.index(start), costs.index(goal)
-    ny, nx = costs.cost.shape
-    cost = costs.cost.copy()
-    cost[a] = min(cost[a], 1.0 + 1e3)
-    if not np.isfinite(cost[b]):
+    from skimage.graph import MCP_Geometric
+
+    ends = [costs.index(g) for g in np.atleast_2d(goal)]
+    ends = [b for b in ends if np.isfinite(costs.cost[b])]
+    a = _way_out(costs, costs.index(start))
+    if not ends or a is None:
         return None
-    rows, columns, weights = [], [], []
-    number = np.arange(ny * nx).reshape(ny, nx)
-    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        p = (slice(0, ny - dy), slice(max(-dx, 0), nx - max(dx, 0)))
-        q = (slice(dy, ny), slice(max(dx, 0), nx - max(-dx, 0)))
-        w = 0.5 * (cost[p] + cost[q]) * math.hypot(dx, dy) * costs.cell
-        open_ = np.isfinite(w)
-        rows.append(number[p][open_])
-        columns.append(number[q][open_])
-        weights.append(w[open_])
-    graph = coo_array(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(ny * nx, ny * nx)
-    ).tocsr()
-    first, last = int(number[a]), int(number[b])
-    distance, before = dijkstra(graph, directed=False, indices=first, return_predecessors=True)
-    if not np.isfinite(distance[last]):
+    search = MCP_Geometric(np.where(np.isfinite(costs.cost), costs.cost, -1.0))
+    totals = search.find_costs([a], ends, find_all_ends=False)[0]  # it ends at the cheapest one
+    b = min(ends, key=lambda end: totals[end])
+    if not np.isfinite(totals[b]):
         return None
-    cells = [last]
-    while cells[-1] != first:
-        cells.append(int(before[cells[-1]]))
-    iy, ix = np.divmod(np.array(cells[::-1]), nx)
+    iy, ix = np.array(search.traceback(b)).T
     points = costs.origin + costs.cell * (np.column_stack([ix, iy]) + 0.5)
+    if a != costs.index(start):
+        points = np.vstack([start, points])
     length = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    return PlannedWay(points, float(distance[last]), length)
+    return PlannedWay(points, float(totals[b]) * costs.cell, length)
+
+
+def _way_out(costs: CostMap, a: tuple[int, int]) -> tuple[int, int] | None:
+    """The open cell nearest to a cell, itself if it is open."""
+    if np.isfinite(costs.cost[a]):
+        return a
+    k = math.floor(_LEAVE / costs.cell)
+    low = max(a[0] - k, 0), max(a[1] - k, 0)
+    iy, ix = np.nonzero(np.isfinite(costs.cost[low[0] : a[0] + k + 1, low[1] : a[1] + k + 1]))
+    iy, ix = iy + low[0], ix + low[1]
+    far = np.hypot(iy - a[0], ix - a[1])
+    if not len(far) or far.min() * costs.cell > _LEAVE:
+        return None
+    best = int(np.argmin(far))
+    share = np.linspace(0.0, 1.0, 2 * k + 1)
+    on = tuple(np.round(p + share * (q[best] - p)).astype(np.int64) for p, q in zip(a, (iy, ix)))
+    return None if np.any(costs.lethal[on]) else (int(iy[best]), int(ix[best]))
 
 
 def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "scale") -> tuple[Path, Path]:
