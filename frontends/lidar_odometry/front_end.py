@@ -39,6 +39,8 @@ UNEVEN = 0.03
 """Points that an uneven motion displaces by more than the noise of a range, as data sheets have it [m], are bent."""
 MANY = 0.05
 """Share of lost scans of a submap from which a line of the verdict says so."""
+BEGUN = 3
+"""Scans at the start of a log of which the map of a sparse lidar tells nothing yet."""
 FIRST = 5
 """Scans that must have come before any is followed: an IMU whose readings begin later is left alone."""
 UNNAMED = ("auto", "none")
@@ -480,7 +482,7 @@ def _findings(key: int, kept: list[Follow], report: dict[str, Any], imu: str | N
             "a pause, or an even motion tells the turns between scans better: look at its axes, units and stamps."
         )
         out.append(Finding("look", "imu-left-aside", text))
-    if report["scans_lost"] > MANY * n:
+    if report["scans_lost"] > MANY * n + (BEGUN if key == 0 else 0):
         text = (
             f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
             "are not in it. The path there is that of an even motion, and the covariance as wide as that may be off."

@@ -76,9 +76,9 @@ class JointErrors:
         self.P[:6, :6] = 0.5 * (new + new.T)
         self.poses[0] = pose
 
-    def lay(self, scan: int) -> None:
-        """The scan of the pose of now went into the map."""
-        if self.ends:
+    def lay(self, scan: int, alone: bool = False) -> None:
+        """The scan of the pose of now went into the map; ``alone``: its pose has an error of its own."""
+        if self.ends and not alone:
             off = se3.se3_between(self.poses[-1], self.poses[0])
             near = np.linalg.norm(off[:3]) < APART[0] and np.linalg.norm(se3.so3_log(off[3:])) < APART[1]
             if near and scan - self._scan < SCANS:

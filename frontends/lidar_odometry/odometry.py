@@ -52,6 +52,10 @@ LATE = 2.5
 """Time since the last scan, in usual ones, from which a scan is looked for far and wide anyhow."""
 BETTER = 1.2
 """A place found far and wide must overlap so many times as much."""
+LITTLE = 0.1
+"""Share of the points of a scan that have a cell on the finest level below which that level says nothing of the scan.
+The rings of a sparse lidar make no surfaces before several scans are laid on each other: cells of a few chance points
+once pulled the second scan of a standing car down by 0.7 m."""
 FEW = 100
 """Points below which a scan is not matched."""
 FITS = 0.75
@@ -248,7 +252,7 @@ class LidarOdometry:
         if self.inertial is not None and seen.state in MAPPED:
             self.inertial.learn(time, self.pose, even)
         if seen.state in MAPPED:
-            self._add(self.points)
+            self._add(self.points, alone=fit is None)
             self.lost, self.anchor = 0, self.pose
         else:
             self.lost += 1
@@ -354,9 +358,9 @@ class LidarOdometry:
         # a speed that nothing holds is off for as long as nothing holds it
         Q = self.loose**2 * self.spread
         H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
-        if fit is not None and self.errors.ends and fit.overlap > 0:
+        if fit is not None and self.errors.ends:
             H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
-        if fit is not None and M.any():  # or no cell of the finest tells anything of this scan
+        if fit is not None and M.any():
             M *= np.interp(fit.misfit, *SPREADS)
             # how far residuals of a whole part of the scan agree, beside what those of one cell would
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
@@ -366,12 +370,12 @@ class LidarOdometry:
             H, M = F @ H, F @ M @ F.T
         self.errors.step(self.pose, motion, Q, H, M, self._bent(raw))
 
-    def _add(self, points: Array) -> None:
+    def _add(self, points: Array, alone: bool) -> None:
         R, t = _split(self.pose)
         world = points @ R.T + t
         for level in self.levels:
             level.add(world, self.scan)
-        self.errors.lay(self.scan)
+        self.errors.lay(self.scan, alone)
 
     # --- matching ----------------------------------------------------------------------------------------------------
 
@@ -396,7 +400,8 @@ class LidarOdometry:
             found = self._search(points, few, (predicted, self.anchor), self.wide_rotations, 6, self.levels)
             overlap, best = max(found, key=lambda x: x[0])
             if overlap > BETTER * fit.overlap:
-                pose, points, fit = self._finish(raw, chosen, best, time)
+                start = best
+                pose, points, fit = self._finish(raw, chosen, start, time)
                 state = "found again"
             if few_of_it and fit.overlap < self.config.suspicious * np.median(self.overlaps):
                 # after scans that were lost, what overlaps little is not new but elsewhere
@@ -406,6 +411,8 @@ class LidarOdometry:
                 state = "new space" if fits else "lost"
         if state == "lost":
             return predicted, None, Seen(len(points), fit.overlap, 6, state, searched)
+        if fit.known < LITTLE:
+            return start, None, Seen(len(points), fit.overlap, 6, state, searched)
         pose, unheld = self._hold(points, pose, predicted, fit)
         if state != "new space":
             self.overlaps.append(fit.overlap)

@@ -174,8 +174,12 @@ def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> tuple[Calibration, S
     notes = []
     ratio = next(e for e in estimates if e.name == "range_scale")
     if ratio.applied:
-        text = "Which of ranges and wheels has the right metre cannot be told from this log: the wheels' is taken."
-        notes.append(Finding("", "calibrated", text))
+        size = "large" if ratio.value < 0 else "small"
+        text = (
+            "Which of ranges and wheels has the right metre cannot be told from this log: the wheels' is taken. Path "
+            f"and map are {abs(ratio.value):.1%} too {size} if the ranges' is right, and no covariance knows of it."
+        )
+        notes.append(Finding("look", "metre", text))
     if lasts or alike > ALIKE:
         notes.append(_lasting_note(half, whole, alike))
     data = f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})"

@@ -18,6 +18,9 @@ from graphslam.core.log import DropCounter
 Mask = npt.NDArray[np.bool_]
 MAX_DROPPED = 0.05
 """Share of a stream's records that may be dropped."""
+STALE, STALE_TIMES = 20.0, 100.0
+"""A first record that all others follow after so long [s], and so many times what is usual between them, is an old one
+that was handed out when the recording began (a latched message)."""
 
 
 def longest_increasing(times: Array) -> Mask:
@@ -92,6 +95,11 @@ def usable_records(
         lost["repeated stamp"][out[repeated]] = True
         lost["stamp out of order"][out[~repeated]] = True
         keep[out] = False
+    some = times[keep]
+    if len(some) > 3 and some[1] - some[0] > max(STALE, STALE_TIMES * float(np.median(np.diff(some[1:])))):
+        lost["first record, long before all others"] = np.zeros(n, dtype=np.bool_)
+        lost["first record, long before all others"][np.flatnonzero(keep)[0]] = True
+        keep[np.flatnonzero(keep)[0]] = False
     if (~keep).sum() > limit * n:
         reason = max(lost, key=lambda r: int(lost[r].sum()))
         first = int(np.flatnonzero(lost[reason])[0])

@@ -222,14 +222,17 @@ def read_landmark_tables(
     landmarks, n_seen = _sightings(
         seen[0], (float(controls.times[0]), float(controls.times[-1])), range_sigma, bearing_sigma, max_range, counter
     )
-    if drops is not None:
-        drops.counts.update(counter.counts)
     stream = "controls" if isinstance(controls, VelocityControls) else "odometry"
+    lost = {
+        k if k.startswith("landmarks: ") else f"{stream}: {k.partition(': ')[2]}": v for k, v in counter.counts.items()
+    }
+    if drops is not None:
+        drops.counts.update(lost)
     return SensorLog(
         name=name or root.name,
         streams={stream: controls, "landmarks": landmarks},
         read={stream: n_controls, "landmarks": n_seen},
-        dropped=dict(counter.counts),
+        dropped=lost,
         meta={"source": root.name, "range_sigma": range_sigma, "bearing_sigma": bearing_sigma},
     )
 

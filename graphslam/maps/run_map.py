@@ -19,6 +19,7 @@ from graphslam.evidence.layout import MAX_LEVELS, half_edge
 from graphslam.evidence.views import has_view, view_of
 from graphslam.maps.clouds import fused_points
 from graphslam.maps.coarse import coarse_piece
+from graphslam.maps.contradictions import NOTHING, Contradictions, contradictions
 from graphslam.maps.export import storeys
 from graphslam.maps.fuse import FusedMap, fuse, reach_of
 from graphslam.maps.global_map import GlobalMap
@@ -74,6 +75,8 @@ class RunMap:
         poses.
     points : (n, dim) or None
         Of the submaps' clouds at the solved poses [m]; None where they have none.
+    passes : Contradictions
+        What submaps say of others that came to the same place by another way.
     coarsened : int
         Of the voxels of the submaps so many make an edge of one of the map: 1 unless it would be too wide for any pool.
     knows_space : bool
@@ -91,6 +94,7 @@ class RunMap:
     points: Array | None = None
     knows_space: bool = True
     coarsened: int = 1
+    passes: Contradictions = NOTHING
 
     def said(self) -> str:
         """What became of a map too wide for its voxels, in words; empty where nothing did."""
@@ -117,6 +121,7 @@ class RunMap:
             "level_nodes": self.divided.level_nodes,
             "bands": {name: list(band) for name, band in self.bands.items()},
             "bytes": f.nbytes,
+            "passes": self.passes.facts(),
             **clouds,
         }
 
@@ -130,6 +135,7 @@ class RunMap:
             ("map_known_volume", f.known_volume(), unit, "none"),
             ("map_entropy_open_chain", self.open_entropy, f"nat {unit}", "none"),
             ("map_known_volume_open_chain", self.open_volume, unit, "none"),
+            *((("map_denied", self.passes.share, "", "lower"),) if len(self.passes.pairs) else ()),
             ("map_pieces", len(f), "", "none"),
             ("map_megabytes", f.nbytes / 1e6, "MB", "lower"),
             *((f"map_{name}_seconds", value, "s", "lower") for name, value in seconds),
@@ -233,6 +239,7 @@ def make_run_map(
         points,
         knows_space,
         coarsened,
+        contradictions(submaps, m.base_poses[:-1]),
     )
 
 

@@ -60,6 +60,15 @@ def test_every_drop_is_counted_once_with_its_reason() -> None:
     }
 
 
+def test_a_first_record_of_long_ago_is_left_out() -> None:
+    t = np.concatenate([[-86_400.0], np.arange(0.0, 50.0, 0.1)])
+    drops = DropCounter()
+    assert list(np.flatnonzero(~usable_records(t, {}, stream="s", where="file", drops=drops))) == [0]
+    assert drops.counts == {"s: first record, long before all others": 1}
+    pause = np.concatenate([np.arange(0.0, 50.0, 0.1), np.arange(150.0, 200.0, 0.1)])
+    assert usable_records(pause, {}, stream="s", where="file", drops=drops).all()
+
+
 def test_too_many_bad_records_are_an_error() -> None:
     t = np.arange(100.0)
     drops = DropCounter()

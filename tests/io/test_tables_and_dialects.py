@@ -56,6 +56,15 @@ def test_ranges_alone_have_no_bearing(tmp_path: Path) -> None:
     assert not load(folder)["landmarks"].has_bearing.any()
 
 
+def test_records_left_out_are_counted_under_the_stream_they_were_of(tmp_path: Path) -> None:
+    root = small.tables(tmp_path / "robot")
+    lines = (root / "odometry.csv").read_text().splitlines()
+    (root / "odometry.csv").write_text("\n".join([*lines[:30], lines[29], *lines[30:]]) + "\n")
+    log = load(root)
+    assert log.dropped == {"controls: repeated stamp": 1}
+    assert log.read["controls"] == len(log["controls"].times) + 1
+
+
 def test_tables_that_lack_something_say_what(tmp_path: Path) -> None:
     folder = small.tables(tmp_path / "robot")
     (folder / "sightings.csv").unlink()

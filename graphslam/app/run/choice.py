@@ -103,8 +103,8 @@ def kind_preset(log: SensorLog) -> str:
     if PointClouds in kinds:
         return "clouds"
     seen = next((s for s in log.streams.values() if isinstance(s, LandmarkObservations)), None)
-    if seen is not None and seen.ids is not None and np.any(seen.has_bearing) and np.mean(seen.ids >= 0) >= NAMED:
-        return "named-landmarks"
+    if seen is not None and seen.ids is not None and np.mean(seen.ids >= 0) >= NAMED:
+        return "named-landmarks" if np.any(seen.has_bearing) else "named-ranges"
     return "planar-laser" if LaserScans in kinds and (Odometry in kinds or VelocityControls in kinds) else ""
 
 

@@ -457,6 +457,8 @@ def _judge(
         report["map_left_out"] = why_not
     if fused is not None and fused.said():
         report["map_coarser"] = fused.said()
+    if fused is not None and len(fused.passes.pairs):
+        report["map_passes"] = fused.passes.facts()
     used = frozenset().union(*(s.uses | s.aids for s in submaps))
     streams = stream_use(log, back.graph, settings, {**log.dropped, **drops.counts}, used)
     report["streams"] = [s.as_row() for s in streams]

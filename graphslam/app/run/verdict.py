@@ -38,6 +38,8 @@ FLAGGED = 0.05
 """Share of the submaps of honest runs that front ends may flag by chance."""
 QUARTER = 0.25
 """Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
+DENIED = (0.02, 0.05)
+"""Share of solid points that another pass denies from which the verdict asks to look at the map, and to distrust it."""
 MOSTLY = 0.95
 """Share of the records of a stream below which the verdict asks to look at what became of the others."""
 
@@ -88,7 +90,18 @@ def stated(figures: Figures) -> list[Finding]:
 
 
 _STATED = frozenset(
-    {"state", "chi2", "nees", "consistency-test", "certificate", "map-left-out", "map-coarser", "flagged", "imu-axes"}
+    {
+        "state",
+        "chi2",
+        "nees",
+        "consistency-test",
+        "certificate",
+        "map-left-out",
+        "map-coarser",
+        "passes",
+        "flagged",
+        "imu-axes",
+    }
     | {"imu-contradicted", "session"}
 )
 
@@ -313,13 +326,30 @@ def _flagged(figures: Figures) -> list[Finding]:
     return [Finding("look", "flagged", f"{text}; chance flags more than {usual:g} in one honest run of a thousand.")]
 
 
+def _passes(found: Mapping[str, Any]) -> list[Finding]:
+    """Do submaps that came to one place by two ways show the same?"""
+    share, points, doubted = found.get("share"), found.get("points"), found.get("doubted")
+    if not (isinstance(share, float) and isinstance(points, int) and points and isinstance(doubted, list)):
+        return []
+    text = f"{1 - share:.1%} of {points} solid points of submaps stand in others that came there by another way"
+    if share <= DENIED[0] and len(doubted) < 2:
+        return [Finding("good", "passes", f"{text}.")]
+    pairs = ", ".join(f"{p[0]} and {p[1]}" for p in doubted[:3] if isinstance(p, list) and len(p) == 2)
+    most = f" (most in submaps {pairs})" if pairs else ""
+    text += (
+        f"; {share:.1%} lie where these saw nothing{most}. Walls stand twice in the map where a loop is wrong or was "
+        "not closed, unless so much was moved between the passes: look at the map."
+    )
+    return [Finding("bad" if share > DENIED[1] else "look", "passes", text)]
+
+
 def _left_out(figures: Figures) -> list[Finding]:
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
         out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
     if figures.report.get("map_coarser"):
         out.append(Finding("look", "map-coarser", str(figures.report["map_coarser"])))
-    out += _flagged(figures)
+    out += [*_passes(figures.part("map_passes")), *_flagged(figures)]
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))

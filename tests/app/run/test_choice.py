@@ -11,6 +11,7 @@ import pytest
 from graphslam.app.run.choice import choose_front_end
 from graphslam.app.run.front_ends import preset_of
 from graphslam.core.errors import MissingDataError
+from graphslam.core.records import LandmarkObservations
 from graphslam.io.catalog import load
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap
@@ -35,6 +36,10 @@ def test_planar_laser_and_tables(tmp_path: Path) -> None:
     seen = log["landmarks"]
     some = replace(seen, ids=np.where(np.arange(len(seen.ids)) % 3 == 0, -1, seen.ids))
     assert preset_of(replace(log, streams={**log.streams, "landmarks": some}), "rbpf-ekf") == ("", True)
+    ranges = LandmarkObservations.range_only(
+        times=seen.times, offsets=seen.offsets, ranges=seen.ranges, ids=seen.ids, range_sigma=0.1
+    )
+    assert preset_of(replace(log, streams={**log.streams, "landmarks": ranges}), "rbpf-ekf")[0] == "named-ranges"
 
 
 def test_wheels_in_space_and_a_lidar_of_unknown_place_are_not_what_clouds_are_put_on(tmp_path: Path) -> None:

@@ -87,3 +87,25 @@ def test_times_of_points_in_another_unit(rng: np.random.Generator) -> None:
     clouds = [room(rng, 3000, 0.1 * k) for k in range(15)]
     submaps = followed(clouds, ages=rng.uniform(0, 1e5, sum(map(len, clouds))))
     assert "scans-lost" in codes(submaps, "bad")
+
+
+def rings(rng: np.random.Generator) -> np.ndarray:
+    """What 16 beams that go round see of a street: ground, and houses 20 m away with gaps."""
+    az, el = np.meshgrid(np.deg2rad(np.arange(0, 360, 1.0) + rng.uniform()), np.deg2rad(np.arange(-15.0, 15.1, 2.0)))
+    d = np.column_stack([(np.cos(el) * np.cos(az)).ravel(), (np.cos(el) * np.sin(az)).ravel(), np.sin(el).ravel()])
+    with np.errstate(divide="ignore"):
+        ground = np.where(d[:, 2] < 0, -1.8 / d[:, 2], np.inf)
+        house = np.where(np.sin(7 * az.ravel()) > -0.3, 20.0 / np.abs(d[:, :2]).max(axis=1), np.inf)
+    r = np.minimum(ground, house)
+    keep = r < 60.0
+    return d[keep] * (r[keep] + 0.02 * rng.normal(size=keep.sum()))[:, None]
+
+
+def test_a_sparse_lidar_that_stands_stays_where_it_is() -> None:
+    """Its first scans have no surface in common: cells of a few chance points are no word against standing."""
+    rng = np.random.default_rng(0)
+    submaps = followed([rings(rng) for _ in range(12)])
+    path, C = submaps[0].trajectory, submaps[0].trajectory.covariances
+    off = np.abs(path.poses[1:, :3])
+    assert off.max() < 0.03  # 0.056 if those cells were believed
+    assert np.all(off < 4.0 * np.sqrt(np.einsum("kii->ki", C[1:])[:, 3:]) + 0.02)

@@ -1,0 +1,53 @@
+"""What two passes say of each other: a room that is where it was, and one that stands beside itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphslam.app.run.verdict import Figures, stated
+from graphslam.core.poses import SE2, SE3
+from graphslam.core.submap import Submap
+from graphslam.maps.contradictions import contradictions
+from tests.reference.small_maps import room
+
+
+def passes(dim: int, off: float) -> tuple[list[Submap], np.ndarray]:
+    """A room, two places far away, and the room again, ``off`` metres from where it was."""
+    group = SE3 if dim == 3 else SE2
+    grid, n = room(group.identity, dim=dim, size=0.1 if dim == 2 else 0.2, beams=20_000), group.dof
+    submaps = [
+        Submap(
+            key=k, interval=(float(k), k + 1.0), exit_pose=group.identity, exit_covariance=1e-4 * np.eye(n), grid=grid
+        )
+        for k in range(4)
+    ]
+    bases = np.tile(group.identity, (4, 1))
+    bases[:, 0] = [0.0, 40.0, 80.0, off]
+    return submaps, bases
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_room_that_stands_beside_itself_is_denied(dim: int) -> None:
+    same = contradictions(*passes(dim, 0.1))
+    assert sorted(map(tuple, same.pairs.tolist())) == [(0, 3), (3, 0)]
+    assert same.points > 300
+    assert same.share < 0.01
+    assert not len(same.doubted)
+    moved = contradictions(*passes(dim, 1.5))
+    assert moved.share > 0.05
+    assert moved.share > 20 * same.share
+
+
+def test_verdict_says_which_passes_contradict() -> None:
+    def line(share: float, doubted: list[list[int]]) -> tuple[str, str]:
+        facts = {"pairs": 9, "points": 900, "share": share, "doubted": doubted}
+        found = [f for f in stated(Figures({"map_passes": facts}, {})) if f.code == "passes"]
+        return found[0].level, found[0].text
+
+    assert line(0.001, [])[0] == "good"
+    assert line(0.02, [[1, 5], [5, 1]])[0] == "look"
+    level, text = line(0.2, [[2, 7]])
+    assert level == "bad"
+    assert "submaps 2 and 7" in text
+    assert not [f for f in stated(Figures({}, {})) if f.code == "passes"]
