@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from graphslam.app.compare import compare
 from graphslam.app.run.files import loops_of_run, undone_of_run
 from graphslam.app.run.loops import redo_loop, undo_loop
 from graphslam.app.run.outputs import SAME_BYTES, open_run
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
+from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
+from graphslam.join.registry import join
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -40,11 +43,34 @@ def go_on(log: SensorLog, folder: Path, *, resume: bool = True) -> Run:
     return run(log, frontend="segslam", seed=2, out=folder, config=OPTIONS, resume=resume, progress=False)
 
 
+def check_that_joiners_find_the_graph(whole: Run, folder: Path) -> None:
+    """Every method ends where the run's own graph does, from the run in memory and from its folder alone."""
+    sources = {
+        "memory": submap_source(whole),
+        "folder": submap_source(folder),
+        "store": submap_source(folder / "submaps"),
+    }
+    tables = {name: compare(s.material, truth=s.truth, memory=False) for name, s in sources.items()}
+    wanted = whole.graph.objective().total
+    for table in tables.values():
+        np.testing.assert_allclose(table["objective_polished"], wanted, rtol=1e-6)
+        assert (table["nees_dof"] == 6 * len(whole.submaps)).all()
+        np.testing.assert_allclose(table["nees"], table["nees"][0], rtol=1e-4)
+    problem = sources["folder"].problem
+    assert problem.levelled
+    assert problem.dof == whole.graph.objective().dof
+    found = join(problem, "eif-tree", polish=True)
+    np.testing.assert_allclose(found.poses, whole.map.node_poses, atol=1e-5)
+    P = np.stack([found.pose_covariance(int(k)) for k in problem.bases[1:]])
+    np.testing.assert_allclose(P, whole.map.node_covariances[problem.bases[1:]], atol=1e-4 * np.abs(P).max())
+
+
 def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     whole = go_on(log, folder, resume=False)
     (loop,) = [d for d in loops_of_run(folder).current() if d.verdict == "accepted"]
     assert undone_of_run(folder) == []
+    check_that_joiners_find_the_graph(whole, folder)
     with pytest.raises(DataError, match="was not undone"):
         redo_loop(folder, loop.loop, progress=False)
 
