@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from graphslam.app.run.files import read_events, read_options
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.sessions import InnerTie, ties_of_network
 from graphslam.core.config import build
-from graphslam.core.errors import DataError, FormatError
+from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
@@ -72,11 +70,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     match = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
     loop = LoopConfig().robust(graph.structure.group.dof)
     loops = _loops(files)
-    try:
-        ties = ties_of_network(network, match)
-    except np.linalg.LinAlgError:
-        raise FormatError("a tie says nothing of a direction", where=str(files / "graph.g2o")) from None
-    for t in ties:
+    for t in ties_of_network(network, match):
         _tie(graph, t, loop if (t.i, t.j) in loops else t.robust)
     values = graph.values.copy()
     values.poses = network.poses  # ties count with the weight that they have where the run ended

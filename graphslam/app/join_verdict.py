@@ -9,6 +9,9 @@ from graphslam.app.run.verdict import bounded, number
 from graphslam.core.findings import Finding
 from graphslam.join.submap_solver import SubmapEstimate
 
+SAME = 1e-6
+"""Relative difference of two objectives that are one."""
+
 
 def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Sequence[str] = ()) -> list[Finding]:
     """Lines of a verdict on one joined map.
@@ -50,4 +53,24 @@ def _state(row: Mapping[str, Any], estimate: SubmapEstimate) -> Finding:
     if not estimate.converged:
         return Finding("bad", "state", f"Not solved: the refinement did not reach an optimum (χ² {best:.6g}).")
     gap = f", {own - best:.3g} below where the method left it" if own > best else ""
-    return Finding("good", "state", f"Solved: at the least-squares optimum, χ² {best:.6g}{gap}.")
+    return Finding("good", "state", f"Solved: at a least-squares optimum, χ² {best:.6g}{gap}.")
+
+
+def compare_verdict(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Whether all methods of a comparison end at one optimum; nothing where there was no refinement.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Of :func:`graphslam.app.compare.methods_json`.
+    """
+    ends = {r["method"]: r["objective_polished"] for r in rows if number(r["objective_polished"])}
+    if len(ends) < 2:
+        return []
+    low, high = min(ends.values()), max(ends.values())
+    if high - low <= SAME * max(low, 1.0):
+        text = f"All {len(ends)} methods end at one optimum, χ² {low:.6g}."
+        return [Finding("good", "one-optimum", text)]
+    best = ", ".join(m for m, value in ends.items() if value - low <= SAME * max(low, 1.0))
+    text = f"The methods end at different optima, χ² {low:.6g} ({best}) to {high:.6g}: the higher ones are local."
+    return [Finding("look", "one-optimum", text)]

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.core.errors import DataError, SolverError
+from graphslam.core.errors import CovarianceError, DataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
@@ -102,7 +102,10 @@ def ties_of_network(net: PoseNetwork, kernel: Robust) -> list[InnerTie]:
 
 
 def _inverse(information: Array) -> Array:
-    P = np.linalg.inv(information)
+    try:
+        P = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        raise CovarianceError("a tie says nothing of a direction", wanted="information of full rank") from None
     return 0.5 * (P + P.T)
 
 

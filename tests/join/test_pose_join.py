@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from graphslam.app.compare import compare, default_methods
-from graphslam.core.errors import ConfigError, DataError, GeometryError, UnknownNameError
+from graphslam.app.join_verdict import compare_verdict
+from graphslam.app.submap_sources import submap_source
+from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError, UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
@@ -256,6 +258,27 @@ def test_published_graphs_cut_into_submaps(
     best = polish_poses(problem, own)
     assert best.converged
     assert best.objective_polished == pytest.approx(BEST_KNOWN[file], rel=1e-6)
+
+
+def test_a_pose_graph_file_is_cut_where_it_is_named(data_dir: Path) -> None:
+    found = submap_source(data_dir / "posegraphs/intel.g2o.xz", submap_poses=100)
+    assert len(found.material.keys) == 18
+    table = compare(found.material, ["eif-tree", "batch"], memory=False)
+    np.testing.assert_allclose(table["objective_polished"], BEST_KNOWN["posegraphs/intel.g2o.xz"], rtol=1e-6)
+    assert found.times == list(range(1728))
+    with pytest.raises(MissingDataError, match="cut into some by --submap-poses"):
+        submap_source(data_dir / "posegraphs/intel.g2o.xz")
+
+
+def test_methods_that_end_apart_are_told() -> None:
+    def rows(*ends: float | None) -> list[dict]:
+        return [{"method": m, "objective_polished": e} for m, e in zip(METHODS, ends)]
+
+    assert compare_verdict(rows(3.0, None)) == []
+    (same,), (apart,) = compare_verdict(rows(3.0, 3.0 + 1e-7)), compare_verdict(rows(4.0, 3.0, 3.0))
+    assert "All 2 methods end at one optimum" in same.text
+    assert "different optima, χ² 3 (batch, eif-tree) to 4" in apart.text
+    assert apart.level == "look"
 
 
 def test_pose_graph_files_that_cannot_be_cut(data_dir: Path) -> None:

@@ -108,6 +108,7 @@ def compare(
 ) -> None:
     """Compare methods on the same submaps: objective, gap, time, memory, and NEES and CI where the truth is known."""
     from graphslam.app import compare as comparing
+    from graphslam.app.join_verdict import compare_verdict
     from graphslam.app.submap_sources import submap_source
 
     s = submap_source(source, submap_poses=submap_poses)
@@ -128,5 +129,7 @@ def compare(
         from graphslam.plots.save import save
 
         save(plot_comparison(None, found, "objective", log=True, label="objective before polishing"), figure)
-    value = comparing.methods_json(found)
-    emit(value, table(value["methods"], comparing.JSON_COLUMNS), as_json=as_json)
+    value: dict[str, Any] = comparing.methods_json(found)
+    said = compare_verdict(value["methods"])
+    value["verdict"] = [f.as_row() for f in said]
+    emit(value, "\n".join([table(value["methods"], comparing.JSON_COLUMNS), *(f.text for f in said)]), as_json=as_json)
