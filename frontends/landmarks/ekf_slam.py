@@ -186,6 +186,7 @@ class _Run:
             positions=g.mean[3:].reshape(-1, 2),
             covariance=g.covariance,
             sightings=sightings,
+            chart="group",
         )
         return Submap.from_landmarks(
             key,

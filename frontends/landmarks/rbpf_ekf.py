@@ -208,6 +208,7 @@ class RbpfEkf(FrontEnd):
             positions=handed.mean[3:].reshape(-1, 2),
             covariance=handed.covariance,
             sightings=np.column_stack([data.original[used], lm_index]),
+            chart="group" if c.handover == "smoothed" else "cartesian",  # particles: as the paper has them
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
         if c.handover != "smoothed":  # the path's end is the Gaussian's

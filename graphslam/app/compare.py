@@ -15,7 +15,7 @@ from graphslam.app.memory import MemoryProbe
 from graphslam.core.errors import DataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
-from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error, vector_pose_error
+from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
 from graphslam.join.association import Association
 from graphslam.join.registry import Material, association_of, identify, methods_for, prepared
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
 JSON_COLUMNS = (
     *("method", "objective", "objective_polished", "seconds", "peak_mb", "states", "landmarks", "nnz"),
-    *("dof", "nees_unpolished", "nees", "nees_dof", "ci_unpolished", "ci"),
+    *("dof", "nees_unpolished", "nees", "nees_plain", "nees_dof", "ci_unpolished", "ci"),
 )
 
 
@@ -42,8 +42,12 @@ def default_methods(submaps: Material) -> tuple[str, ...]:
     return tuple(m for m in DEFAULT_METHODS if m != "ekf")
 
 
-def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[float, int]:
+def map_nees(
+    estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth, *, chart: str | None = None
+) -> tuple[float, int]:
     """Joint NEES of all poses and landmarks of known truth, gauge "first base fixed", and its dimension (eq. 18).
+
+    It is taken in the chart of the map, or in another (:mod:`graphslam.core.charts`).
 
     Parameters
     ----------
@@ -52,13 +56,14 @@ def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> 
         Keys of the submaps that were joined.
     truth : MapTruth
         In the frame of the first base.
+    chart : "cartesian" or "group", optional
 
     Raises
     ------
     DataError
         Nothing in the estimate has a truth.
     """
-    error, known = _errors(estimate, keys, truth)
+    error, known = _errors(estimate, keys, truth, chart)
     if len(known) == 0:
         raise DataError("neither a pose nor a landmark has a truth", got=len(truth.keys), wanted="common keys or ids")
     if estimate.information is not None and len(known) == estimate.states:
@@ -66,8 +71,10 @@ def map_nees(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> 
     return joint_nees(error, covariance=estimate.covariance_block(known)), len(known)
 
 
-def _errors(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of all scalars of known truth, and where they stand in the state vector."""
+def _errors(
+    estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth, chart: str | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of all scalars of known truth in a chart, and where they stand in the state vector."""
     exits = getattr(estimate, "exits", None)
     if exits is not None:  # of dense submaps: in the right tangents of their exits
         i, j = match_ids(np.asarray(keys), truth.keys)
@@ -82,24 +89,27 @@ def _errors(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth) -> t
         raise DataError("truth is not two-dimensional", got=truth.exit_poses.shape, wanted="(m, 3)")
     m = len(estimate.poses) - 1
     i, j = match_ids(np.asarray(keys), truth.keys)
-    ends = vector_pose_error(estimate.poses[1 + i], truth.exit_poses[j])
+    poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # what has no truth has no error
+    poses[i] = truth.exit_poses[j]
     a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
-    landmark_error = truth.landmarks[b] - estimate.landmarks[a]
-    at = [(3 * i[:, None] + np.arange(3)).ravel(), (3 * m + 2 * a[:, None] + np.arange(2)).ravel()]
-    return np.concatenate([ends.ravel(), landmark_error.ravel()]), np.concatenate(at)
+    landmarks[a] = truth.landmarks[b]
+    at = np.concatenate([(3 * i[:, None] + np.arange(3)).ravel(), (3 * m + 2 * a[:, None] + np.arange(2)).ravel()])
+    return estimate.difference(poses, landmarks, chart=chart)[at], at
 
 
 def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:
     if truth is None:
-        return {"nees": None, "nees_dof": None, "ci": None, "rmse_poses": None, "rmse_landmarks": None}
+        unknown = ("nees", "nees_plain", "nees_dof", "ci", "rmse_poses", "rmse_landmarks")
+        return dict.fromkeys(unknown)
     d2, dof = map_nees(estimate, keys, truth)
-    error, known = _errors(estimate, keys, truth)
+    error, known = _errors(estimate, keys, truth, "cartesian")
     g = group_of(estimate.poses)
     poses = g.dof * (len(estimate.poses) - 1)
     position = (known < poses) & np.isin(known % g.dof, np.arange(g.dof)[g.position])
     landmark = known >= poses
     return {
         "nees": d2,
+        "nees_plain": map_nees(estimate, keys, truth, chart="cartesian")[0],
         "nees_dof": dof,
         "ci": float(consistency_index(d2, dof)),
         "rmse_poses": math.sqrt(g.dim * float(np.mean(error[position] ** 2))) if position.any() else None,
@@ -143,10 +153,11 @@ def compare(
     -------
     pandas.DataFrame
         ``objective`` is that of the method itself, ``objective_polished`` that of the optimum reached from it.
-        ``nees``, ``ci`` and the errors judge the map that is handed over: the polished one where there is a polish;
-        ``nees_unpolished`` and ``ci_unpolished`` the method's own. ``dof`` are the scalars measured less the free ones.
-        ``seconds`` is wall time, polish included; ``nnz`` the stored entries of the information matrix (of the dense
-        covariance for an unpolished EKF).
+        ``nees`` and ``ci`` are taken in the chart of the map, ``nees_plain`` of the plain vector. They and the errors
+        judge the map that is handed over: the polished one where there is a polish; ``nees_unpolished`` and
+        ``ci_unpolished`` the method's own. ``dof`` are the scalars measured less the free ones. ``seconds`` is wall
+        time, polish included; ``nnz`` the stored entries of the information matrix (of the dense covariance for an
+        unpolished EKF).
     """
     submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
     way = methods_for(submaps)

@@ -54,8 +54,8 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
         return np.full(n, np.nan)
     start, end = graph.values.poses[record.start], graph.values.poses[record.start + 1]
     points = np.array([graph.landmark(int(i)) for i in ids])
-    r = submap_residual(start, end, points, record.z)
-    J_start, J_end, J_point = submap_jacobians(start, end, points, tangent=True)
+    r = submap_residual(start, end, points, record.z, record.chart)
+    J_start, J_end, J_point = submap_jacobians(start, end, points, record.z, record.chart, tangent=True)
     variables = record.variables()
     column = {name: k for k, name in enumerate(variables[2:])}
     J = np.zeros((len(r), 6 + 2 * len(column)))

@@ -6,7 +6,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -87,7 +87,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
 
 
 def read_npz(
-    path: str | os.PathLike[str], *, fmt: str, fields: Mapping[str, Field] | None = None
+    path: str | os.PathLike[str], *, fmt: str, old: Sequence[str] = (), fields: Mapping[str, Field] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
     """Read the arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
 
@@ -95,6 +95,8 @@ def read_npz(
     ----------
     path : path
     fmt : str
+    old : sequence of str
+        Earlier formats that the caller reads as well.
     fields : mapping of str to Field, optional
         What the arrays must be; only these are returned, and checked. Without: all, for a caller that checks them.
 
@@ -107,7 +109,9 @@ def read_npz(
     """
     where = str(path)
     arrays = read_arrays(path)
-    check_format(str(arrays.get("format", "none")), fmt, where=where)
+    found = str(arrays.get("format", "none"))
+    if found not in old:
+        check_format(found, fmt, where=where)
     return arrays if fields is None else check_arrays(arrays, fields, where)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from graphslam.core.charts import check_chart, map_difference
 from graphslam.core.dense import CloudMap, DensePayload
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
@@ -27,8 +28,10 @@ from graphslam.core.trajectory import Trajectory
 class LandmarkMap:
     """Joint Gaussian over ``[exit pose, landmark_1, …]`` in the base frame.
 
-    In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame, and the residual is that of Combined SLAM
-    eq. 15 with the heading wrapped. In 3-D the pose block is the right tangent at the exit.
+    In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame. ``chart`` names what it is Gaussian in:
+    these coordinates themselves (the residual of Combined SLAM eq. 15 with the heading wrapped), or those of the exit's
+    own group, in which an error of the heading turns exit and landmarks together (:mod:`graphslam.core.charts`). Mean
+    and covariance are the same in both. In 3-D the pose block is the right tangent at the exit.
 
     Parameters
     ----------
@@ -44,6 +47,8 @@ class LandmarkMap:
     sightings : (q, 2) int64 or None
         Which observation (index in the log's observation stream) saw which landmark of this map: for audits of the
         association; no solver reads it.
+    chart : "cartesian" or "group"
+        Maps from elsewhere and those of the papers are Cartesian; our front ends make the other kind.
     """
 
     ids: npt.NDArray[np.int64]
@@ -52,8 +57,10 @@ class LandmarkMap:
     covariance: Array | None = None
     information: sp.csc_matrix | None = None
     sightings: npt.NDArray[np.int64] | None = None
+    chart: str = "cartesian"
 
     def __post_init__(self) -> None:
+        check_chart(self.chart)
         ids = np.ascontiguousarray(self.ids, dtype=np.int64)
         pose = np.ascontiguousarray(self.exit_pose, dtype=np.float64)
         dim = {3: 2, 7: 3}.get(pose.shape[0] if pose.ndim == 1 else -1)
@@ -131,7 +138,12 @@ class LandmarkMap:
             exit_pose=self.exit_pose,
             positions=self.positions[k],
             covariance=self.dense_covariance()[np.ix_(ix, ix)],
+            chart=self.chart,
         )
+
+    def difference(self, x: Array) -> Array:
+        """What ``x`` ``(n,)``, laid out as :attr:`mean`, differs from the mean by in this map's chart (2-D only)."""
+        return map_difference(x, self.mean, self.chart)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

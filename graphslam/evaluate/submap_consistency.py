@@ -29,7 +29,9 @@ class SubmapNees:
     landmarks : (n,)
         Of each landmark, 2 or 3 degrees of freedom.
     joint : float
-        Of exit and landmarks together.
+        Of exit and landmarks together, in the map's own chart.
+    joint_plain : float
+        The same of the plain vector: larger where the map is right about a bent world.
     joint_dof : int
     without_truth : int
         Landmarks left out because their identity is unknown or not in the truth.
@@ -40,6 +42,7 @@ class SubmapNees:
     landmark_ids: np.ndarray
     landmarks: Array
     joint: float
+    joint_plain: float
     joint_dof: int
     without_truth: int
 
@@ -73,8 +76,8 @@ def true_submap(submap: Submap, truth: Truth) -> tuple[Array, np.ndarray, Array]
 def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
     """NEES of exit, landmarks and both together.
 
-    A landmark submap is judged as the vector of Combined SLAM eq. 15 (2-D) or with the tangent at the exit (3-D);
-    a submap without landmarks by its exit alone.
+    A landmark submap is judged in its own chart, and as the vector of Combined SLAM eq. 15 beside it (2-D), or with the
+    tangent at the exit (3-D); a submap without landmarks by its exit alone. Landmarks by themselves are judged plainly.
     """
     exit_true, known, landmarks_true = true_submap(submap, truth)
     d = 3 if submap.dim == 2 else 6
@@ -87,6 +90,7 @@ def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
             landmark_ids=none.astype(np.int64),
             landmarks=none,
             joint=d2,
+            joint_plain=d2,
             joint_dof=d,
             without_truth=0,
         )
@@ -96,13 +100,16 @@ def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
     e_exit = error(m.exit_pose, exit_true)
     e_landmarks = landmarks_true - m.positions
     k = d + submap.dim * np.arange(len(m))[:, None] + np.arange(submap.dim)
+    e_plain = np.concatenate([e_exit, e_landmarks.ravel()])
+    e = e_plain if submap.dim == 3 else m.difference(np.concatenate([exit_true, landmarks_true.ravel()]))
     blocks = P[k[:, :, None], k[:, None, :]]
     return SubmapNees(
         key=submap.key,
-        exit=float(nees(e_exit, P[:d, :d])),
+        exit=float(nees(e[:d], P[:d, :d])),
         landmark_ids=m.ids,
         landmarks=nees(e_landmarks, blocks),
-        joint=joint_nees(np.concatenate([e_exit, e_landmarks.ravel()]), covariance=P),
+        joint=joint_nees(e, covariance=P),
+        joint_plain=joint_nees(e_plain, covariance=P),
         joint_dof=len(P),
         without_truth=int(np.sum(~known)),
     )

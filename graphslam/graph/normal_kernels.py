@@ -12,6 +12,16 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+@nb.njit(cache=True)
+def arc_terms(d: float) -> tuple[float, float, float]:
+    """``a``, ``b``, ``da/dd`` of ``V(d)⁻¹ = a I - b S`` (:mod:`graphslam.core.charts`)."""
+    h = 0.5 * d
+    if abs(h) < 1e-3:
+        return 1.0 - h * h / 3.0 - h**4 / 45.0, h, -h / 3.0 - 2.0 * h**3 / 45.0
+    c, s = np.cos(h), np.sin(h)
+    return h * c / s, h, 0.5 * (c / s - h / (s * s))
+
+
 class SubmapArrays(NamedTuple):
     """Landmark submaps one after the other."""
 
@@ -29,6 +39,8 @@ class SubmapArrays(NamedTuple):
     """Information matrices, flat and row-major …"""
     info_offset: Index
     """… and where they begin."""
+    group: npt.NDArray[np.bool_]
+    """(S,): the residual is taken in the group chart."""
 
 
 class SubmapBlocks(NamedTuple):
@@ -59,7 +71,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         Fill H as well.
     out : SubmapBlocks
     """
-    start, entry_offset, entry_row, z, z_offset, info, info_offset = submaps
+    start, entry_offset, entry_row, z, z_offset, info, info_offset, group = submaps
     H, H_offset, g, g_offset, chi2 = out
     for s in range(start.shape[0]):
         a, b = start[s], start[s] + 1
@@ -70,8 +82,15 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         z0 = z_offset[s]
         L = info[info_offset[s] : info_offset[s] + m * m].reshape(m, m)
         ca, sa = np.cos(poses[a, 2]), np.sin(poses[a, 2])
-        # q: everything in the start frame; r = H(X) - z (eq. 15)
+        t = poses[b, 2] - poses[a, 2] - z[z0 + 2]
+        t = np.pi - ((np.pi - t) % (2.0 * np.pi))
+        va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
+        if group[s]:
+            va, vb, slope = arc_terms(t)
+            half = 0.5
+        # q: everything in the start frame; r = H(X) - z (eq. 15) in its chart; h: what it changes by with the heading
         q = np.empty((n + 1, 2))
+        h = np.empty((n + 1, 2))
         r = np.empty(m)
         for i in range(n + 1):
             if i == 0:
@@ -82,10 +101,10 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
             q[i, 0] = ca * dx + sa * dy
             q[i, 1] = -sa * dx + ca * dy
             k = 0 if i == 0 else 1 + 2 * i
-            r[k] = q[i, 0] - z[z0 + k]
-            r[k + 1] = q[i, 1] - z[z0 + k + 1]
-        t = poses[b, 2] - poses[a, 2] - z[z0 + 2]
-        r[2] = np.pi - ((np.pi - t) % (2.0 * np.pi))
+            ex, ey = q[i, 0] - z[z0 + k], q[i, 1] - z[z0 + k + 1]
+            r[k], r[k + 1] = va * ex + vb * ey, va * ey - vb * ex
+            h[i, 0], h[i, 1] = slope * ex + half * ey, slope * ey - half * ex
+        r[2] = t
         Lr = L @ r
         chi2[s] = np.dot(r, Lr)
         if not hessian:
@@ -93,10 +112,13 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         ce, se = np.cos(poses[b, 2] - poses[a, 2]), np.sin(poses[b, 2] - poses[a, 2])
         M = np.zeros((m, d))  # Λ J, column block by column block
         for row in range(m):
-            sx, sy, st = 0.0, 0.0, -L[row, 2]
+            sx, sy, st = 0.0, 0.0, 0.0
+            turn = L[row, 2]
             for i in range(n + 1):
                 k = 0 if i == 0 else 1 + 2 * i
                 lx, ly = L[row, k], L[row, k + 1]
+                turn += lx * h[i, 0] + ly * h[i, 1]
+                lx, ly = va * lx - vb * ly, vb * lx + va * ly
                 sx += lx
                 sy += ly
                 st += lx * q[i, 1] - ly * q[i, 0]
@@ -107,16 +129,19 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
                 else:  # d/dl: R_sᵀ
                     M[row, c] = lx * ca - ly * sa
                     M[row, c + 1] = lx * sa + ly * ca
-            M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st
-            M[row, 5] = L[row, 2]
+            M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st - turn
+            M[row, 5] = turn
         h0 = H_offset[s]
         g0 = g_offset[s]
         B = H[h0 : h0 + d * d].reshape(d, d)
         for c in range(d):  # Jᵀ M, the same sparsity of J applied to rows
-            sx, sy, st = 0.0, 0.0, -M[2, c]
+            sx, sy, st = 0.0, 0.0, 0.0
+            turn = M[2, c]
             for i in range(n + 1):
                 k = 0 if i == 0 else 1 + 2 * i
                 lx, ly = M[k, c], M[k + 1, c]
+                turn += lx * h[i, 0] + ly * h[i, 1]
+                lx, ly = va * lx - vb * ly, vb * lx + va * ly
                 sx += lx
                 sy += ly
                 st += lx * q[i, 1] - ly * q[i, 0]
@@ -126,8 +151,8 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
                 else:
                     B[4 + 2 * i, c] = lx * ca - ly * sa
                     B[5 + 2 * i, c] = lx * sa + ly * ca
-            B[0, c], B[1, c], B[2, c] = -sx, -sy, st
-            B[5, c] = M[2, c]
+            B[0, c], B[1, c], B[2, c] = -sx, -sy, st - turn
+            B[5, c] = turn
         for c in range(d):
             v = 0.0
             for row in range(m):

@@ -150,7 +150,7 @@ class PoseGraph(GraphRecord):
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         self._start_landmarks(ids, se2_transform(self.pose(node), lm.positions))
-        record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W)
+        record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W, chart=lm.chart)
         ends = np.stack([np.zeros(3), submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)

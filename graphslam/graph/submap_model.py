@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphslam.core.charts import arc_terms, map_difference
 from graphslam.core.geometry import Array, rotation2, wrap_angle
 
 
@@ -35,15 +36,15 @@ def predict_submap(start: Array, end: Array, landmarks: Array) -> Array:
     return out
 
 
-def submap_residual(start: Array, end: Array, landmarks: Array, z: Array) -> Array:
-    """``H(X) - z`` with the heading wrapped, ``(3 + 2n,)``."""
-    r = predict_submap(start, end, landmarks) - z
-    r[2] = wrap_angle(r[2])
-    return r
+def submap_residual(start: Array, end: Array, landmarks: Array, z: Array, chart: str = "cartesian") -> Array:
+    """``H(X) - z`` ``(3 + 2n,)`` in the coordinates of a chart, the heading wrapped."""
+    return map_difference(predict_submap(start, end, landmarks), z, chart)
 
 
-def submap_jacobians(start: Array, end: Array, landmarks: Array, *, tangent: bool) -> tuple[Array, Array, Array]:
-    """Jacobians of :func:`predict_submap`.
+def submap_jacobians(
+    start: Array, end: Array, landmarks: Array, z: Array, chart: str = "cartesian", *, tangent: bool
+) -> tuple[Array, Array, Array]:
+    """Jacobians of :func:`submap_residual`.
 
     Parameters
     ----------
@@ -54,9 +55,9 @@ def submap_jacobians(start: Array, end: Array, landmarks: Array, *, tangent: boo
     -------
     J_start : (3 + 2n, 3)
     J_end : (3 + 2n, 3)
-        Only its first three rows are non-zero.
+        In a Cartesian chart only its first three rows are non-zero.
     J_landmark : (2, 2)
-        The same ``R(θ_s)ᵀ`` for every landmark, in that landmark's own two rows.
+        The same ``V⁻¹ R(θ_s)ᵀ`` for every landmark, in that landmark's own two rows (``V = I`` in a Cartesian chart).
     """
     n = len(landmarks)
     Rt = rotation2(start[2]).T
@@ -64,14 +65,22 @@ def submap_jacobians(start: Array, end: Array, landmarks: Array, *, tangent: boo
     p[0] = end[:2] - start[:2]
     p[1:] = landmarks - start[:2]
     q = p @ Rt.T  # everything in the start frame
-    dq = np.stack([q[:, 1], -q[:, 0]], -1)  # d(Rᵀ v)/dθ_s = Rᵀ rotated by -90°
+    Vi, bent = np.eye(2), np.zeros((1 + n, 2))
+    if chart == "group":
+        d = wrap_angle(end[2] - start[2] - z[2])
+        a, b, slope = (float(v) for v in arc_terms(d))
+        Vi = np.array([[a, b], [-b, a]])
+        e = q - np.concatenate([z[:2], z[3:]]).reshape(-1, 2)
+        bent = e @ np.array([[slope, 0.5], [-0.5, slope]]).T  # d(V⁻¹ e)/dd
+    dq = np.stack([q[:, 1], -q[:, 0]], -1) @ Vi.T - bent  # d(Rᵀ v)/dθ_s = Rᵀ rotated by -90°
     J_start = np.zeros((3 + 2 * n, 3))
-    A = -np.eye(2) if tangent else -Rt
+    A = -Vi if tangent else -Vi @ Rt
     J_start[0:2, :2], J_start[0:2, 2] = A, dq[0]
     J_start[2, 2] = -1.0
     J_start[3:, :2] = np.tile(A, (n, 1))
     J_start[3:, 2] = dq[1:].ravel()
     J_end = np.zeros((3 + 2 * n, 3))
-    J_end[:2, :2] = Rt @ rotation2(end[2]) if tangent else Rt
+    J_end[:2, :2] = Vi @ Rt @ rotation2(end[2]) if tangent else Vi @ Rt
+    J_end[:2, 2], J_end[3:, 2] = bent[0], bent[1:].ravel()
     J_end[2, 2] = 1.0
-    return J_start, J_end, Rt
+    return J_start, J_end, Vi @ Rt

@@ -1,4 +1,4 @@
-"""One submap as the arrays of its npz file, and back (``graphslam.submap/1``). No pickles; extra arrays are ignored."""
+"""One submap as the arrays of its npz file, and back (``graphslam.submap/2``). No pickles; extra arrays are ignored."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from graphslam.core.charts import check_chart
 from graphslam.core.dense import CloudMap
-from graphslam.core.errors import DataError, FormatError
+from graphslam.core.errors import ConfigError, DataError, FormatError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.json_file import check_json, parse_json
@@ -19,7 +20,9 @@ from graphslam.core.npz import check_arrays, flags, floats, ints, texts
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 
-SUBMAP_FORMAT = "graphslam.submap/1"
+SUBMAP_FORMAT = "graphslam.submap/2"
+OLD_FORMATS = ("graphslam.submap/1",)
+"""Without ``chart``: all landmark maps were Cartesian."""
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -39,6 +42,7 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         "report": json.dumps(dict(submap.report), sort_keys=True, default=_plain),
     }
     landmarks = submap.landmarks
+    arrays["chart"] = "cartesian" if landmarks is None else landmarks.chart
     if landmarks is None:  # what measures the exit alone is still a joint Gaussian over [exit pose]
         P = submap.exit_covariance
         arrays["covariance"] = tangent_to_vector_covariance(submap.exit_pose, P) if d == 2 else P
@@ -128,6 +132,7 @@ _FIELDS = {
     "used": texts("u", optional=True),
     "aided": texts("a", optional=True),
     "report": texts(optional=True),
+    "chart": texts(optional=True),
     "landmark_ids": ints("l", optional=True),
     "landmarks": floats("l", "c", optional=True),
     "covariance": floats("v", "v", optional=True),
@@ -181,7 +186,15 @@ def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
         covariance=a.get("covariance"),
         information=information,
         sightings=a.get("sightings"),
+        chart=_chart(a, where),
     )
+
+
+def _chart(a: Arrays, where: str) -> str:
+    try:
+        return check_chart(str(a.get("chart", "cartesian")))
+    except ConfigError as error:
+        raise FormatError(str(error), where=where) from None
 
 
 def _trajectory(a: Arrays, where: str) -> Trajectory | None:

@@ -8,6 +8,10 @@ the values B gives them, and then
 
 which is eq. 16 with ``i = I X`` (eq. 13) subtracted on both sides: in this residual form a heading can be wrapped.
 Nothing is marginalised out, so ``I`` keeps only the couplings that submaps made.
+
+Maps that are Gaussian in the group chart (:mod:`graphslam.core.charts`) are joined in it: every landmark hangs on the
+end of the submap that saw it first, and B's observation is linearised again, inside the join, where A and B together
+put it. The inner Gaussians of A and B stay summarised, so it is an information filter still, an iterated one.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.geometry import Array
 from graphslam.join import kernels
 from graphslam.join.joined_map import JoinedMap, JoinTimes
 from graphslam.linear.symmetric_factor import elimination_order
@@ -37,6 +42,11 @@ def match_by_id(a: JoinedMap, b: JoinedMap) -> Index:
     return np.where(a.ids[candidate] == b.ids, candidate, -1).astype(np.intp)
 
 
+_PASSES = 3
+# … and no more of them once a step is a thousandth of a standard deviation.
+_STEP = 1e-3
+
+
 def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None = None) -> JoinedMap:
     """Join B, which starts where A ends, to A.
 
@@ -54,9 +64,11 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
         In the frame of A's first base.
     """
     times = times or JoinTimes()
+    if a.anchor is not None and b.anchor is not None:
+        return _join_along_arcs(a, b, match, times)
     with times.measure("update"):
-        joined, gradient = _assemble(a, b, match)
-    if gradient is None:  # nothing in B was known before: the mean stays, and no factorisation is needed
+        joined, gradient, news = _assemble(a, b, match, blocks_of(a), blocks_of(b), np.zeros(len(b.x)))
+    if not news:  # nothing in B was known before: the mean stays, and no factorisation is needed
         return joined
     with times.measure("recovery"):
         _keep_order_sparse(joined)
@@ -64,19 +76,64 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
     return joined
 
 
-def _assemble(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[JoinedMap, npt.NDArray[np.float64] | None]:
-    """The joined map at its values before the update, and ``∇Hᵀ I_B (x_B - H(X))`` there (None: zero)."""
-    N, m_b = len(a.width), len(b.pose_node)
+def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes) -> JoinedMap:
+    """The same in the group chart.
+
+    A and B stay the Gaussians they are, each along its own arcs. The values at which they meet are found by a few
+    Gauss–Newton passes, and what both say together is carried to where the passes end.
+    """
+    assert a.anchor is not None
+    assert b.anchor is not None
+    x, symbolic, left = a.x, None, _PASSES
+    first, second, start = blocks_of(a), blocks_of(b), int(a.pose_node[-1])
+    while True:
+        with times.measure("update"):
+            image, *_ = _image(a, b, match)
+            seen = kernels.predicted(first, second, image, start, x)
+            if left == _PASSES and np.all(np.abs(seen - b.x) < _ROUNDING * (1.0 + np.abs(b.x))):
+                return _assemble(a, b, match, first, second, np.zeros(len(b.x)))[0]  # no news
+            ours, g_a = kernels.pulled_back(first, a.anchor, x[: len(a.x)])
+            theirs, g_b = kernels.pulled_back(second, b.anchor, seen)
+            joined, gradient, _ = _assemble(a, b, match, ours, theirs, -g_b)
+        with times.measure("recovery"):
+            if symbolic is None:
+                _keep_order_sparse(joined)
+                symbolic, order, fill = joined.symbolic(), joined.order, joined.fill
+            joined.take_symbolic(symbolic, order, fill)  # all passes have one pattern
+            if left == 0:
+                return joined
+            gradient[: len(g_a)] -= g_a
+            step = joined.factor().solve(gradient)
+            x = _along_arcs(joined, step)
+            left = 0 if gradient @ step < _STEP**2 else left - 1
+
+
+def _along_arcs(m: JoinedMap, step: Array) -> Array:
+    """Values ``(n,)`` of a map after a step: headings by what it says, positions along the arcs of their anchors."""
+    assert m.anchor is not None
+    at = np.cumsum(m.width) - m.width
+    pose = m.width == 3
+    d = step[at[m.anchor] + 2]
+    small = np.abs(d) < 1e-6
+    safe = np.where(small, 1.0, d)
+    along = np.where(small, 1.0, np.sin(safe) / safe)  # V = along I + across S
+    across = np.where(small, 0.5 * d, (1.0 - np.cos(safe)) / safe)
+    x = m.x.copy()
+    x[at] += along * step[at] - across * step[at + 1]
+    x[at + 1] += across * step[at] + along * step[at + 1]
+    x[at[pose] + 2] += step[at[pose] + 2]
+    return x
+
+
+def _assemble(
+    a: JoinedMap, b: JoinedMap, match: Index, ours: kernels.BlockMap, theirs: kernels.BlockMap, pull: Array
+) -> tuple[JoinedMap, Array, bool]:
+    """The joined map before the update of its mean, ``∇Hᵀ (I_B (x_B - H(X)) + pull)`` there, and whether B has news."""
+    N = len(a.width)
     new = np.flatnonzero(match < 0)
-    image = np.empty(len(b.width), dtype=np.int64)
-    pose_node = N + np.arange(m_b)
-    image[b.pose_node] = pose_node
-    landmark_node = np.empty(len(match), dtype=np.int64)
-    landmark_node[match >= 0] = a.landmark_node[match[match >= 0]]
-    landmark_node[new] = N + m_b + np.arange(len(new))
-    image[b.landmark_node] = landmark_node
+    image, pose_node, landmark_node = _image(a, b, match)
     x, width, ptr, neighbours, block, values, gradient, news = kernels.join_blocks(
-        _blocks(a), _blocks(b), image, int(a.pose_node[-1]), _ROUNDING
+        ours, theirs, image, int(a.pose_node[-1]), _ROUNDING, pull
     )
     place = np.where(match >= 0, match, len(a.landmark_node) + np.cumsum(match < 0) - 1).astype(np.intp)
     came = image[b.order]
@@ -98,9 +155,33 @@ def _assemble(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[JoinedMap, npt.
         entry_count=np.append(a.entry_count, b.entry_count),
         order=np.append(a.order, came[came >= N]) if rank is None else np.argsort(rank),
         fill=max(a.fill, b.fill),
+        anchor=_anchors(a, b, image, len(width)),
         rank=rank,
     )
-    return joined, gradient if news else None
+    return joined, gradient, bool(news)
+
+
+def _image(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[Index, Index, Index]:
+    """Node of the joined map that each node of B ``(N_b,)``, each of its poses, and each of its landmarks is."""
+    N, m_b = len(a.width), len(b.pose_node)
+    new = np.flatnonzero(match < 0)
+    image = np.empty(len(b.width), dtype=np.int64)
+    image[b.pose_node] = pose_node = N + np.arange(m_b)
+    landmark_node = np.empty(len(match), dtype=np.int64)
+    landmark_node[match >= 0] = a.landmark_node[match[match >= 0]]
+    landmark_node[new] = N + m_b + np.arange(len(new))
+    image[b.landmark_node] = landmark_node
+    return image, pose_node, landmark_node
+
+
+def _anchors(a: JoinedMap, b: JoinedMap, image: Index, nodes: int) -> Index | None:
+    """What each node of the joined map hangs on: as in A, and what is new as in B."""
+    if a.anchor is None or b.anchor is None:
+        return None
+    anchor = np.empty(nodes, dtype=np.int64)
+    anchor[image] = image[b.anchor]
+    anchor[: len(a.anchor)] = a.anchor
+    return anchor
 
 
 def _keep_order_sparse(joined: JoinedMap) -> None:
@@ -110,5 +191,5 @@ def _keep_order_sparse(joined: JoinedMap) -> None:
         joined.reorder(elimination_order(owner, joined.neighbours, len(joined.width)).astype(np.int64))
 
 
-def _blocks(m: JoinedMap) -> kernels.BlockMap:
+def blocks_of(m: JoinedMap) -> kernels.BlockMap:
     return kernels.BlockMap(m.x, m.width, m.ptr, m.neighbours, m.block, m.values)

@@ -130,6 +130,11 @@ def check_chain(submaps: Sequence[Submap], *, identified: bool) -> None:
         raise DataError("there are no submaps", got=0, wanted="at least one")
 
 
+def in_group_chart(submaps: Sequence[Submap]) -> bool:
+    """Whether all submaps that have landmarks are Gaussian in the group chart."""
+    return all(s.landmarks is None or s.landmarks.chart == "group" for s in submaps)
+
+
 def distinct_landmarks(submap: Submap, *, identified: bool) -> tuple[LandmarkMap, Index]:
     """The landmark map of a submap with each landmark once, and which of them each entry became.
 
@@ -174,6 +179,9 @@ class JoinedMap:
         Elimination order of the nodes.
     fill : float
         Entries of the factor per entry of the matrix under the last fresh order.
+    anchor : (N,), optional
+        In the group chart (:mod:`graphslam.core.charts`): the pose that each node hangs on, the end of the submap that
+        saw it first; of a pose itself. None: the chart is Cartesian.
     rank : (N,), optional
         When each node is eliminated under an order of all that will ever be joined; then no other is looked for.
     """
@@ -191,6 +199,7 @@ class JoinedMap:
     entry_count: Nodes
     order: Nodes
     fill: float
+    anchor: Nodes | None = None
     rank: Nodes | None = None
     _symbolic: BlockSymbolic | None = field(default=None, init=False, repr=False)
     _factor: BlockFactor | None = field(default=None, init=False, repr=False)
@@ -228,6 +237,10 @@ class JoinedMap:
         self._symbolic = self._factor = None
         self.fill = self.symbolic().nnz / len(self.values)
 
+    def take_symbolic(self, symbolic: BlockSymbolic, order: Nodes, fill: float) -> None:
+        """Take what a map of the same pattern knows of its factorisation."""
+        self.order, self.fill, self._symbolic, self._factor = order, fill, symbolic, None
+
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` by sparse solves (Algorithm 1)."""
         return self.factor().inverse_block(indices)
@@ -264,17 +277,21 @@ class JoinedMap:
         return cls.leaves([submap], identified=identified)[0][0]
 
     @classmethod
-    def leaves(cls, submaps: Sequence[Submap], *, identified: bool) -> tuple[list[JoinedMap], list[Array] | None]:
+    def leaves(
+        cls, submaps: Sequence[Submap], *, identified: bool, classical: bool = False
+    ) -> tuple[list[JoinedMap], list[Array] | None]:
         """Every submap as a joined map, and the information matrices of all of them as they stand in the submaps.
 
-        The latter is None where entries of one id had to be fused.
+        The latter is None where entries of one id had to be fused. Maps are joined in the group chart where all
+        submaps with landmarks are of that chart, unless a ``classical`` filter is asked for.
         """
+        group = not classical and in_group_chart(submaps)
         maps: list[JoinedMap] = []
         matrices: list[Array] | None = []
         for submap in submaps:
             fused, entries = distinct_landmarks(submap, identified=identified)
             matrix = dense_information(fused, what=f"submap {submap.key}")
-            maps.append(cls.of_landmarks(fused, entries, matrix, identified=identified))
+            maps.append(cls.of_landmarks(fused, entries, matrix, identified=identified, group=group))
             if len(fused) < len(entries):
                 matrices = None
             elif matrices is not None:
@@ -282,7 +299,9 @@ class JoinedMap:
         return maps, matrices
 
     @classmethod
-    def of_landmarks(cls, landmarks: LandmarkMap, entries: Index, information: Array, *, identified: bool) -> JoinedMap:
+    def of_landmarks(
+        cls, landmarks: LandmarkMap, entries: Index, information: Array, *, identified: bool, group: bool = False
+    ) -> JoinedMap:
         """A landmark map, each landmark once, its information matrix, and which landmark each entry became."""
         n = len(landmarks)
         width = np.full(n + 1, 2, dtype=np.int64)
@@ -304,6 +323,7 @@ class JoinedMap:
             entry_count=np.array([len(entries)]),
             order=nodes,
             fill=0.5,
+            anchor=np.zeros(n + 1, dtype=np.int64) if group else None,
         )
 
 
@@ -387,4 +407,6 @@ def finish(
         times=dict(times.parts),
         submap_ids=submap_ids,
         problem=problem,
+        chart="group" if isinstance(view, JoinedMap) and view.anchor is not None else "cartesian",
+        anchors=problem.anchors,
     )

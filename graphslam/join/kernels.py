@@ -12,6 +12,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.graph.normal_kernels import arc_terms
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
@@ -33,7 +35,7 @@ class BlockMap(NamedTuple):
 
 @nb.njit(cache=True)
 def join_blocks(
-    known: BlockMap, new: BlockMap, image: Index, start: int, rounding: float
+    known: BlockMap, new: BlockMap, image: Index, start: int, rounding: float, pull: Array
 ) -> tuple[Array, Index, Index, Index, Index, Array, Array, bool]:
     """Add map B, seen from node ``start`` of map A, to A (eq. 15–16).
 
@@ -47,13 +49,15 @@ def join_blocks(
         The pose of A where B begins.
     rounding : float
         Innovations smaller than this, relative to 1 + the value, are arithmetic and count as zero.
+    pull : (n_b,)
+        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`pulled_back`), less its sign.
 
     Returns
     -------
     x, width, ptr, idx, block, value
         Joined map before the update of its mean.
     gradient : (n,)
-        ``∇Hᵀ I_B (z - H(X))`` there.
+        ``∇Hᵀ (I_B (z - H(X)) + pull)`` there.
     news : bool
         Whether it differs from zero.
     """
@@ -116,6 +120,8 @@ def join_blocks(
     for b in range(NB):
         v, wb = b_at[b], b_width[b]
         u = np.zeros(3)
+        for p in range(wb):
+            u[p] = pull[v + p]
         for e in range(b_ptr[b], b_ptr[b + 1]):
             h, wh, k = b_at[b_idx[e]], b_width[b_idx[e]], b_block[e]
             for p in range(wb):
@@ -227,6 +233,179 @@ def join_blocks(
                     new_value[to + 3 * d + d2] += own[d, d2]
         new_ptr[i + 1] = e
     return out, new_width, new_ptr, new_idx[:e].copy(), new_block[:e].copy(), new_value[:k].copy(), gradient, news
+
+
+@nb.njit(cache=True)
+def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
+    """``H(X)``: the nodes of map B ``(n_b,)`` as seen from node ``start`` of the joined map at its ``values`` ``(n,)``.
+
+    Values end where those of A do on the first call; what is new is then where B has it.
+    """
+    N = len(known.width)
+    at = np.zeros(len(image) + N + 1, np.int64)
+    n = 0
+    for i in range(N):
+        at[i] = n
+        n += known.width[i]
+    for b in range(len(image)):
+        if image[b] >= N:
+            at[image[b]] = new.width[b]
+    for i in range(N, len(at)):
+        w = at[i]
+        at[i] = n
+        n += w
+    sx, sy, st = values[at[start]], values[at[start] + 1], values[at[start] + 2]
+    c, s = np.cos(st), np.sin(st)
+    out = new.x.copy()
+    v = 0
+    for b in range(len(image)):
+        i = at[image[b]]
+        if i < len(values):
+            dx, dy = values[i] - sx, values[i + 1] - sy
+            out[v], out[v + 1] = c * dx + s * dy, c * dy - s * dx
+            if new.width[b] == 3:
+                out[v + 2] = values[i + 2] - st
+        v += new.width[b]
+    return out
+
+
+@nb.njit(cache=True)
+def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
+    """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
+
+    With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
+    says ``uᵀ I u``: its matrix at x is ``Jᵀ I J`` and its gradient ``Jᵀ I u``. A node moves along the arc of its
+    anchor's heading, so the anchor's column couples with all that the node is coupled with.
+
+    Parameters
+    ----------
+    m : BlockMap
+    anchor : (N,)
+        Pose that each node hangs on; of a pose itself.
+    x : (n,)
+
+    Returns
+    -------
+    BlockMap
+        At ``x``.
+    gradient : (n,)
+    """
+    mean, width, ptr, idx, block, value = m
+    N = len(width)
+    at = np.zeros(N + 1, np.int64)
+    for i in range(N):
+        at[i + 1] = at[i] + width[i]
+    arc = np.empty((N, 4))  # a, b of V⁻¹; the column of the anchor's heading
+    u = np.empty(at[N])
+    for i in range(N):
+        k, p = at[i], at[anchor[i]] + 2
+        d = x[p] - mean[p]
+        d -= 2.0 * np.pi * np.floor((d + np.pi) / (2.0 * np.pi))
+        a, b, slope = arc_terms(d)
+        ex, ey = x[k] - mean[k], x[k + 1] - mean[k + 1]
+        arc[i] = a, b, slope * ex + 0.5 * ey, slope * ey - 0.5 * ex
+        u[k], u[k + 1] = a * ex + b * ey, a * ey - b * ex
+        if width[i] == 3:
+            u[k + 2] = d
+
+    gradient = np.zeros(at[N])
+    for i in range(N):
+        k, wi = at[i], width[i]
+        y0, y1, y2 = 0.0, 0.0, 0.0
+        for e in range(ptr[i], ptr[i + 1]):
+            j, f = at[idx[e]], block[e]
+            wj = width[idx[e]]
+            for q in range(wj):
+                y0 += value[f + q] * u[j + q]
+                y1 += value[f + wj + q] * u[j + q]
+                if wi == 3:
+                    y2 += value[f + 2 * wj + q] * u[j + q]
+        a, b, hx, hy = arc[i]
+        gradient[k] += a * y0 - b * y1
+        gradient[k + 1] += b * y0 + a * y1
+        gradient[at[anchor[i]] + 2] += hx * y0 + hy * y1 + y2
+
+    begin = np.zeros(N + 1, np.int64)  # of the nodes that hang on each pose
+    for i in range(N):
+        if anchor[i] != i:
+            begin[anchor[i] + 1] += 1
+    for i in range(N):
+        begin[i + 1] += begin[i]
+    fill = begin[:-1].copy()
+    hanging = np.empty(begin[N], np.int64)
+    for i in range(N):
+        if anchor[i] != i:
+            hanging[fill[anchor[i]]] = i
+            fill[anchor[i]] += 1
+
+    new_ptr = np.zeros(N + 1, np.int64)
+    seen = np.full(N, -1, np.int64)
+    room = 0
+    for sweep in range(2):  # count, then write
+        if sweep:
+            new_idx = np.empty(new_ptr[N], np.int64)
+            new_block = np.empty(new_ptr[N], np.int64)
+            out = np.zeros(room)
+            seen[:] = -1
+        else:
+            new_idx, new_block, out = np.empty(N, np.int64), np.empty(0, np.int64), np.empty(0)
+        e, k = 0, 0
+        for r in range(N):
+            first = e
+            wr = width[r]
+            base = e if sweep else 0  # when counting, one row at a time is kept
+            count = 0
+            for part in range(-1, begin[r + 1] - begin[r]):
+                i = r if part < 0 else hanging[begin[r] + part]
+                for f in range(ptr[i], ptr[i + 1]):
+                    j = idx[f]
+                    if seen[j] < first:
+                        seen[j] = first + count
+                        new_idx[base + count] = j
+                        count += 1
+            direct = count
+            for c in range(direct):
+                j = anchor[new_idx[base + c]]
+                if seen[j] < first:
+                    seen[j] = first + count
+                    new_idx[base + count] = j
+                    count += 1
+            e += count
+            new_ptr[r + 1] = e
+            if not sweep:
+                for c in range(count):
+                    room += wr * width[new_idx[c]]
+                continue
+            for c in range(first, e):
+                new_block[c] = k
+                k += wr * width[new_idx[c]]
+            # Jᵀ I: rows of the node itself, then the heading row by all that hangs on it
+            a, b, hx, hy = arc[r]
+            for f in range(ptr[r], ptr[r + 1]):
+                wj, v, t = width[idx[f]], block[f], new_block[seen[idx[f]]]
+                for q in range(wj):
+                    y0, y1 = value[v + q], value[v + wj + q]
+                    out[t + q], out[t + wj + q] = a * y0 - b * y1, b * y0 + a * y1
+                    if wr == 3:
+                        out[t + 2 * wj + q] = value[v + 2 * wj + q] + hx * y0 + hy * y1
+            for h in range(begin[r], begin[r + 1]):
+                i = hanging[h]
+                hx, hy = arc[i, 2], arc[i, 3]
+                for f in range(ptr[i], ptr[i + 1]):
+                    wj, v, t = width[idx[f]], block[f], new_block[seen[idx[f]]]
+                    for q in range(wj):
+                        out[t + 2 * wj + q] += hx * value[v + q] + hy * value[v + wj + q]
+            # times J: the same by columns
+            for c in range(first, first + direct):
+                j = new_idx[c]
+                wj, t = width[j], new_block[c]
+                a, b, hx, hy = arc[j]
+                to = new_block[seen[anchor[j]]] + 2
+                for p in range(wr):
+                    y0, y1 = out[t + p * wj], out[t + p * wj + 1]
+                    out[to + 3 * p] += hx * y0 + hy * y1
+                    out[t + p * wj], out[t + p * wj + 1] = a * y0 - b * y1, b * y0 + a * y1
+    return BlockMap(x, width, new_ptr, new_idx, new_block, out), gradient
 
 
 @nb.njit(cache=True)

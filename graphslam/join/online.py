@@ -121,7 +121,7 @@ def join_online(
     counts = dict.fromkeys(("every", "closure", "heading", "all"), 0)
     iterations, converged = 0, False
     with times.measure("update"):
-        leaves, matrices = JoinedMap.leaves(submaps, identified=identified)
+        leaves, matrices = JoinedMap.leaves(submaps, identified=identified, classical=True)
     state = _Online(leaves[0], np.zeros(len(leaves[0].ids), dtype=np.int64), np.zeros(0))
     if on_join is not None:
         on_join(0, state.joined)

@@ -26,9 +26,12 @@ def join_sequential(
     *,
     association: Association | None = None,
     on_join: OnJoin | None = None,
+    classical: bool = False,
     progress: bool = False,
 ) -> JoinResult:
     """Join submaps one after the other: every submap is a measurement of the map so far.
+
+    Submaps that are Gaussian in the group chart are joined in it (:mod:`graphslam.join.eif`).
 
     Parameters
     ----------
@@ -38,6 +41,8 @@ def join_sequential(
     on_join : callable, optional
         ``on_join(k, view)`` is called after submap k (from 0, the first included) is in, outside the clock; the
         :class:`~graphslam.join.joined_map.MapView` is valid during the call only.
+    classical : bool
+        Join as the paper does, whatever the chart of the submaps: Cartesian, each join linearised once.
     progress : bool
         Show a progress bar.
 
@@ -49,7 +54,7 @@ def join_sequential(
     check_chain(submaps, identified=identified)
     times = JoinTimes()
     with times.measure("update"):
-        leaves, matrices = JoinedMap.leaves(submaps, identified=identified)
+        leaves, matrices = JoinedMap.leaves(submaps, identified=identified, classical=classical)
     joined = leaves[0]
     if on_join is not None:
         on_join(0, joined)
@@ -57,7 +62,14 @@ def join_sequential(
         joined = join_two(joined, leaf, association, times)
         if on_join is not None:
             on_join(k, joined)
-    return finish(submaps, joined, identified=identified, method="eif-sequential", times=times, information=matrices)
+    return finish(
+        submaps,
+        joined,
+        identified=identified,
+        method=_name("eif-sequential", classical),
+        times=times,
+        information=matrices,
+    )
 
 
 def join_tree(
@@ -66,6 +78,7 @@ def join_tree(
     association: Association | None = None,
     executor: str | Executor | Client | None = None,
     workers: int | None = None,
+    classical: bool = False,
     progress: bool = False,
 ) -> JoinResult:
     """Join submaps pairwise, then the pairs, and so on: the joined map of B9 is a submap for the next level.
@@ -74,7 +87,7 @@ def join_tree(
 
     Parameters
     ----------
-    submaps, association, progress
+    submaps, association, classical, progress
         As in :func:`join_sequential`.
     executor : optional
         Where the joins are made: in this process (default); ``"processes"``, a pool of spawned processes that lives for
@@ -99,7 +112,7 @@ def join_tree(
     check_chain(submaps, identified=identified)
     times = JoinTimes()
     with times.measure("update"):
-        leaves, matrices = JoinedMap.leaves(submaps, identified=identified)
+        leaves, matrices = JoinedMap.leaves(submaps, identified=identified, classical=classical)
         if identified:
             for leaf, rank in zip(leaves, tree_ranks([leaf.ids for leaf in leaves])):
                 leaf.rank, leaf.order = rank, np.argsort(rank)
@@ -107,7 +120,13 @@ def join_tree(
     for part, seconds in times.parts.items():
         spent.parts[part] += seconds
     spent.wall += times.wall
-    return finish(submaps, joined, identified=identified, method="eif-tree", times=spent, information=matrices)
+    return finish(
+        submaps, joined, identified=identified, method=_name("eif-tree", classical), times=spent, information=matrices
+    )
+
+
+def _name(method: str, classical: bool) -> str:
+    return f"{method}-classical" if classical else method
 
 
 Ids = npt.NDArray[np.int64]

@@ -45,6 +45,7 @@ def polish(
         landmarks=best.x[3 * problem.m :].reshape(-1, 2).copy(),
         information=problem.pattern.matrix(best.data),
         covariance=None,
+        chart=problem.chart,
         objective_polished=best.objective,
         iterations=best.iterations,
         converged=best.converged,

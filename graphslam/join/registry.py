@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
 from graphslam.core.errors import ConfigError, UnknownNameError
@@ -33,6 +34,8 @@ def _batch(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> Submap
 JOINERS: dict[str, Callable[..., JoinResult]] = {
     "eif-tree": join_tree,
     "eif-sequential": join_sequential,
+    "eif-tree-classical": partial(join_tree, classical=True),
+    "eif-sequential-classical": partial(join_sequential, classical=True),
     "eif-online": join_online,
     "ekf": join_ekf,
 }
@@ -131,8 +134,9 @@ def join(
         In order; submap k+1 starts where submap k ends. Those without landmarks are joined by their poses: with the
         matches that they carry, or with all ties of a :class:`~graphslam.join.pose_problem.PoseProblem`.
     method : str
-        ``eif-tree``, ``eif-sequential`` or ``ekf``: once linearised. ``eif-online``: in sequence, linearised afresh
-        when a loop closes or a heading moves. ``batch``, ``isam2``: least squares.
+        ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
+        as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``eif-online``: in sequence,
+        linearised afresh when a loop closes or a heading moves. ``batch``, ``isam2``: least squares.
     polish : bool
         Go on to the least-squares optimum from there.
     associate : "given", "nearest", "joint" or Association
@@ -158,7 +162,7 @@ def join(
     submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
     methods = methods_for(submaps)
     methods.check(method)
-    if (workers is not None or cluster is not None) and method != "eif-tree":
+    if (workers is not None or cluster is not None) and not method.startswith("eif-tree"):
         raise ConfigError(f"only eif-tree can be joined by several workers; got {method!r}")
     if workers is not None and cluster is not None:
         raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
@@ -174,7 +178,7 @@ def join(
         if association is not None:
             submaps = identify(submaps, association, progress=progress)
         return SOLVERS[method](submaps, polish=polish, progress=progress)
-    shared = {"workers": workers, "executor": cluster} if method == "eif-tree" else {}
+    shared = {"workers": workers, "executor": cluster} if method.startswith("eif-tree") else {}
     joined = JOINERS[method](submaps, association=association, progress=progress, **shared)
     return polish_join(submaps, joined) if polish else joined
 

@@ -4,9 +4,9 @@ The unknowns are ``[x_1 … x_m, l_1 … l_L]``: the end poses (x, y, θ) of the
 the frame of the first base, which is fixed. Submap k measures ``x_{k+1}`` and its landmarks from ``x_k`` (Combined SLAM
 eq. 15) with its full joint covariance, and the objective is ``Σ rᵀ P⁻¹ r`` (no half).
 
-Why it is fast: the Jacobian of a landmark is a rotation ``Rᵀ``, so a 2×2 block ``W`` of a submap's information enters
-the normal equations as ``R W Rᵀ``. Refreshing the matrix is one pass over the information matrices in compiled code,
-instead of two dense products a submap.
+Why it is fast: the Jacobian of a landmark is a rotation ``Rᵀ`` (in the group chart a scaled one), so a 2×2 block ``W``
+of a submap's information enters the normal equations as ``R W Rᵀ``. Refreshing the matrix is one pass over the
+information matrices in compiled code, instead of two dense products a submap.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def landmark_map_of(submap: Submap) -> LandmarkMap:
         exit_pose=submap.exit_pose,
         positions=np.zeros((0, 2)),
         covariance=tangent_to_vector_covariance(submap.exit_pose, submap.exit_covariance),
+        chart="group",  # of an exit alone that is its right tangent
     )
 
 
@@ -100,7 +101,13 @@ def fuse_repeated(landmarks: LandmarkMap, *, what: str = "submap") -> LandmarkMa
     y = y + np.linalg.solve(I_y, C.T @ I_z @ (landmarks.mean - C @ y))
     P = np.linalg.inv(I_y)
     y[2] = wrap_angle(y[2])
-    return LandmarkMap(ids=ids[kept], exit_pose=y[:3], positions=y[3:].reshape(-1, 2), covariance=0.5 * (P + P.T))
+    return LandmarkMap(
+        ids=ids[kept],
+        exit_pose=y[:3],
+        positions=y[3:].reshape(-1, 2),
+        covariance=0.5 * (P + P.T),
+        chart=landmarks.chart,
+    )
 
 
 def check_identified(submaps: Sequence[Submap]) -> None:
@@ -142,6 +149,8 @@ class SubmapProblem:
         Global ids in the order of first sighting.
     size : int
         Free scalars, ``3 m + 2 L``.
+    chart : str
+        Of all submaps; "cartesian" where they differ.
     measurements : int
         Rows of the residual; ``measurements - size`` are the degrees of freedom of the objective.
 
@@ -189,6 +198,7 @@ class SubmapProblem:
         self._row_ptr = _offsets(rows)
         self.measurements = int(self._row_ptr[-1])
         self._z = np.concatenate([a.mean for a in maps])
+        self._group = np.array([a.chart == "group" for a in maps])
         self._omega_ptr = _offsets(rows * rows)
         self._omega = np.empty(self._omega_ptr[-1])
         for k, (submap, landmarks) in enumerate(zip(submaps, maps)):
@@ -197,7 +207,13 @@ class SubmapProblem:
         sighting = first[by_sighting]  # among the landmark entries of all submaps
         self._first_owner = owner[is_landmark][sighting]
         self._first_row = self._row_ptr[self._first_owner] + 3
+        self.chart = "group" if bool(np.all(self._group)) else "cartesian"
         self._first_row += 2 * (np.flatnonzero(is_landmark)[sighting] - self._entry_ptr[self._first_owner] - 1)
+
+    @property
+    def anchors(self) -> Index:
+        """For every landmark ``(L,)`` which end pose it hangs on: k is the end of submap k, the first that saw it."""
+        return np.asarray(self._first_owner, dtype=np.int64)
 
     def is_of(self, submaps: Sequence[Submap]) -> bool:
         """Whether it was made of these very submaps."""
@@ -287,7 +303,12 @@ class SubmapProblem:
         return bent
 
     def residual(self, x: Array) -> Array:
-        """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15)."""
+        """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15), each in its chart."""
+        r = self._difference(x)
+        kernels.into_chart(self._row_ptr, self._group, r)
+        return r
+
+    def _difference(self, x: Array) -> Array:
         poses, points = self._split(np.ascontiguousarray(x, dtype=np.float64))
         r = np.empty(self.measurements)
         kernels.predict(poses, points, self.m, self._entry_ptr, self._node, self._z, r)
@@ -306,11 +327,11 @@ class SubmapProblem:
     def linearise(self, x: Array) -> tuple[float, Array, Array]:
         """Objective, ``JᵀΩr`` ``(size,)``, and the values of ``JᵀΩJ`` in :attr:`pattern`."""
         x = np.ascontiguousarray(x, dtype=np.float64)
-        r, poses = self.residual(x), self._split(x)[0]
+        r, poses = self._difference(x), self._split(x)[0]
         g, values = np.zeros(self.size), np.zeros(self.pattern.entries)
         pair_ptr, slots = self._slots
         submaps = kernels.SubmapArrays(
-            self._entry_ptr, self._node, self._row_ptr, self._z, self._omega, self._omega_ptr
+            self._entry_ptr, self._node, self._row_ptr, self._z, self._omega, self._omega_ptr, self._group
         )
         f = kernels.linearise(poses, submaps, kernels.Slots(self._node_at, pair_ptr, slots), r, g, values)
         return float(f), g, values

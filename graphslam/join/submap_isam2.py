@@ -6,13 +6,15 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 from tqdm import tqdm
 
 from graphslam.core.geometry import rotation2
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.join.submap_blocks import check_identified
+from graphslam.join.joined_map import in_group_chart
+from graphslam.join.submap_blocks import check_identified, landmark_map_of
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.solve.isam2 import Isam2Solver
 
@@ -75,7 +77,18 @@ def solve_submaps_isam2(
         iterations=solver.updates,
         converged=here.converged,
         seconds=time.perf_counter() - start,
+        chart="group" if in_group_chart(submaps) else "cartesian",
+        anchors=_first_seen(submaps, values.landmark_ids),
     )
+
+
+def _first_seen(submaps: Sequence[Submap], landmark_ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The submap that saw each landmark first."""
+    first: dict[int, int] = {}
+    for k, s in enumerate(submaps):
+        for i in landmark_map_of(s).ids.tolist():
+            first.setdefault(i, k)
+    return np.array([first[i] for i in landmark_ids.tolist()], dtype=np.int64)
 
 
 def _vector_information(graph: PoseGraph) -> sp.csc_matrix:

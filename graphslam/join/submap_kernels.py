@@ -13,6 +13,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.graph.normal_kernels import arc_terms
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -153,6 +155,20 @@ def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: I
 
 
 @nb.njit(cache=True)
+def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
+    """Differences ``H(X) - z`` of all submaps, in the group chart where ``group`` ``(m,)``; in place."""
+    for k in range(len(row_ptr) - 1):
+        if not group[k]:
+            continue
+        first = row_ptr[k]
+        a, b, _ = arc_terms(r[first + 2])
+        for i in range(row_ptr[k + 1] - first):
+            if i == 0 or (i > 2 and i % 2 == 1):
+                x, y = r[first + i], r[first + i + 1]
+                r[first + i], r[first + i + 1] = a * x + b * y, a * y - b * x
+
+
+@nb.njit(cache=True)
 def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
     """``rᵀ Ω r`` of every submap."""
     for k in range(len(row_ptr) - 1):
@@ -180,6 +196,8 @@ class SubmapArrays(NamedTuple):
     """Information matrices, row-major …"""
     omega_ptr: Index
     """… and where they begin."""
+    group: Flags
+    """(m,): in the group chart."""
 
 
 class Slots(NamedTuple):
@@ -196,8 +214,9 @@ class Slots(NamedTuple):
 def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Array, value: Array) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
-    A position is measured through ``Rᵀ``, so a block ``W`` of Ω enters as ``R W Rᵀ``; a heading as it is. The start
-    moves all positions the other way: its translation columns are minus the sum of theirs.
+    A position is measured through ``V(d)⁻¹ Rᵀ``, d being the residual of the end heading (V = I in a Cartesian chart),
+    so a block ``W`` of Ω enters as ``T W Tᵀ`` with ``T = R V⁻ᵀ``; the end heading through its own row and through V.
+    The start moves all positions the other way: its translation columns are minus the sum of theirs.
 
     Parameters
     ----------
@@ -205,11 +224,11 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
     submaps : SubmapArrays
     where : Slots
     r : (rows,)
-        Residual of every submap.
+        ``H(X) - z`` of every submap in Cartesian coordinates.
     g, value
         Out.
     """
-    entry_ptr, entry_node, row_ptr, z, omega, omega_ptr = submaps
+    entry_ptr, entry_node, row_ptr, z, omega, omega_ptr, group = submaps
     node_at, pair_ptr, slot = where
     m = len(poses)
     f = 0.0
@@ -217,30 +236,45 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
     for k in range(m):
         most = max(most, row_ptr[k + 1] - row_ptr[k])
     d, wr, wd = np.empty(most), np.empty(most), np.empty(most)
+    h, wh, u = np.empty(most), np.empty(most), np.empty(most)
     turned = np.empty((most, most))
     for k in range(m):
         n, a0 = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
         entries = entry_ptr[k + 1] - entry_ptr[k]
         W = omega[omega_ptr[k] : omega_ptr[k + 1]].reshape(n, n)
         st = poses[k - 1, 2] if k else 0.0
-        c, s = np.cos(st), np.sin(st)
-        # Rows: 0, 1 end position, 2 end heading, then landmarks. d is the column of the start heading.
+        va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
+        if group[k]:
+            va, vb, slope = arc_terms(r[a0 + 2])
+            half = 0.5
+        # Rows: 0, 1 end position, 2 end heading, then landmarks. u is the residual, d the column of the start heading,
+        # h that of the end heading.
+        u[2], d[2], h[2] = r[a0 + 2], -1.0, 1.0
+        for e in range(entries):
+            i = 0 if e == 0 else 1 + 2 * e
+            x, y = r[a0 + i], r[a0 + i + 1]
+            qx, qy = x + z[a0 + i], y + z[a0 + i + 1]
+            u[i], u[i + 1] = va * x + vb * y, va * y - vb * x
+            h[i], h[i + 1] = slope * x + half * y, slope * y - half * x
+            d[i], d[i + 1] = va * qy - vb * qx - h[i], -va * qx - vb * qy - h[i + 1]
+        rr, dd, dr, hh, hd, hr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(n):
-            if i == 2:
-                d[i] = -1.0
-            elif (i < 2 and i == 0) or (i > 2 and i % 2 == 1):
-                qx, qy = r[a0 + i] + z[a0 + i], r[a0 + i + 1] + z[a0 + i + 1]
-                d[i], d[i + 1] = qy, -qx
-        for i in range(n):
-            v, u = 0.0, 0.0
+            v0, v1, v2 = 0.0, 0.0, 0.0
             for j in range(n):
-                v += W[i, j] * r[a0 + j]
-                u += W[i, j] * d[j]
-            wr[i], wd[i] = v, u
-            f += v * r[a0 + i]
-        # T W Tᵀ with T = blkdiag(R, 1, R, R, …): rows first, then columns
-        for j in range(n):
-            turned[2, j] = W[2, j]
+                v0 += W[i, j] * u[j]
+                v1 += W[i, j] * d[j]
+                v2 += W[i, j] * h[j]
+            wr[i], wd[i], wh[i] = v0, v1, v2
+            rr += v0 * u[i]
+            dr += v0 * d[i]
+            hr += v0 * h[i]
+            dd += v1 * d[i]
+            hd += v1 * h[i]
+            hh += v2 * h[i]
+        f += rr
+        # T W Tᵀ: rows first, then columns
+        c, s = np.cos(st), np.sin(st)
+        c, s = c * va - s * vb, s * va + c * vb
         for e in range(entries):
             i = 0 if e == 0 else 1 + 2 * e
             for j in range(n):
@@ -257,10 +291,13 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
             wr[i], wr[i + 1] = c * x - s * y, s * x + c * y
             x, y = wd[i], wd[i + 1]
             wd[i], wd[i + 1] = c * x - s * y, s * x + c * y
+            x, y = wh[i], wh[i + 1]
+            wh[i], wh[i + 1] = c * x - s * y, s * x + c * y
+        wr[2], wd[2], wh[2] = hr, hd, hh
+        for j in range(n):
+            turned[2, j] = turned[j, 2] = wh[j]
         slots = slot[pair_ptr[k] : pair_ptr[k + 1]].reshape(entries + 1, entries + 1)
         gx, gy = 0.0, 0.0
-        dd = -wd[2]  # dᵀ Ω d; d of the positions is turned like the rest
-        dr = -wr[2]
         for e in range(entries):
             i = 0 if e == 0 else 1 + 2 * e
             wi = 3 if e == 0 else 2
@@ -269,14 +306,11 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
                 g[at + p] += wr[i + p]
             gx += wr[i]
             gy += wr[i + 1]
-            dx, dy = c * d[i] - s * d[i + 1], s * d[i] + c * d[i + 1]
-            dd += dx * wd[i] + dy * wd[i + 1]
-            dr += dx * wr[i] + dy * wr[i + 1]
-            for h in range(entries):
-                v = slots[e + 1, h + 1]
+            for o in range(entries):
+                v = slots[e + 1, o + 1]
                 if v >= 0:
-                    j = 0 if h == 0 else 1 + 2 * h
-                    wj = 3 if h == 0 else 2
+                    j = 0 if o == 0 else 1 + 2 * o
+                    wj = 3 if o == 0 else 2
                     for p in range(wi):
                         for q in range(wj):
                             value[v + p * wj + q] += turned[i + p, j + q]
@@ -294,8 +328,8 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
             one, other = slots[0, e + 1], slots[e + 1, 0]
             for p in range(wi):
                 tx, ty = 0.0, 0.0
-                for h in range(entries):
-                    j = 0 if h == 0 else 1 + 2 * h
+                for o in range(entries):
+                    j = 0 if o == 0 else 1 + 2 * o
                     tx -= turned[j, i + p]
                     ty -= turned[j + 1, i + p]
                 if p == 0:

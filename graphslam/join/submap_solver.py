@@ -17,6 +17,7 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from graphslam.core.charts import along_arc
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
 from graphslam.core.markup import element, join
@@ -66,6 +67,10 @@ class SubmapEstimate:
         Wall time of the solution, polish included.
     covariance : (3m + 2L, 3m + 2L) or None
         Exactly one of ``information`` and ``covariance`` is given.
+    chart : str
+        In which it is Gaussian about its mean (:mod:`graphslam.core.charts`).
+    anchors : (L,) or None
+        End pose (0 for ``poses[1]``) of the submap that saw each landmark first: what it hangs on in the group chart.
     """
 
     poses: Array
@@ -78,6 +83,28 @@ class SubmapEstimate:
     converged: bool
     seconds: float
     covariance: Array | None = None
+    chart: str = "cartesian"
+    anchors: npt.NDArray[np.int64] | None = None
+
+    def difference(self, poses: Array, landmarks: Array, *, chart: str | None = None) -> Array:
+        """What other values differ from these by ``(states,)``, in the chart of this map or in another.
+
+        Parameters
+        ----------
+        poses : (m, 3)
+            End poses in the frame of the first base.
+        landmarks : (L, 2)
+            In the order of :attr:`landmark_ids`.
+        """
+        e = poses - self.poses[1:]
+        e[:, 2] = wrap_angle(e[:, 2])
+        f = landmarks - self.landmarks
+        if (chart or self.chart) == "group":
+            if self.anchors is None:
+                raise SolverError("the map does not say what its landmarks hang on: wanted anchors")
+            e[:, :2] = along_arc(e[:, :2], e[:, 2])
+            f = along_arc(f, e[self.anchors, 2])
+        return np.concatenate([e.ravel(), f.ravel()])
 
     @property
     def states(self) -> int:
@@ -284,4 +311,6 @@ def solve_submaps(
         iterations=best.iterations,
         converged=best.converged,
         seconds=time.perf_counter() - start,
+        chart=problem.chart,
+        anchors=problem.anchors,
     )

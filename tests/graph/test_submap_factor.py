@@ -17,11 +17,11 @@ from graphslam.graph.variables import gtsam_key, key_name, vector_form
 from tests.reference.graph_chain import correlated_covariance, dense_submap, end_only_submap, make_chain
 
 
-def build(rng, start: int, ids: np.ndarray):
+def build(rng, start: int, ids: np.ndarray, chart: str = "cartesian"):
     n = len(ids)
     z = np.concatenate([[3.0, 1.0, 0.4], rng.normal(0, 5, 2 * n)])
     P = correlated_covariance(rng, 3 + 2 * n, 0.3)
-    factor = gtsam_factor(SubmapRecord(0, 0, start, ids, z, whitener(P)), np.zeros(3))
+    factor = gtsam_factor(SubmapRecord(0, 0, start, ids, z, whitener(P), chart=chart), np.zeros(3))
     poses = {start: np.array([1.0, -2.0, 2.9]) if start else np.zeros(3), start + 1: np.array([4.0, 1.0, -2.8])}
     points = {int(i): rng.normal(0, 5, 2) for i in ids}
     values = gtsam.Values()
@@ -33,17 +33,19 @@ def build(rng, start: int, ids: np.ndarray):
     return factor, values, z, P, poses, points
 
 
-def plain_residual(ids, z, poses, points, start):
-    return submap_residual(poses[start], poses[start + 1], np.array([points[int(i)] for i in ids]).reshape(-1, 2), z)
+def plain_residual(ids, z, poses, points, start, chart="cartesian"):
+    seen = np.array([points[int(i)] for i in ids]).reshape(-1, 2)
+    return submap_residual(poses[start], poses[start + 1], seen, z, chart)
 
 
+@pytest.mark.parametrize("chart", ["cartesian", "group"])
 @pytest.mark.parametrize("start", [0, 3])
 @pytest.mark.parametrize("ids", [[], [7], [9, 2, 5], [4, 8, 4, 1, 8]], ids=["none", "one", "unsorted", "twice"])
-def test_linearisation_matches_finite_differences(rng, start, ids):
+def test_linearisation_matches_finite_differences(rng, start, ids, chart):
     ids = np.array(ids, dtype=np.int64)
-    factor, values, z, P, poses, points = build(rng, start, ids)
+    factor, values, z, P, poses, points = build(rng, start, ids, chart)
     W = whitener(P)
-    r = W @ plain_residual(ids, z, poses, points, start)
+    r = W @ plain_residual(ids, z, poses, points, start, chart)
     np.testing.assert_allclose(factor.unwhitenedError(values), r, atol=1e-12)
     J, b = factor.linearize(values).jacobian()
     np.testing.assert_allclose(-b, r, atol=1e-12)
@@ -60,7 +62,7 @@ def test_linearisation_matches_finite_differences(rng, start, ids):
                     p[int(name[1:])] = se2_compose(p[int(name[1:])], se2_exp(step))
                 else:
                     q[int(name[1:])] = q[int(name[1:])] + step
-                sides.append(W @ plain_residual(ids, z, p, q, start))
+                sides.append(W @ plain_residual(ids, z, p, q, start, chart))
             columns.append((sides[0] - sides[1]) / (2 * h))
     np.testing.assert_allclose(J, np.array(columns).T, atol=2e-6)
 

@@ -53,6 +53,7 @@ def assert_same(a: Submap, b: Submap) -> None:
     assert (a.landmarks is None) == (b.landmarks is None)
     if a.landmarks is not None and b.landmarks is not None:
         np.testing.assert_array_equal(a.landmarks.ids, b.landmarks.ids)
+        assert a.landmarks.chart == b.landmarks.chart
         np.testing.assert_array_equal(a.landmarks.positions, b.landmarks.positions)
         if a.landmarks.information is not None:
             assert (a.landmarks.information != b.landmarks.information).nnz == 0
@@ -78,7 +79,7 @@ def assert_same(a: Submap, b: Submap) -> None:
 def submaps(rng: np.random.Generator) -> list[Submap]:
     plain, _ = submap_chain(rng, submaps=4)
     I = np.linalg.inv(plain[1].landmarks.covariance)
-    sparse = replace(plain[1].landmarks, covariance=None, information=sp.csc_matrix(0.5 * (I + I.T)))
+    sparse = replace(plain[1].landmarks, covariance=None, information=sp.csc_matrix(0.5 * (I + I.T)), chart="group")
     blind = replace(plain[2], landmarks=None)
     lost = plain[3].with_ids(np.full(len(plain[3].landmarks), -1))
     return [rich(rng, plain[0]), Submap.from_landmarks(1, sparse), blind, lost]
@@ -196,7 +197,8 @@ def corrupt(tmp_path: Path, submaps: list[Submap], **changes: object) -> Path:
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"format": "graphslam.submap/2"}, FormatError, "unknown format"),
+        ({"format": "graphslam.submap/3"}, FormatError, "unknown format"),
+        ({"chart": "polar"}, FormatError, "unknown chart 'polar'"),
         ({"format": None}, FormatError, "unknown format"),
         ({"exit_pose": None}, FormatError, "'exit_pose' is missing"),
         ({"exit_pose": np.zeros(7)}, FormatError, "wrong shape"),

@@ -9,10 +9,10 @@ import pytest
 
 from graphslam.core.geometry import se2_compose, se2_transform
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.join import eif
+from graphslam.join import eif, kernels
 from graphslam.join.joined_map import JoinedMap, JoinTimes
 from graphslam.join.order import join_sequential, join_tree
-from tests.reference.dense_join import dense_information_join, dense_tree_join
+from tests.reference.dense_join import BentMap, bent_join, bent_leaf, dense_information_join, dense_tree_join
 from tests.reference.submap_chain import random_covariance, submap_chain
 
 
@@ -76,6 +76,65 @@ def test_small_chains_are_joined_as_the_equations_say(count: int, rng: np.random
     np.testing.assert_allclose(tree.vector, X, atol=1e-8)
     # the twin's Jacobians are differences
     np.testing.assert_allclose(tree.information.toarray(), I[np.ix_(at, at)], rtol=0, atol=1e-7 * np.abs(I).max())
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_joins_along_arcs_are_the_least_squares_of_both_maps(count: int, rng: np.random.Generator) -> None:
+    """One after the other and as a tree, against dense least squares in the chart with numerical Jacobians."""
+    chain = submap_chain(rng, submaps=6, landmarks=11, reach=30.0, sigma=0.02, sigma_heading=0.04, chart="group")[0][
+        :count
+    ]
+    leaves = [bent_leaf(k, s) for k, s in enumerate(chain)]
+    twin = leaves[0]
+    for leaf_ in leaves[1:]:
+        twin = bent_join(twin, leaf_)
+    level = leaves
+    while len(level) > 1:
+        level = [bent_join(a, b) for a, b in zip(level[::2], level[1::2])] + level[len(level) - len(level) % 2 :]
+    for joined, slow in ((join_sequential(chain), twin), (join_tree(chain), level[0])):
+        begin = slow.begin()
+        at = [begin["pose", k] + i for k in range(count) for i in range(3)]
+        at += [begin["landmark", int(j)] + i for j in joined.landmark_ids for i in range(2)]
+        X = slow.x[at]
+        X[2 : 3 * count : 3] = np.arctan2(np.sin(X[2 : 3 * count : 3]), np.cos(X[2 : 3 * count : 3]))
+        I = slow.information[np.ix_(at, at)]
+        sigma = np.sqrt(np.diag(np.linalg.inv(I)))
+        # three passes, and none after a step of a thousandth of a standard deviation
+        np.testing.assert_allclose((joined.vector - X) / sigma, 0.0, atol=2e-3)
+        np.testing.assert_allclose(joined.information.toarray(), I, rtol=0, atol=2e-3 * np.abs(I).max())
+        hangs = [slow.anchor["landmark", int(j)][1] for j in joined.landmark_ids]
+        assert joined.anchors.tolist() == hangs
+        assert joined.chart == "group"
+
+
+def test_a_map_is_pulled_back_as_its_chart_says(rng: np.random.Generator) -> None:
+    """``Jᵀ I J`` and ``Jᵀ I u`` of a joined map at other values, against numerical differences of the chart; the
+    pattern holds all of it, both ways."""
+    chain = submap_chain(rng, submaps=4, landmarks=9, reach=30.0, sigma_heading=0.1, chart="group")[0]
+    m, slow = JoinedMap.leaf(chain[0], identified=True), bent_leaf(0, chain[0])
+    for k, s in enumerate(chain[1:], start=1):
+        m, slow = (
+            eif.join_maps(m, b := JoinedMap.leaf(s, identified=True), eif.match_by_id(m, b)),
+            bent_join(slow, bent_leaf(k, s), passes=1),
+        )
+    here = replace_values(slow, m)
+    x = m.x + rng.normal(0, 0.4, len(m.x))
+    blocks, gradient = kernels.pulled_back(eif.blocks_of(m), m.anchor, x)
+    u = here.difference(x)
+    J = np.stack([(here.difference(x + h) - here.difference(x - h)) / 2e-6 for h in 1e-6 * np.eye(len(x))], axis=1)
+    I = here.information
+    at = replace(m, ptr=blocks.ptr, neighbours=blocks.idx, block=blocks.block, values=blocks.value, x=x)
+    np.testing.assert_allclose(at.information().toarray(), J.T @ I @ J, rtol=0, atol=1e-7 * np.abs(I).max())
+    np.testing.assert_allclose(gradient, J.T @ I @ u, rtol=0, atol=1e-7 * np.abs(J.T @ I @ u).max())
+
+
+def replace_values(slow: BentMap, m: JoinedMap) -> BentMap:
+    """The dense twin's parts in the order of the sparse map, with its mean and information."""
+    kinds = {int(n): ("pose", k) for k, n in enumerate(m.pose_node)}
+    kinds |= {int(n): ("landmark", int(j)) for n, j in zip(m.landmark_node, m.ids)}
+    names = [kinds[n] for n in range(len(m.width))]
+    assert {n: slow.anchor[n] for n in names} == {n: names[int(m.anchor[i])] for i, n in enumerate(names)}
+    return BentMap(names, m.x, m.information().toarray(), slow.anchor)
 
 
 def test_what_each_entry_became_and_where_new_nodes_stand() -> None:
@@ -181,7 +240,8 @@ def test_ranks_of_a_tree_order_are_followed_only_where_both_maps_have_them(which
             m.rank = np.array(rank, dtype=np.int64)
             m.order = np.argsort(m.rank)
     a.fill, b.fill = 0.2, 1e-3
-    joined, gradient = eif._assemble(a, b, eif.match_by_id(a, b))
+    none = np.zeros(len(b.x))
+    joined, gradient, _ = eif._assemble(a, b, eif.match_by_id(a, b), eif.blocks_of(a), eif.blocks_of(b), none)
     assert gradient is not None
     assert joined.fill == 0.2  # the larger: what the worse of the two was worth when it was fresh
     if which == "both":

@@ -66,8 +66,8 @@ def test_processes_give_the_same_bits(chain: list[Submap]) -> None:
 def test_an_error_in_a_worker_arrives(chain: list[Submap], scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
     real = JoinedMap.leaves
 
-    def spoiled(submaps, *, identified):
-        leaves, matrices = real(submaps, identified=identified)
+    def spoiled(submaps, *, identified, classical):
+        leaves, matrices = real(submaps, identified=identified, classical=classical)
         leaves[40].values *= -1.0
         return leaves, matrices
 

@@ -25,9 +25,17 @@ def with_repeated_landmark(submaps: list[Submap], k: int) -> list[Submap]:
     return [s.with_ids(ids) if i == k else s for i, s in enumerate(submaps)]
 
 
-@pytest.fixture(params=["plain", "repeated"])
+def in_chart(submaps: list[Submap], chart: str) -> list[Submap]:
+    return [replace(s, landmarks=replace(s.landmarks, chart=chart)) for s in submaps]
+
+
+@pytest.fixture(params=["plain", "repeated", "group", "mixed"])
 def chain(request: pytest.FixtureRequest, rng: np.random.Generator) -> list[Submap]:
     submaps, _ = submap_chain(rng, submaps=8, landmarks=40)
+    if request.param == "group":
+        return in_chart(submaps, "group")
+    if request.param == "mixed":
+        return in_chart(submaps[:4], "group") + submaps[4:]
     return with_repeated_landmark(submaps, 2) if request.param == "repeated" else submaps
 
 
@@ -53,7 +61,7 @@ def test_residual_is_the_model_of_one_submap_after_the_other(chain: list[Submap]
     for k, s in enumerate(chain):
         points = np.array([x[place[int(j)] : place[int(j)] + 2] for j in s.landmarks.ids])
         start = np.zeros(3) if k == 0 else x[3 * k - 3 : 3 * k]
-        expected.append(submap_residual(start, x[3 * k : 3 * k + 3], points, s.landmarks.mean))
+        expected.append(submap_residual(start, x[3 * k : 3 * k + 3], points, s.landmarks.mean, s.landmarks.chart))
     np.testing.assert_allclose(problem.residual(x), np.concatenate(expected), atol=1e-12)
 
 
@@ -177,7 +185,8 @@ def test_submaps_without_landmarks_measure_their_ends(rng: np.random.Generator) 
         exit_pose=submaps[2].exit_pose,
         exit_covariance=submaps[2].exit_covariance,
     )
-    empty = Submap.from_landmarks(2, submaps[2].landmarks.subset(np.zeros(0, dtype=int)))
+    none = submaps[2].landmarks.subset(np.zeros(0, dtype=int))
+    empty = Submap.from_landmarks(2, replace(none, chart="group"))  # that of a right tangent
     a = solve_submaps([*submaps[:2], blind, *submaps[3:]])
     b = solve_submaps([*submaps[:2], empty, *submaps[3:]])
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-10)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.core.geometry import se2_compose, se2_transform, wrap_angle
+from graphslam.core.geometry import rotation2, se2_compose, se2_transform, wrap_angle
 from graphslam.core.submap import Submap
 from graphslam.graph.submap_model import predict_submap, submap_jacobians, submap_residual
 
@@ -30,8 +31,10 @@ def dense_normal_equations(submaps: Sequence[Submap], x: np.ndarray) -> tuple[fl
         end = x[3 * k : 3 * k + 3]
         own = [place[int(j)] for j in s.landmarks.ids]
         points = np.array([x[a : a + 2] for a in own]).reshape(-1, 2)
-        r = submap_residual(start, end, points, s.landmarks.mean)
-        J_start, J_end, J_landmark = submap_jacobians(start, end, points, tangent=False)
+        r = submap_residual(start, end, points, s.landmarks.mean, s.landmarks.chart)
+        J_start, J_end, J_landmark = submap_jacobians(
+            start, end, points, s.landmarks.mean, s.landmarks.chart, tangent=False
+        )
         J = np.zeros((len(r), len(x)))
         if k:
             J[:, 3 * k - 3 : 3 * k] += J_start
@@ -69,7 +72,7 @@ def dense_information_join(submaps: Sequence[Submap]) -> tuple[np.ndarray, np.nd
         i = I @ X  # rows of zeros for what is new
         # 2. the submap is a measurement
         end, points = X[3 * k : 3 * k + 3], np.array([X[a : a + 2] for a in own]).reshape(-1, 2)
-        J_start, J_end, J_landmark = submap_jacobians(start, end, points, tangent=False)
+        J_start, J_end, J_landmark = submap_jacobians(start, end, points, s.landmarks.mean, tangent=False)
         J = np.zeros((3 + 2 * len(own), n))
         if k:
             J[:, 3 * k - 3 : 3 * k] = J_start
@@ -148,3 +151,78 @@ def dense_tree_join(submaps: Sequence[Submap]) -> tuple[Names, np.ndarray, np.nd
         above = [dense_join_two(a, b) for a, b in zip(level[::2], level[1::2])]
         level = above + level[len(level) - len(level) % 2 :]
     return level[0]
+
+
+@dataclass(frozen=True)
+class BentMap:
+    """A map in the group chart, dense: its parts by name, mean, information, and the pose that each part hangs on."""
+
+    names: Names
+    x: np.ndarray
+    information: np.ndarray
+    anchor: dict[tuple[str, int], tuple[str, int]]
+
+    def begin(self) -> dict[tuple[str, int], int]:
+        return dict(zip(self.names, np.cumsum([0] + [3 if kind == "pose" else 2 for kind, _ in self.names])))
+
+    def difference(self, x: np.ndarray) -> np.ndarray:
+        """From the mean to ``x``: every part by the inverse mean rotation of its anchor's heading error."""
+        at, out = self.begin(), np.empty(len(x))
+        for name in self.names:
+            i, d = at[name], float(wrap_angle(x[at[self.anchor[name]] + 2] - self.x[at[self.anchor[name]] + 2]))
+            out[i : i + 2] = np.linalg.solve(mean_rotation(d), x[i : i + 2] - self.x[i : i + 2])
+            if name[0] == "pose":
+                out[i + 2] = d
+        return out
+
+
+def mean_rotation(d: float) -> np.ndarray:
+    """``V(d) = ∫₀¹ R(s d) ds``."""
+    if abs(d) < 1e-9:
+        return np.array([[1.0, -0.5 * d], [0.5 * d, 1.0]])
+    A, B = np.sin(d) / d, (1.0 - np.cos(d)) / d
+    return np.array([[A, -B], [B, A]])
+
+
+def bent_leaf(k: int, submap: Submap) -> BentMap:
+    assert submap.landmarks is not None
+    names: Names = [("pose", k), *(("landmark", int(j)) for j in submap.landmarks.ids)]
+    information = np.linalg.inv(submap.landmarks.dense_covariance())
+    return BentMap(names, submap.landmarks.mean, information, dict.fromkeys(names, ("pose", k)))
+
+
+def bent_join(a: BentMap, b: BentMap, passes: int = 30) -> BentMap:
+    """Least squares over what A and B say, each in its own chart, with numerical Jacobians, to the end; the joined
+    Gaussian is the Gauss-Newton matrix there."""
+    names = a.names + [n for n in b.names if n not in a.names]
+    anchor = {**b.anchor, **a.anchor}
+    start = max(n for n in a.names if n[0] == "pose")
+
+    def seen(x: np.ndarray, begin: dict[tuple[str, int], int]) -> np.ndarray:
+        s, out = x[begin[start] : begin[start] + 3], []
+        for name in b.names:
+            i = begin[name]
+            out += list((x[i : i + 2] - s[:2]) @ rotation2(s[2]))
+            out += [x[i + 2] - s[2]] if name[0] == "pose" else []
+        return np.array(out)
+
+    x = list(a.x)
+    s, at = a.x[a.begin()[start] : a.begin()[start] + 3], b.begin()
+    for name in names[len(a.names) :]:
+        x += list(se2_transform(s, b.x[at[name] : at[name] + 2]))
+        x += [s[2] + b.x[at[name] + 2]] if name[0] == "pose" else []
+    joined = BentMap(names, np.array(x), np.zeros((len(x), len(x))), anchor)
+    begin = joined.begin()
+    both = np.zeros((len(a.x) + len(b.x),) * 2)
+    both[: len(a.x), : len(a.x)], both[len(a.x) :, len(a.x) :] = a.information, b.information
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([a.difference(x[: len(a.x)]), b.difference(seen(x, begin))])
+
+    x = joined.x
+    for _ in range(passes):
+        J = np.stack([(residual(x + h) - residual(x - h)) / 2e-6 for h in 1e-6 * np.eye(len(x))], axis=1)
+        I = J.T @ both @ J
+        x = x - np.linalg.solve(I, J.T @ both @ residual(x))
+    J = np.stack([(residual(x + h) - residual(x - h)) / 2e-6 for h in 1e-6 * np.eye(len(x))], axis=1)
+    return BentMap(names, x, J.T @ both @ J, anchor)

@@ -19,7 +19,7 @@ def whitened_residual(record: object, values: Values) -> np.ndarray:
     if isinstance(record, SubmapRecord):
         row = {int(i): k for k, i in enumerate(values.landmark_ids)}
         points = values.landmarks[[row[int(i)] for i in record.landmark_ids]]
-        r = submap_residual(values.poses[record.start], values.poses[record.start + 1], points, record.z)
+        r = submap_residual(values.poses[record.start], values.poses[record.start + 1], points, record.z, record.chart)
         return record.whitener @ r
     if isinstance(record, BetweenRecord):
         h = se2_between(values.poses[record.i], values.poses[record.j])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphslam.core.charts import arc_terms
 from graphslam.core.geometry import se2_between, wrap_angle
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Submap
@@ -42,6 +43,7 @@ def submap_chain(
     sigma_heading: float = 0.005,
     known_heading: bool = False,
     claimed: float = 1.0,
+    chart: str = "cartesian",
 ) -> tuple[list[Submap], MapTruth]:
     """Submaps with truth.
 
@@ -53,6 +55,8 @@ def submap_chain(
         The end heading is exact to 1e-9 rad and independent of all else: the problem is linear.
     claimed : float
         Factor between the covariance a submap claims and the one its noise has.
+    chart : "cartesian" or "group"
+        In which the noise is Gaussian.
     """
     truth = wavy_loop(submaps, radius, laps)
     angle = rng.uniform(0.0, 2.0 * np.pi, landmarks)
@@ -69,9 +73,16 @@ def submap_chain(
         s = np.full(len(z), sigma)
         s[2] = 1e-9 if known_heading else sigma_heading
         P = random_covariance(rng, s, lone=(2,) if known_heading else ())
-        z = z + np.linalg.cholesky(P) @ rng.standard_normal(len(z))
+        noise = np.linalg.cholesky(P) @ rng.standard_normal(len(z))
+        if chart == "group":  # the truth is the estimate, moved along arcs by minus the noise
+            rows = np.r_[0:2, 3 : len(z)]
+            a, b, _ = arc_terms(-noise[2])
+            noise[rows] = (noise[rows].reshape(-1, 2) @ np.linalg.inv([[a, b], [-b, a]]).T).ravel()
+        z = z + noise
         z[2] = wrap_angle(z[2])
-        local = LandmarkMap(ids=ids[seen], exit_pose=z[:3], positions=z[3:].reshape(-1, 2), covariance=claimed * P)
+        local = LandmarkMap(
+            ids=ids[seen], exit_pose=z[:3], positions=z[3:].reshape(-1, 2), covariance=claimed * P, chart=chart
+        )
         chain.append(Submap.from_landmarks(k, local))
     known = np.unique(np.concatenate([s.landmarks.ids for s in chain if s.landmarks is not None]))
     at = {int(i): n for n, i in enumerate(ids)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 STUDIES: dict[str, str] = {
+    "charts": "graphslam.app.studies.charts:STUDY",
     "combined-slam": "graphslam.app.studies.combined_slam:STUDY",
     "association-ambiguity": "graphslam.app.studies.association_ambiguity:STUDY",
     "segslam-garage": "graphslam.app.studies.segslam_garage:STUDY",

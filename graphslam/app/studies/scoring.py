@@ -153,6 +153,7 @@ class Judge:
             r = submap_nees(s, self.truth)
             figures = {
                 "local_joint_nees": r.joint,
+                "local_joint_nees_plain": r.joint_plain,
                 "local_joint_dof": float(r.joint_dof),
                 "local_pose_nees": r.exit,
                 "local_feature_nees": float(np.mean(r.landmarks)) if len(r.landmarks) else np.nan,

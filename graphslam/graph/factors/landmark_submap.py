@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.charts import arc_terms
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_factor
 from graphslam.graph.variables import Layout, Values, gtsam_key
@@ -39,6 +40,8 @@ class SubmapRecord:
         ``W`` with ``Wᵀ W`` = information.
     information : ((3 + 2n)²,)
         Row major; made here.
+    chart : str
+        In which the residual is taken (:mod:`graphslam.core.charts`).
     """
 
     factor_id: int
@@ -48,6 +51,7 @@ class SubmapRecord:
     z: Array
     whitener: Array
     group: str = "submap"
+    chart: str = "cartesian"
     information: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -83,6 +87,7 @@ class SubmapBatch(FactorBatch):
         self._z_offset = offsets([len(r.z) for r in records])
         self._info = np.concatenate([np.zeros(0), *(r.information for r in records)])
         self._info_offset = offsets([len(r.z) ** 2 for r in records])
+        self._bent = np.array([r.chart == "group" for r in records], dtype=bool)
         entries = np.diff(self._entry_offset)
         self.arity = 2 + entries
         # every submap: two poses, then its entries
@@ -108,8 +113,9 @@ class SubmapBatch(FactorBatch):
         if len(self) == 0:
             return chi2
         submaps = SubmapArrays(
-            self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset
-        )
+            self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
+            self._bent,
+        )  # fmt: skip
         submap_blocks(
             np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), submaps, hessian,
             SubmapBlocks(H, H_offset, g, g_offset, chi2),
@@ -132,13 +138,14 @@ def submap_factor(record: SubmapRecord, origin: Array) -> gtsam.CustomFactor:
     names = [] if fixed else [f"x{record.start}"]
     names += [f"x{record.start + 1}", *(f"l{i}" for i in unique.tolist())]
     widths = [3 if n[0] == "x" else 2 for n in names]
-    terms = _terms([gtsam_key(n) for n in names], fixed, entry_of, record.z, record.whitener, origin)
+    terms = _terms([gtsam_key(n) for n in names], fixed, entry_of, record, origin)
     return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
 
 
 def _terms(
-    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], z: Array, W: Array, origin: Array
+    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord, origin: Array
 ) -> Callable[..., Array]:
+    z, W, group = record.z, record.whitener, record.chart == "group"
     m = len(z)
     first_landmark = len(keys) - (len(np.unique(entry_of)) if len(entry_of) else 0)
     landmark_keys = keys[first_landmark:]
@@ -179,27 +186,52 @@ def _terms(
         r[3:] = qe.ravel()
         r -= z
         r[2] = math.pi - (math.pi - r[2]) % _TWO_PI
+        Vi, bent = None, None
+        if group:
+            a, b, slope = (float(v) for v in arc_terms(r[2]))
+            e = np.concatenate([r[:2], r[3:]]).reshape(-1, 2)
+            Vi = np.array([[a, b], [-b, a]])
+            bent = _rows(e @ np.array([[slope, -0.5], [0.5, slope]]))
+            bent[2] = 0.0
+            heading = r[2]
+            r = _rows(e @ Vi.T)
+            r[2] = heading
         if H is not None:
-            _fill(H, q[0], qe, dt, R)
+            _fill(H, q[0], qe, dt, R, Vi, bent)
         return np.asarray(W @ r)
 
-    def _fill(H: list[Array], q_end: Array, qe: Array, dt: float, R: Array) -> None:
+    def _rows(points: Array) -> Array:
+        """Points of the end and of all entries in the layout of the residual; the heading is left open."""
+        out = np.empty(m)
+        out[:2], out[3:] = points[0], points[1:].ravel()
+        return out
+
+    def _fill(
+        H: list[Array], q_end: Array, qe: Array, dt: float, R: Array, Vi: Array | None, bent: Array | None
+    ) -> None:
+        # along an arc V⁻¹ stands before every rotation, and the end heading moves all points
+        by_heading = W_heading if bent is None else W_heading + W @ bent
         if not fixed:
             J = np.empty((m, 3), order="F")
-            J[:, :2] = -W_sum  # a step of the start moves every point by -1
+            J[:, :2] = -W_sum if Vi is None else -W_sum @ Vi  # a step of the start moves every point by -1
             turn = np.empty(m)
             turn[0], turn[1], turn[2] = q_end[1], -q_end[0], -1.0
             turn[3::2], turn[4::2] = qe[:, 1], -qe[:, 0]
+            if Vi is not None and bent is not None:
+                turn = _rows(np.concatenate([turn[:2], turn[3:]]).reshape(-1, 2) @ Vi.T) - bent
+                turn[2] = -1.0
             J[:, 2] = W @ turn
             H[0] = J
         J = np.empty((m, 3), order="F")
         ce, se = math.cos(dt), math.sin(dt)
-        J[:, 0] = W_end[:, 0] * ce + W_end[:, 1] * se  # R_sᵀ R_e
-        J[:, 1] = W_end[:, 1] * ce - W_end[:, 0] * se
-        J[:, 2] = W_heading
+        ends = W_end if Vi is None else W_end @ Vi
+        J[:, 0] = ends[:, 0] * ce + ends[:, 1] * se  # R_sᵀ R_e
+        J[:, 1] = ends[:, 1] * ce - ends[:, 0] * se
+        J[:, 2] = by_heading
         H[first_landmark - 1] = J
         if u:
-            J_points = (W_unique @ R.T).reshape(m, u, 2)  # R_sᵀ in each landmark's own rows
+            turned = R.T if Vi is None else Vi @ R.T
+            J_points = (W_unique @ turned).reshape(m, u, 2)  # R_sᵀ in each landmark's own rows
             for i in range(u):
                 H[first_landmark + i] = J_points[:, i]
 
