@@ -43,7 +43,7 @@ def match_by_id(a: JoinedMap, b: JoinedMap) -> Index:
 
 
 _PASSES = 3
-# … and no more of them once a step is a thousandth of a standard deviation.
+# … and no more of them once a step is a thousandth of a standard deviation, on the average over the map.
 _STEP = 1e-3
 
 
@@ -84,28 +84,31 @@ def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes)
     """
     assert a.anchor is not None
     assert b.anchor is not None
-    x, symbolic, left = a.x, None, _PASSES
     first, second, start = blocks_of(a), blocks_of(b), int(a.pose_node[-1])
+    x, image, left = a.x, _image(a, b, match)[0], _PASSES
+    joined: JoinedMap | None = None
     while True:
         with times.measure("update"):
-            image, *_ = _image(a, b, match)
             seen = kernels.predicted(first, second, image, start, x)
-            if left == _PASSES and np.all(np.abs(seen - b.x) < _ROUNDING * (1.0 + np.abs(b.x))):
+            if joined is None and np.all(np.abs(seen - b.x) < _ROUNDING * (1.0 + np.abs(b.x))):
                 return _assemble(a, b, match, first, second, np.zeros(len(b.x)))[0]  # no news
             ours, g_a = kernels.pulled_back(first, a.anchor, x[: len(a.x)])
             theirs, g_b = kernels.pulled_back(second, b.anchor, seen)
-            joined, gradient, _ = _assemble(a, b, match, ours, theirs, -g_b)
+            if joined is None:
+                joined, gradient, _ = _assemble(a, b, match, ours, theirs, -g_b)
+            else:  # all passes have one pattern
+                system = kernels.join_blocks(ours, theirs, image, start, _ROUNDING, -g_b)
+                gradient = system[6]
+                joined.take_values(system[0], system[5])
+        if left == 0:
+            return joined
         with times.measure("recovery"):
-            if symbolic is None:
+            if left == _PASSES:
                 _keep_order_sparse(joined)
-                symbolic, order, fill = joined.symbolic(), joined.order, joined.fill
-            joined.take_symbolic(symbolic, order, fill)  # all passes have one pattern
-            if left == 0:
-                return joined
             gradient[: len(g_a)] -= g_a
             step = joined.factor().solve(gradient)
             x = _along_arcs(joined, step)
-            left = 0 if gradient @ step < _STEP**2 else left - 1
+            left = 0 if gradient @ step < _STEP**2 * len(step) else left - 1
 
 
 def _along_arcs(m: JoinedMap, step: Array) -> Array:

@@ -237,9 +237,9 @@ class JoinedMap:
         self._symbolic = self._factor = None
         self.fill = self.symbolic().nnz / len(self.values)
 
-    def take_symbolic(self, symbolic: BlockSymbolic, order: Nodes, fill: float) -> None:
-        """Take what a map of the same pattern knows of its factorisation."""
-        self.order, self.fill, self._symbolic, self._factor = order, fill, symbolic, None
+    def take_values(self, x: Array, values: Array) -> None:
+        """Take another mean and other blocks of the same pattern."""
+        self.x, self.values, self._factor = x, values, None
 
     def covariance_block(self, indices: Index) -> Array:
         """Joint covariance of the scalars ``indices`` by sparse solves (Algorithm 1)."""

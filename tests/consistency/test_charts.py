@@ -1,5 +1,5 @@
-"""Headings that drift by degrees inside a submap: maps are honest in the group chart, and joins of them without a polish;
-the same maps read as plain vectors are not."""
+"""Headings that drift by degrees inside a submap: maps are honest in the group chart, and joins of them without a
+polish; the same maps read as plain vectors are not."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_classical_filter_is_not(honesty: dict[str, tuple[float, int]]) -> N
 
 def test_local_maps_of_a_drifting_robot_are_honest_in_their_chart_only() -> None:
     """The front end smooths; exit headings are uncertain by some 7°."""
-    config = ChartConfig(odometry=(0.1, 0.1, 3.0), seconds=90.0, landmarks=60)
+    config = ChartConfig(odometry=(0.1, 0.1, 3.0), seconds=120.0)
     rows = [
         {"world": "w", "algorithm": m.algorithm, "quantity": m.quantity, "value": m.value, "submap": m.submap}
         for seed in range(4)
@@ -53,5 +53,5 @@ def test_local_maps_of_a_drifting_robot_are_honest_in_their_chart_only() -> None
     ]
     (row,) = local_table(pd.DataFrame(rows)).to_dict("records")
     assert row["exit_sigma"] > 4.0
-    assert abs(row["group"] - 1.0) < max(1.7 * row["bound"], 0.1)
+    assert 0.9 < row["group"] < 1.1
     assert row["plain"] > 2.0

@@ -123,7 +123,7 @@ def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
         max_range=c.max_range,
     )
     truth = Truth(Trajectory(times, poses), landmark_ids=np.arange(len(points)), landmarks=points)
-    streams = {
+    streams: dict[str, Stream] = {
         "odometry": Odometry(times=times, increments=increments, covariances=covariances),
         "landmarks": sightings,
     }
