@@ -14,8 +14,8 @@ from tqdm.auto import tqdm
 from graphslam.join.joined_map import JoinTimes
 from graphslam.join.pose_ekf import PoseFilter
 from graphslam.join.pose_estimate import PoseEstimate, estimate, estimate_of_map, polish_poses, tilt_of
-from graphslam.join.pose_map import Blocks, PoseMap, join_poses
-from graphslam.join.pose_problem import PoseProblem, Ties
+from graphslam.join.pose_map import PoseMap, join_poses
+from graphslam.join.pose_problem import PoseProblem
 
 Index = npt.NDArray[np.int64]
 _NONE = np.zeros(0, dtype=np.int64)
@@ -50,18 +50,20 @@ def _by_group(rows: Index, group: Index, m: int) -> list[Index]:
 
 
 @cache
-def _load_kernels() -> None:
+def load_kernels() -> None:
     """Compiled kernels are loaded at their first use, which takes longer than most joins and is not part of any."""
-    ends = np.array([[0, 1], [1, 2], [0, 2]])
-    W = np.broadcast_to(np.eye(3), (3, 3, 3))
-    ties = Ties(ends, np.zeros((3, 3)), W, _NONE, np.zeros((0, 3)), np.zeros((0, 2, 2)))
-    here = PoseMap(np.zeros((3, 3)), None, Blocks(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3, 3))))
-    here.solve(*here.linearised(ties))
+    ends, W = np.array([[0, 1], [1, 2], [0, 2]]), np.broadcast_to(np.eye(3), (3, 3, 3))
+    tiny = PoseProblem(
+        ends, np.zeros((3, 3)), W, _NONE, np.zeros((0, 3)), np.zeros((0, 2, 2)),
+        keys=np.zeros(1, dtype=np.int64), bases=np.array([0, 2]), times=np.arange(3.0),
+    )  # fmt: skip
+    leaf = PoseMap.leaf(tiny)  # the dense solver
+    leaf.solve(*leaf.linearised(tiny))  # the sparse one
 
 
 def leaves_of(problem: PoseProblem, ties: Sorted, times: JoinTimes, progress: bool = False) -> list[PoseMap]:
     """Every submap as a map of its own, at its own optimum."""
-    _load_kernels()
+    load_kernels()
     with times.measure("leaves"):
         return [
             PoseMap.leaf(problem.part(k, k + 1, ties.inside[k], ties.levels[k]))
@@ -153,6 +155,7 @@ def solve_poses(problem: PoseProblem, *, polish: bool = True, progress: bool = F
     ------
     IndeterminateError, SolverError
     """
+    load_kernels()
     t0 = time.perf_counter()
     begun = estimate(problem, problem.start, None, method="batch", seconds=time.perf_counter() - t0)
     best = polish_poses(problem, begun)
@@ -172,6 +175,7 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.isam2 import Isam2Solver
 
+    load_kernels()
     start = time.perf_counter()
     ties, g = Sorted(problem), problem.group
     graph = PoseGraph(problem.dim)

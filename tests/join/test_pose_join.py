@@ -66,6 +66,12 @@ def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
     problem, _ = pose_ramp(6, submaps=5, radians=0.05, **case)
     sparse, dense = join(problem, "eif-sequential"), join(problem, "ekf")
     np.testing.assert_allclose(dense.poses, sparse.poses, atol=1e-9)
+    assert sparse.information.shape == (problem.states, problem.states) == (sparse.states, dense.states)
+    if problem.levelled:
+        np.testing.assert_allclose(dense.tilt, sparse.tilt, atol=1e-9)
+        assert np.abs(sparse.tilt).max() > 1e-4
+    else:
+        assert sparse.tilt is dense.tilt is None
     poses = slice(None, problem.group.dof * (len(problem.times) - 1))
     P = dense.joint_covariance()
     np.testing.assert_allclose(P, P.T, atol=1e-12 * np.abs(P).max())
