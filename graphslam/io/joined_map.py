@@ -29,6 +29,8 @@ JOINED = {
     "landmark_ids": ints("n"),
     "landmarks": floats("n", "c"),
     "state": texts(optional=True),
+    "chart": texts(optional=True),
+    "anchors": ints("n", optional=True),
     "information_data": floats("k", optional=True),
     "information_indices": ints("k", optional=True),
     "information_indptr": ints("s+1", optional=True),
@@ -46,6 +48,8 @@ def write_joined(
     information: sp.csc_matrix | None = None,
     covariance: Array | None = None,
     state: str = "vector",
+    chart: str = "cartesian",
+    anchors: npt.NDArray[np.int64] | None = None,
 ) -> None:
     """Write a joined map, in the frame of the first base.
 
@@ -59,6 +63,10 @@ def write_joined(
     information, covariance : (s, s), optional
         Of the state without the first base.
     state : {"vector", "tangent"}
+    chart : str
+        In which a vector is Gaussian (:mod:`graphslam.core.charts`).
+    anchors : (n,), optional
+        In the group chart, the end pose that each landmark hangs on.
     """
     root = Path(folder)
     root.mkdir(parents=True, exist_ok=True)
@@ -71,6 +79,10 @@ def write_joined(
         "landmarks": landmarks,
         "state": state,
     }
+    if state == "vector":
+        arrays["chart"] = chart
+        if anchors is not None:
+            arrays["anchors"] = anchors
     if information is not None:
         A = sp.csc_matrix(information)
         arrays |= {f"information_{part}": getattr(A, part) for part in ("data", "indices", "indptr")}

@@ -79,6 +79,8 @@ def join(
             information=estimate.information,
             covariance=estimate.covariance,
             state="vector" if isinstance(material, Sequence) else "tangent",
+            chart=estimate.chart,
+            anchors=estimate.anchors,
         )
     found = join_verdict(value["methods"][0], estimate, () if s.problem is None else s.problem.left_out)
     value["verdict"] = [f.as_row() for f in found]

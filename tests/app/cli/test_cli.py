@@ -66,6 +66,7 @@ def test_join_and_compare_print_the_documented_json(run_folder):
         "dof",
         "nees_unpolished",
         "nees",
+        "nees_plain",
         "nees_dof",
         "ci_unpolished",
         "ci",
@@ -82,6 +83,7 @@ def test_join_and_compare_print_the_documented_json(run_folder):
     assert row["objective_polished"] <= row["objective"]
     joined = read_joined(run_folder.parent / "joined")
     assert len(joined["landmarks"]) == len(joined["landmark_ids"]) == row["landmarks"]
+    assert str(joined["state"]) == "vector"
     A = information_of(joined)
     assert A.shape == (row["states"], row["states"])
     assert (np.diag(np.linalg.inv(A.toarray())) > 0).all()
