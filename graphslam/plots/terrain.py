@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap, to_rgba
 from matplotlib.patches import Rectangle
 
 from graphslam.core.geometry import Array
@@ -29,6 +30,12 @@ NAMES = {
     TerrainClass.OBSTACLE: "obstacle",
     TerrainClass.HOLE: "hole, drop",
 }
+
+
+def class_colours(classes: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
+    """Colours ``(n, 4)`` of classes ``(n,)``; grey where nothing is known."""
+    table = [to_rgba(COLOURS[k] if k is not TerrainClass.UNKNOWN else style.GREY) for k in TerrainClass]
+    return np.asarray(np.round(255.0 * np.array(table))).astype(np.uint8)[classes]
 
 
 def plot_terrain(

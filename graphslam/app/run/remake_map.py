@@ -14,7 +14,7 @@ from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
-from graphslam.app.run.terrain import RunTerrain, draw_terrain, terrain_of_run, write_terrain
+from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_file, terrain_of_run, write_terrain
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
@@ -185,9 +185,10 @@ def remake_surface(
         open_run(home)  # says what is wrong
     with locked(home):
         run = open_run(home)
+        terrain = read_terrain_file(outputs(home)) if colour == "terrain" else None
         made = surface_of_run(run, log=log, config=config, progress=progress)
         with new_generation(home) as new:
-            files = write_surface(new, made, colour=colour, generation=run.report.get("generation"))
+            files = write_surface(new, made, colour=colour, terrain=terrain, generation=run.report.get("generation"))
             figures = draw_surface(made, new.figures, name=run.name)
             new.adopt(drop=["surface*", "figures/surface*.png"])
             report_beside(new)

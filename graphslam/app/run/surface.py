@@ -16,7 +16,7 @@ from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.run import Run
 from graphslam.app.run.terrain import scans_of_run
 from graphslam.core import se3
-from graphslam.core.errors import DataError, UnknownNameError
+from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
@@ -26,10 +26,12 @@ from graphslam.maps.surface.layer import PieceId, SurfaceLayer
 from graphslam.maps.surface.mesh import Mesh, owners, position_sigma, save_mesh, zero_set
 from graphslam.maps.surface.piece import Scan, SurfaceConfig
 from graphslam.maps.terrain.lines import lines_of_scans
+from graphslam.maps.terrain.pyramid import ClassGrid
 
 FORMAT = "graphslam.surface/1"
-COLOURS = ("height", "piece", "sigma")
-"""What a surface may be coloured by: height, the node it hangs on, σ of its place that comes of that node."""
+COLOURS = ("height", "piece", "sigma", "terrain")
+"""What a surface may be coloured by: height, the node it hangs on, σ of its place that comes of that node, class of
+terrain below it."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,15 @@ class RunSurface:
             "config": asdict(self.layer.config),
         }
 
-    def colours(self, by: str) -> npt.NDArray[np.uint8]:
-        """Colours ``(v, 4)`` of the vertices by one of :data:`COLOURS`."""
+    def colours(self, by: str, terrain: ClassGrid | None = None) -> npt.NDArray[np.uint8]:
+        """Colours ``(v, 4)`` of the vertices by one of :data:`COLOURS`; by ``terrain`` needs the terrain of the run."""
         from graphslam.plots.surface import vertex_colours
+        from graphslam.plots.terrain import class_colours
 
+        if by == "terrain":
+            if terrain is None:
+                raise MissingDataError("a surface is coloured by terrain of a run whose terrain was made before")
+            return class_colours(terrain.at(self.mesh.vertices))
         if by == "piece":  # neighbours along the path differ
             return vertex_colours(np.asarray((7.0 * self.owner) % 20.0, dtype=np.float64), "tab20")
         if by not in COLOURS:
@@ -178,10 +185,15 @@ def _scans(scans: PointClouds | RangeScans, at: npt.NDArray[np.int64], path: Tra
 
 
 def write_surface(
-    folder: OutputFiles, made: RunSurface, *, colour: str = "height", generation: str | None = None
+    folder: OutputFiles,
+    made: RunSurface,
+    *,
+    colour: str = "height",
+    terrain: ClassGrid | None = None,
+    generation: str | None = None,
 ) -> list[Path]:
     """Write ``surface.ply``, ``surface.glb``, ``surface.obj`` in the colours asked for, and ``surface.json``."""
-    colours = made.colours(colour)
+    colours = made.colours(colour, terrain)
     files = [save_mesh(made.mesh, folder.path / f"surface{ending}", colours) for ending in (".ply", ".glb", ".obj")]
     folder.write_json("surface.json", {**made.facts(), "colour": colour, "generation": generation})
     return [*files, folder.path / "surface.json"]

@@ -17,10 +17,11 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
 from graphslam.core import se3
-from graphslam.core.atomic import write_npz
-from graphslam.core.errors import DataError, MissingDataError, RunFolderError
+from graphslam.core.atomic import read_json, read_npz, write_npz
+from graphslam.core.errors import DataError, FormatError, MissingDataError, RunFolderError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
+from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
@@ -29,7 +30,7 @@ from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotatio
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
 from graphslam.maps.terrain.plan import cost_map, save_cost_map
-from graphslam.maps.terrain.pyramid import TerrainClass, TerrainMap
+from graphslam.maps.terrain.pyramid import ClassGrid, TerrainClass, TerrainMap
 from graphslam.maps.terrain.tables import Tables, read_tables
 from graphslam.maps.terrain.vehicle import LineSensor, Vehicle
 
@@ -246,7 +247,7 @@ def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
 def _posed(scans: PointClouds, k: int, path: Trajectory) -> tuple[Array, Array]:
     """Points of a scan, and where the scanner was, in the frame of the path."""
     T = se3.se3_compose(path.interpolate(scans.times[k : k + 1])[0], scans.T_base_sensor)
-    return se3.se3_transform(T, np.asarray(scans.cloud(k), dtype=np.float64)), T[:3]
+    return se3.se3_move(T, np.asarray(scans.cloud(k), dtype=np.float64)), T[:3]
 
 
 def _ground_of_clouds(
@@ -327,6 +328,27 @@ def _lines(scans: RangeScans, at: Ints, level: Trajectory, height: float) -> Sca
     mine = np.zeros(len(scans.times), np.bool_)
     mine[at] = True
     return lines_of_scans(scans.take(mine), level, height)
+
+
+def read_terrain_file(folder: Path) -> ClassGrid:
+    """The terrain of a run folder.
+
+    Raises
+    ------
+    MissingDataError
+        It was not made yet.
+    FormatError
+        Files that do not fit.
+    """
+    facts = read_json(folder / "terrain.json", fmt=FORMAT, shape={"rotation_level_run": [(float,) * 3]})
+    a = read_npz(
+        folder / "terrain.npz", fmt=FORMAT, fields={"origin": floats(2), "cell": floats(), "classes": ints("ny", "nx")}
+    )
+    rotation = np.array(facts["rotation_level_run"], dtype=np.float64)
+    known = len(a["classes"]) == 0 or bool(a["classes"].min() >= 0 and a["classes"].max() < len(TerrainClass))
+    if rotation.shape != (3, 3) or not a["cell"] > 0 or not known:
+        raise FormatError("terrain that does not fit", where=str(folder / "terrain.npz"))
+    return ClassGrid(a["origin"], float(a["cell"]), a["classes"].astype(np.int8), rotation)
 
 
 def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | None = None) -> list[Path]:

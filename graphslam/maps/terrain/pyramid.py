@@ -89,6 +89,36 @@ class TerrainMap:
         return np.isfinite(self.probability)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassGrid:
+    """The classes of a terrain that was written before, in the frame of its run.
+
+    Parameters
+    ----------
+    origin : (2,)
+        Lower left corner, level frame [m].
+    cell : float
+        [m]
+    classes : (ny, nx) int8
+    rotation : (3, 3)
+        From the frame of the run to the level one.
+    """
+
+    origin: Array
+    cell: float
+    classes: npt.NDArray[np.int8]
+    rotation: Array
+
+    def at(self, points: Array) -> npt.NDArray[np.int8]:
+        """Classes ``(n,)`` of the cells below or above points ``(n, 3)`` of the run [m]; unknown outside."""
+        index = np.floor(((points @ self.rotation.T)[:, :2] - self.origin) / self.cell).astype(np.int64)
+        ny, nx = self.classes.shape
+        inside = np.all((index >= 0) & (index < (nx, ny)), axis=1)
+        out = np.full(len(points), TerrainClass.UNKNOWN, np.int8)
+        out[inside] = self.classes[index[inside, 1], index[inside, 0]]
+        return out
+
+
 class Pyramid:
     """Evidence of a vehicle's surroundings.
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.surface import RunSurface, draw_surface, read_surface, write_surface
-from graphslam.core.errors import ConfigError, DataError, UnknownNameError
+from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
@@ -75,6 +75,8 @@ def test_what_is_written(made: tuple[RunSurface, PointClouds, Trajectory], tmp_p
     assert all(p.stat().st_size > 10_000 for p in drawn)
     with pytest.raises(UnknownNameError, match="colour"):
         made[0].colours("taste")
+    with pytest.raises(MissingDataError, match="made before"):
+        made[0].colours("terrain")
 
 
 def test_no_scan_on_the_path(made: tuple[RunSurface, PointClouds, Trajectory]) -> None:

@@ -11,13 +11,14 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, write_terrain
+from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, read_terrain_file, write_terrain
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.pyramid import TerrainClass
+from graphslam.plots.terrain import class_colours
 
 HEIGHT, CURB_Y = 1.6, 4.0
 LEAN = se3.so3_exp(np.array([0.06, -0.04, 0.0]))
@@ -121,3 +122,31 @@ def test_terrain_is_made_alone(tmp_path: Path) -> None:
     assert done.exit_code != 0
     assert isinstance(done.exception, ConfigError)
     assert "alone" in str(done.exception)
+
+
+def test_a_surface_is_coloured_by_what_was_written(
+    made: tuple[RunTerrain, PointClouds, Trajectory], tmp_path: Path
+) -> None:
+    write_terrain(OutputFiles(tmp_path), made[0])
+    again = read_terrain_file(tmp_path)
+    found = made[0].map
+    iy, ix = np.nonzero(found.classes == TerrainClass.FREE)
+    level = np.column_stack(
+        [found.origin + found.cell * (np.column_stack([ix, iy]) + 0.5), np.zeros(len(ix))]
+    )  # fmt: skip
+    in_run = level @ made[0].rotation
+    assert np.all(again.at(in_run) == TerrainClass.FREE)
+    assert np.all(again.at(in_run + 1e4) == TerrainClass.UNKNOWN)
+    colours = class_colours(again.at(np.vstack([in_run[:1], in_run[:1] + 1e4])))
+    assert colours.shape == (2, 4)
+    assert not np.array_equal(*colours)
+    (tmp_path / "terrain.json").unlink()
+    with pytest.raises(MissingDataError):
+        read_terrain_file(tmp_path)
+
+
+def test_points_are_moved_by_a_matrix_as_by_the_quaternion() -> None:
+    rng = np.random.default_rng(0)
+    T = se3.se3_exp(rng.standard_normal(6))
+    points = rng.standard_normal((50, 3))
+    assert np.allclose(se3.se3_move(T, points), se3.se3_transform(T[None], points), atol=1e-12)
