@@ -18,7 +18,7 @@ from graphslam.core.geometry import Array
 _POSE, _FEATURE = chi2_quantile(0.95, 3), chi2_quantile(0.95, 2)
 GLOBAL = (
     *("ekf", "rbpf", "ekf-eif", "ekf-eif-tree", "rbpf-ekf", "rbpf-eif", "rbpf-eif-tree"),
-    *("default-ekf", "default-eif", "default-eif-tree"),
+    *("default-ekf", "default-eif-classical", "default-eif", "default-eif-tree"),
     *("ekf-eif+polish", "rbpf-eif+polish", "default-eif+polish", "default-isam2", "default-online", "default-optimum"),
     "full-batch",
 )
