@@ -8,7 +8,7 @@ place by another way.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -18,14 +18,17 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
-from graphslam.core.submap import Submap
-from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.layout import UNKNOWN
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.layout import BRICK_EDGE, UNKNOWN
+from graphslam.maps.pieces import Piece, PieceId
 
 POINTS, PAIRS = 1500, 400
 """Points of a submap and pairs of submaps that are looked at, at most; of more, some spread evenly."""
 BESIDE = 2
 """All voxels so far beside a point must deny it: what the path is off is no contradiction."""
+SURE = 0.9
+"""Share of the surest log-odds of free space from which a voxel denies: what came back from no wall (glass, far rooms)
+is taken for free by some settings, and a few such beams say little."""
 FEW = 50
 """Points of a pair below which nothing is said of it."""
 DOUBTED = 0.2
@@ -80,49 +83,79 @@ NOTHING = Contradictions(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.z
 """No submap came to the place of another."""
 
 
-def contradictions(submaps: Sequence[Submap], bases: Array) -> Contradictions:
-    """Look for the solid points of every submap in those that came to the same place by another way.
+def contradictions(
+    pieces: Mapping[PieceId, Piece], at: Mapping[PieceId, Array], model: BeamModel | None = None
+) -> Contradictions:
+    """Look for the solid voxels of every piece in those that came to the same place by another way.
 
     Parameters
     ----------
-    submaps : sequence of Submap
-        Those without a grid are left out.
-    bases : (n, 3|7)
-        Where the map has them.
+    pieces : by name
+        In the order of the way; names begin with the key of the submap. Each holds what it saw itself: a segment that
+        entered an older map has left what it took over from there.
+    at : by name
+        ``T_world_node``.
+    model : BeamModel, optional
+        Of the voxels.
     """
-    g, found = group_of(bases), []
-    clouds = [_solid(s) for s in submaps]
+    names = [n for n, p in pieces.items() if p.known]
+    if not names:
+        return NOTHING
+    model = BeamModel() if model is None else model
+    some = [pieces[n] for n in names]
+    nodes = np.array([at[n] for n in names])
+    g = group_of(nodes)
+    bases = g.compose(nodes, g.inverse(np.array([p.T_base_node for p in some])))
+    clouds = [_solid(p, model.threshold_step) for p in some]
     middles = [c.mean(axis=0) if len(c) else np.zeros(g.dim) for c in clouds]
     centres = g.transform(bases, np.array(middles))
-    sizes = np.array([np.quantile(np.linalg.norm(c - c.mean(axis=0), axis=1), 0.9) if len(c) else 0.0 for c in clouds])
-    way = arc_length(np.asarray(bases[:, : g.dim]))
-    for i, j in product(range(len(submaps)), repeat=2):
+    sizes = np.array(
+        [np.quantile(np.linalg.norm(c - m, axis=1), 0.9) if len(c) else 0 for c, m in zip(clouds, middles)]
+    )
+    way = arc_length(nodes[:, : g.dim])
+    found = []
+    for i, j in product(range(len(some)), repeat=2):
         near = sizes[i] + sizes[j]
         another = abs(i - j) > 1 and abs(way[i] - way[j]) > near
         if another and len(clouds[i]) and len(clouds[j]) and np.linalg.norm(centres[i] - centres[j]) < near:
             found.append((i, j))
     if len(found) > PAIRS:
         found = [found[k * len(found) // PAIRS] for k in range(PAIRS)]
-    rows = [_compared(clouds[i], g.between(bases[j], bases[i]), submaps[j].grid) for i, j in found]
-    keys = np.array([(submaps[i].key, submaps[j].key) for i, j in found], dtype=np.int64).reshape(-1, 2)
+    rows = [_compared(clouds[i], g.between(bases[j], bases[i]), some[j], model) for i, j in found]
+    keys = np.array([(names[i][0], names[j][0]) for i, j in found], dtype=np.int64).reshape(-1, 2)  # type: ignore[index]
     told = np.array(rows, dtype=np.int64).reshape(-1, 2)
     return Contradictions(keys, told[:, 0], told[:, 1])
 
 
-def _solid(s: Submap) -> Array:
-    if not isinstance(s.grid, EvidenceGrid):
-        return np.zeros((0, s.dim))
-    cloud = np.asarray(s.grid.occupied_cloud())
-    return cloud[np.arange(min(len(cloud), POINTS)) * len(cloud) // max(min(len(cloud), POINTS), 1)]
+def _solid(piece: Piece, threshold: int) -> Array:
+    """Centres of solid voxels ``(k, dim)`` in the base [m], not too many."""
+    brick, voxel = np.nonzero(piece.values >= threshold)
+    keep = np.arange(min(len(brick), POINTS)) * len(brick) // max(min(len(brick), POINTS), 1)
+    brick, voxel = brick[keep], voxel[keep]
+    inside = np.column_stack([voxel & 7, voxel >> 3 & 7, voxel >> 6])
+    centres = (BRICK_EDGE * piece.coordinates[brick] + inside + 0.5) * piece.voxel_size
+    return np.asarray(centres[:, : piece.dim])
 
 
-def _compared(cloud: Array, T: Array, grid: Any) -> tuple[int, int]:
-    """How many points of a cloud at ``T_grid_cloud`` a grid has, and how many it denies."""
+def _values(piece: Piece, voxels: npt.NDArray[np.int64]) -> npt.NDArray[np.int16]:
+    """Of voxels ``(k, 3)`` of the base's lattice."""
+    at = (voxels >> 3) - piece.first
+    inside = np.all((at >= 0) & (at < piece.table.shape[::-1]), axis=1)
+    at = np.where(inside[:, None], at, 0)
+    row = np.where(inside, piece.table[at[:, 2], at[:, 1], at[:, 0]], 0)
+    v = voxels & 7
+    return np.asarray(piece.lookup[row, v[:, 2] << 6 | v[:, 1] << 3 | v[:, 0]])
+
+
+def _compared(cloud: Array, T: Array, piece: Piece, model: BeamModel) -> tuple[int, int]:
+    """How many points of a cloud at ``T_base_cloud`` a piece has, and how many it denies."""
     points = group_of(T[None]).transform(np.broadcast_to(T, (len(cloud), len(T))), cloud)
-    points = points[grid.values_at(points) != UNKNOWN]
-    top, low = np.full(len(points), UNKNOWN, np.int16), np.full(len(points), 32767, np.int16)
-    for beside in product(range(-BESIDE, BESIDE + 1), repeat=grid.dim):
-        values = grid.values_at(points + np.array(beside) * grid.voxel_size)
+    voxels = np.zeros((len(points), 3), np.int64)
+    voxels[:, : piece.dim] = np.floor(points / piece.voxel_size)
+    voxels = voxels[_values(piece, voxels) != UNKNOWN]
+    top, low = np.full(len(voxels), UNKNOWN, np.int16), np.full(len(voxels), 32767, np.int16)
+    for beside in product(range(-BESIDE, BESIDE + 1), repeat=piece.dim):
+        values = _values(piece, voxels + np.array([*beside, 0][:3]))
         top, low = np.maximum(top, values), np.minimum(low, values)
-    clear = grid.model.miss_step
-    return int(np.sum(top >= grid.model.threshold_step)), int(np.sum((top <= clear) & (low != UNKNOWN)))
+    free = (top <= SURE * model.clamp_steps[0]) & (low != UNKNOWN)
+    return int(np.sum(top >= model.threshold_step)), int(np.sum(free))

@@ -239,7 +239,7 @@ def make_run_map(
         points,
         knows_space,
         coarsened,
-        contradictions(submaps, m.base_poses[:-1]),
+        contradictions(divided.pieces, at, model),
     )
 
 

@@ -38,7 +38,9 @@ FLAGGED = 0.05
 """Share of the submaps of honest runs that front ends may flag by chance."""
 QUARTER = 0.25
 """Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
-DENIED = (0.02, 0.05)
+ALIKE = 2
+"""Submaps of which the same is said in full; of more their keys are told."""
+DENIED = (0.02, 0.1)
 """Share of solid points that another pass denies from which the verdict asks to look at the map, and to distrust it."""
 MOSTLY = 0.95
 """Share of the records of a stream below which the verdict asks to look at what became of the others."""
@@ -138,9 +140,25 @@ def observed(
     for n in noticed:
         level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
         out.append(replace(n.finding, level=level))
-    out += _of_events(events)
-    for submap in submaps:
-        out += [f for row in submap.report.get("findings", ()) if (f := Finding.from_row(row))]
+    return [*out, *_of_events(events), *_of_submaps(submaps)]
+
+
+def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
+    """What front ends say of submaps; of what they say of many, the first in full and the keys of the others."""
+    said = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
+    told: dict[tuple[Level, str], list[int]] = {}
+    out = []
+    for key, f in said:
+        keys = told.setdefault((f.level, f.code), [])
+        if key not in keys:
+            keys.append(key)
+        if len(keys) <= ALIKE:
+            out.append(f)
+    for (level, code), keys in told.items():
+        if more := keys[ALIKE:]:
+            some = ", ".join(map(str, more[:12])) + (", …" if len(more) > 12 else "")
+            text = f"The same ({code}) is said of {len(more)} more submaps: {some}; their reports have the figures."
+            out.append(Finding(level, code, text))
     return out
 
 

@@ -13,7 +13,7 @@ import graphslam as gs
 from graphslam.app.cli.run import _summary, join_note
 from graphslam.app.report.report import make_report
 from graphslam.app.run.run import Run
-from graphslam.app.run.verdict import Figures, stated
+from graphslam.app.run.verdict import Figures, observed, stated
 from graphslam.core.findings import Finding, findings_of_json, headline, verdict_json
 from tests.reference.page import Page
 
@@ -69,6 +69,21 @@ def test_loops_that_disagree_are_read_by_the_verdict() -> None:
     for value, expected in ((1.05, []), (1.76, ["bad"])):
         lines = stated(Figures(solved, {"loops_value": value, "loops_dof": dof, "gap": 0.0}))
         assert [f.level for f in lines if "loops" in f.text] == expected
+
+
+def test_what_is_said_of_many_submaps_is_said_twice_and_counted() -> None:
+    def submap(key: int) -> SimpleNamespace:
+        rows = [Finding("look", "scans-unheld", f"Submap {key}: nothing holds it.").as_row()]
+        rows += [Finding("", "note", text).as_row() for text in ("one", "two", "three")] if key == 0 else []
+        return SimpleNamespace(key=key, report={"findings": rows})
+
+    found = observed([], submaps=[submap(k) for k in range(20)])  # type: ignore[misc]
+    assert [f.text for f in found if f.code == "note"] == ["one", "two", "three"]
+    unheld = [f.text for f in found if f.code == "scans-unheld"]
+    assert len(unheld) == 3
+    assert unheld[0] == "Submap 0: nothing holds it."
+    assert "18 more submaps: 2, 3, 4" in unheld[2]
+    assert not [f for f in observed([], submaps=[submap(0), submap(1)]) if "more submaps" in f.text]
 
 
 def test_what_is_no_finding_of_ours_is_left_out() -> None:
