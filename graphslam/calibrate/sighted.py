@@ -45,10 +45,13 @@ class Effort:
     """Poses of all short windows together; of the one stretch of ranges alone."""
     clock: bool = True
     """Is the offset of the clocks looked for?"""
+    again: bool = False
+    """Is an estimate of ranges and bearings made once more, of all data, when withheld ones have judged it? That of
+    ranges alone always is."""
 
 
 QUICK = Effort()
-FULL = Effort(windows=60, poses=6000)
+FULL = Effort(windows=60, poses=6000, again=True)
 
 
 def calibrate_sightings(
@@ -70,16 +73,18 @@ def calibrate_sightings(
         Too little is seen twice, or nothing moves.
     """
     held, noise = seen.holding(), noise or MotionNoise()
-    if not np.any(seen.sightings.has_bearing):
+    blind = not np.any(seen.sightings.has_bearing)
+    if blind:
         found, whole = _ranges_alone(held, effort, seed)
         scans = [stretches(seen, 1e9)[0][: len(whole.windows[0].poses)]]
-        start = partial(_along, whole, seen.sightings.ids)
-        foretell = partial(foretold, held, found, scans, noise, start)
+        foretell = partial(foretold, held, found, scans, noise, partial(_along, whole, seen.sightings.ids))
     else:
         found = _range_and_bearing(held, effort)
         foretell = partial(foretold, held, found, _tested(held, effort), noise)
     prediction = None if found.contradictions() else foretell()
-    return found if prediction is None else found.judged(prediction)
+    if blind or effort.again:  # what was withheld is data like the rest once it has judged
+        found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
+    return found if prediction is None or found.contradictions() else found.judged(prediction)
 
 
 def _tested(held: Seen, effort: Effort) -> list[Ints]:
