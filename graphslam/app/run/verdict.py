@@ -356,7 +356,8 @@ def _passes(found: Mapping[str, Any]) -> list[Finding]:
     most = f" (most in submaps {pairs})" if pairs else ""
     text += (
         f"; {share:.1%} lie where these saw nothing{most}. Walls stand twice in the map where a loop is wrong or was "
-        "not closed, unless so much was moved between the passes: look at the map."
+        "not closed, unless so much was moved between the passes: look at the map. Other seeds (--seed), or the noise "
+        "that the log states (--set calibrate.use=none), may find the loops that this run did not."
     )
     return [Finding("bad" if share > DENIED[1] else "look", "passes", text)]
 
