@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from graphslam.core.charts import along_arc
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
@@ -240,6 +241,7 @@ def truth_metrics(
     """RMSE and NEES with the first base fixed, and after a rigid alignment; landmarks only with the truth's identities.
 
     The first gauge trusts the true pose of the first base, heading included: over metres a degree of it is centimetres.
+    Its NEES is taken in the chart of the map (:mod:`graphslam.core.charts`), ``nees_plain`` of the plain vector.
     In the second the map is moved onto the truth as a whole (three scalars less in the NEES): landmarks by themselves,
     the path by itself, and the NEES by generalised least squares over all that is judged.
 
@@ -259,12 +261,16 @@ def truth_metrics(
     error, points = e_pose.ravel(), np.zeros((0, 2))
     ix = (3 * (node - 1)[:, None] + np.arange(3)).ravel()
     n_pose = len(error)
+    turned = np.zeros(len(solution.poses))  # what the headings differ by
+    turned[node] = e_pose[:, 2]
+    charted = np.column_stack([along_arc(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
     if identities:
         ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
         points = solution.landmarks[ours]
         e_lm = truth.landmarks[theirs] - points
         out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
         error = np.concatenate([error, e_lm.ravel()])
+        charted = np.concatenate([charted, along_arc(e_lm, turned[solution.anchors[ours]]).ravel()])
         ix = np.concatenate([ix, (first_landmark + 2 * ours[:, None] + np.arange(2)).ravel()])
         if len(ours) >= 2:
             rigid = landmark_error(
@@ -276,7 +282,8 @@ def truth_metrics(
         out.add("path_rmse_aligned", whole.statistics.rmse, "m", "lower")
         out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
     P = P[np.ix_(ix, ix)]
-    add_nees(out, "nees", joint_nees(error, covariance=P), len(error))
+    add_nees(out, "nees", joint_nees(charted if solution.chart == "group" else error, covariance=P), len(error))
+    out.add("nees_plain", joint_nees(error, covariance=P))
     gauge = gauge_directions(solution.poses[node], points)
     parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
     for name, part in parts.items():

@@ -57,9 +57,9 @@ class Contradictions:
         return int(self.seen.sum() + self.denied.sum())
 
     @property
-    def share(self) -> float:
-        """Share of denied points; 0 where too few were told of."""
-        return float(self.denied.sum()) / self.points if self.points >= FEW else 0.0
+    def share(self) -> float | None:
+        """Share of denied points; none where too few were told of."""
+        return float(self.denied.sum()) / self.points if self.points >= FEW else None
 
     @property
     def doubted(self) -> npt.NDArray[np.int64]:

@@ -17,6 +17,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factors.gps import level_datum_pose
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.network import network_of
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
@@ -91,6 +92,22 @@ class Solution:
     def submaps(self) -> tuple[SubmapNode, ...]:
         """Nodes of every submap, inner ones included."""
         return tuple(self._submaps)
+
+    @property
+    def chart(self) -> str:
+        """The coordinates in which its landmark maps are Gaussian: "group" where all are so, otherwise "cartesian"."""
+        charts = {r.chart for r in self._flat.records if isinstance(r, SubmapRecord) and len(r.landmark_ids)}
+        return "group" if charts == {"group"} else "cartesian"
+
+    @property
+    def anchors(self) -> npt.NDArray[np.intp]:
+        """Row of :attr:`poses` at the end of the submap that saw each landmark first ``(n,)``; -1 of what none saw."""
+        first: dict[int, int] = {}
+        for r in self._flat.records:
+            if isinstance(r, SubmapRecord):
+                for i in r.landmark_ids.tolist():
+                    first.setdefault(i, r.start + 1)
+        return np.array([first.get(i, -1) for i in self.landmark_ids.tolist()], dtype=np.intp)
 
     @property
     def node_times(self) -> Array:
