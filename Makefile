@@ -2,8 +2,11 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+BASE   := $(VENV)/.base
 STAMP  := $(VENV)/.ready
-EXTRAS ?= dev,notebooks,lidar
+EXTRAS ?= dev,notebooks
+# Bytecode of everything installed is 0.2 GB, most of it never loaded; Python writes what it does load.
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 # Processes that run tests, or quick benchmarks, at one time; the tests of a file stay together.
 WORKERS ?= 2
 
@@ -16,14 +19,21 @@ export OMP_WAIT_POLICY ?= passive
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml setup.py
+# What runs, draws and simulates: the demo needs no more.
+$(BASE): pyproject.toml setup.py
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo "installing graphslam and what it needs into $(VENV) (a minute or two the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
+	@echo "installing graphslam into $(VENV) (0.6 GB, half a minute or more the first time)"
+	@$(PIP) --upgrade pip
+	@$(PIP) --editable .
+	@touch $(BASE)
+
+# What the tests compare with, and the notebooks.
+$(STAMP): $(BASE)
+	@echo "installing what the tests and the notebooks need into $(VENV) (another 2 GB: Open3D, Rerun, JupyterLab)"
+	@$(PIP) --editable '.[$(EXTRAS)]'
 	@touch $(STAMP)
 
-demo: $(STAMP)
+demo: $(BASE)
 	$(BIN)/graphslam demo --out demo-run
 	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 

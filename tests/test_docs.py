@@ -25,6 +25,7 @@ PAGES = [
     "gnss.md",
     "how-to.md",
     "imu.md",
+    "install.md",
     "joiners.md",
     "limits.md",
     "loops.md",

@@ -39,6 +39,8 @@ CONFINED = {
     "matplotlib": ("graphslam/plots/",),
     "typer": ("graphslam/app/",),
     "open3d": (),
+    "skimage": (),
+    "trimesh": (),
     "small_gicp": ("graphslam/registration/",),
 }
 FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])

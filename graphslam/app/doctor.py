@@ -8,23 +8,22 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from typing import Literal
 
 from graphslam.app.run.front_ends import front_end_names
+from graphslam.core.extras import EXTRAS
 from graphslam.io.catalog import cache_folder, data_roots
 
 REQUIRED = {
     "gtsam": "gtsam",
     "numpy": "numpy",
     "scipy": "scipy",
-    "scikit-image": "skimage",
-    "trimesh": "trimesh",
     "numba": "numba",
     "matplotlib": "matplotlib",
     "pandas": "pandas",
     "small_gicp": "small_gicp",
 }
-OPTIONAL = {"open3d": "open3d", "kiss-icp": "kiss_icp", "libusb-package": "libusb_package"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +36,19 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Python, packages, data roots, front ends; "absent" is an optional part that is not there."""
+    """Python, packages, extras and what each buys, data roots, front ends; "absent" is an optional part."""
     found = [Finding("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
     for name, module in REQUIRED.items():
         problem = _import_error(f"import {module}")
-        found.append(_finding(name, problem, required=True, hint=f"pip install {name}"))
-    hint = "pip install 'graphslam-submaps[lidar]'"
-    for name, module in OPTIONAL.items():
-        code = f"import {module}"
-        if name == "open3d":  # with libusb loaded first, as the library does it
-            code = "from graphslam.core.heavy import import_open3d; import_open3d()"
-        found.append(_finding(name, _import_error(code), required=False, hint=hint))
+        found.append(_finding(name, problem))
+    for extra, e in EXTRAS.items():
+        code = "from graphslam.core.extras import import_extra\n"
+        code += "\n".join(f"import_extra({module!r}, {extra!r})" for module in e.modules)
+        there = all(find_spec(module) for module in e.modules)
+        problem = _import_error(code) if there else "not installed"
+        advice = f"{e.buys}: pip install 'graphslam-submaps[{extra}]' (about {e.size} MB)"
+        detail = e.buys if not problem else advice if not there else f"{problem} ({e.buys})"
+        found.append(Finding(f"extra {extra}", "absent" if problem else "ok", detail))
     names = front_end_names()
     state: Literal["ok", "missing"] = "ok" if names else "missing"
     found.append(
@@ -60,14 +61,14 @@ def examine() -> list[Finding]:
     return found
 
 
-def _finding(name: str, problem: str, *, required: bool, hint: str) -> Finding:
+def _finding(name: str, problem: str) -> Finding:
     try:
         number = version(name)
     except PackageNotFoundError:
         number = "not installed"
-    if not problem:
-        return Finding(name, "ok", number)
-    return Finding(name, "missing" if required else "absent", f"{number}: {problem}; {hint}")
+    return (
+        Finding(name, "missing", f"{number}: {problem}; pip install {name}") if problem else Finding(name, "ok", number)
+    )
 
 
 def _import_error(code: str) -> str:

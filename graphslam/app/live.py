@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.backend.back_end import Observer
-from graphslam.core.errors import MissingDataError
+from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
@@ -42,19 +41,12 @@ class LiveView(Observer):
 
     Raises
     ------
-    MissingDataError
+    MissingExtraError
         Rerun is not installed.
     """
 
     def __init__(self, name: str, file: str | Path | None = None) -> None:
-        try:
-            self.rr: Any = importlib.import_module("rerun")
-        except ImportError as error:
-            raise MissingDataError(
-                "a live view needs Rerun, which is not installed",
-                got=error,
-                wanted='pip install "graphslam-submaps[live]"',
-            ) from error
+        self.rr: Any = import_extra("rerun", "a live view")
         self.stream = self.rr.RecordingStream(f"graphslam {name}")
         if file is None:
             self.stream.spawn()

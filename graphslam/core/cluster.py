@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from graphslam.core.errors import ConfigError, GraphSlamError
+from graphslam.core.extras import import_extra
 
 if TYPE_CHECKING:
     from distributed import Client
-
-
-def require_distributed() -> ModuleType:
-    """Import ``distributed`` (Dask's scheduler, BSD).
-
-    Raises
-    ------
-    GraphSlamError
-        If it is not installed; names the extra that brings it.
-    """
-    try:
-        return importlib.import_module("distributed")
-    except ImportError as error:
-        raise GraphSlamError(
-            f"a Dask cluster needs the package distributed ({error}); pip install 'graphslam-submaps[cluster]'"
-        ) from error
 
 
 def connect(address: str, *, timeout: float = 10.0) -> Client:
@@ -47,12 +30,12 @@ def connect(address: str, *, timeout: float = 10.0) -> Client:
 
     Raises
     ------
-    GraphSlamError
+    MissingExtraError
         If ``distributed`` is not installed.
     ConfigError
         If nobody answers at the address, or it is not one.
     """
-    distributed = require_distributed()
+    distributed = import_extra("distributed", "a Dask cluster")
     try:
         client: Client = distributed.Client(address, timeout=timeout, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -83,7 +66,7 @@ def hands(workers: int | None = None, address: str | None = None) -> Iterator[Ca
     if workers is None and address is None:
         yield lambda work, tasks: [work(*task) for task in tasks]
         return
-    distributed = require_distributed()
+    distributed = import_extra("distributed", "a Dask cluster")
 
     def on(client: Client) -> Callable[..., list[Any]]:
         def run(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Any]:

@@ -44,6 +44,10 @@ class MissingDataError(DataError):
     """A file, stream or data set that was asked for is not there."""
 
 
+class MissingExtraError(MissingDataError):
+    """A package that only some uses need is not installed; the message names the extra that brings it."""
+
+
 class CovarianceError(DataError):
     """A covariance or information matrix is not finite, not symmetric or not positive definite."""
 

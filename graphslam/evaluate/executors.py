@@ -19,8 +19,9 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from graphslam.core.cluster import connect, require_distributed
+from graphslam.core.cluster import connect
 from graphslam.core.errors import ConfigError, GraphSlamError
+from graphslam.core.extras import import_extra
 
 Executor = Literal["serial", "processes", "dask"]
 Call = Callable[[int], Iterable[Any]]
@@ -243,7 +244,7 @@ def _processes(jobs: Sequence[Job], count: int, prepare: Callable[[], object] | 
 
 
 def _dask(jobs: Sequence[Job], address: str, prepare: Callable[[], object] | None) -> Generator[Outcome, None, None]:
-    distributed = require_distributed()
+    distributed = import_extra("distributed", "a Dask cluster")
     client = connect(address)
     try:
         futures = {client.submit(attempt, j.trial, j.seed, prepare, pure=False): j for j in jobs}

@@ -30,6 +30,7 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, FormatError, GraphSlamError, MissingDataError
+from graphslam.core.extras import import_extra
 from graphslam.core.geodesy import geodetic_to_ecef
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.gnss import TangentPlane
@@ -204,17 +205,12 @@ class _Bag:
     """The files of a bag, opened: topics, and messages as ``(topic, bytes, bag's stamp, decode)``."""
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
-        try:
-            import mcap  # noqa: F401
-            from rosbags.rosbag1 import Reader as Reader1
-            from rosbags.rosbag2 import Reader as Reader2
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise MissingDataError(
-                f"bags need a package that is not installed ({error})",
-                where=str(path),
-                wanted="pip install 'graphslam-submaps[ros]'",
-            ) from None
+        for package in ("mcap", "rosbags"):
+            import_extra(package, "a bag", where=str(path))
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        from rosbags.typesys import Stores, get_typestore
+
         self.path = path
         files = _files(path)
         kinds = {f: "" if f.is_dir() else bag_kind(Look(f), f) for f in files}

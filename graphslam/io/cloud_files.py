@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.core.reading import check_size, read_bytes, usable
 from graphslam.io.look import ending, plain_name
@@ -373,14 +374,7 @@ def lzf(data: bytes, size: int, where: str) -> bytes:
 
 
 def _las(raw: bytes, where: str) -> Cloud:
-    try:
-        import laspy
-    except ImportError as error:
-        raise MissingDataError(
-            f"LAS needs a package that is not installed ({error})",
-            where=where,
-            wanted="pip install 'graphslam-submaps[las]'",
-        ) from None
+    laspy = import_extra("laspy", "a LAS file", where=where)
     n = _las_count(raw, len(raw), where)  # before laspy allocates
     if raw[104] & 0x80 and n:
         _check_chunks(raw, where)

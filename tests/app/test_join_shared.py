@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.core.cluster import require_distributed
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.io.joined_map import read_joined
@@ -37,7 +36,7 @@ def joined(folder: Path, out: Path, *options: str) -> tuple[dict, np.ndarray]:
 def test_cluster_and_workers_join_the_same_map(store: tuple[Path, list[Submap]], tmp_path: Path) -> None:
     folder, _ = store
     alone, poses = joined(folder, tmp_path / "alone")
-    with require_distributed().LocalCluster(
+    with pytest.importorskip("distributed").LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
         shared = [joined(folder, tmp_path / "cluster", "--cluster", cluster.scheduler_address)]

@@ -16,7 +16,6 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.core.cluster import require_distributed
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.skeleton import chain_tiles as tiles
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
@@ -79,7 +78,7 @@ def test_a_killed_worker_changes_no_byte(graph: ChainGraph, tmp_path: Path) -> N
     assert bytes_of(alone) == bytes_of(shared)
     wanted = relax_tiles(alone, gain=1e-12)
     killed = []
-    with require_distributed().LocalCluster(
+    with pytest.importorskip("distributed").LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
     ) as cluster:
 

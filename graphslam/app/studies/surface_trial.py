@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 from time import process_time
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError
+from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
-from graphslam.core.heavy import import_open3d
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.montecarlo import Measurement
@@ -27,6 +26,7 @@ from graphslam.sim.campus_config import CampusConfig
 from graphslam.sim.campus_world import campus
 from graphslam.sim.garage import garage
 from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from graphslam.sim.raycast import RayCaster
 from graphslam.sim.world import World
 
 SAMPLES = 60_000
@@ -208,7 +208,7 @@ class Judge:
 
     def __init__(self, seen: Seen, r: np.random.Generator) -> None:
         self.seen, self.r = seen, r
-        self.truth = _distances_to(seen.world.vertices, seen.world.triangles)
+        self.truth = RayCaster.of(seen.world).distances
 
     def of(self, name: str, mesh: Mesh) -> Iterator[Measurement]:
         """Figures of one surface."""
@@ -216,7 +216,7 @@ class Judge:
             return
         to_truth = self.truth(mesh.samples(SAMPLES, self.r))
         places = self.seen.places[self.r.permutation(len(self.seen.places))[:SAMPLES]]
-        to_mesh = _distances_to(mesh.vertices, mesh.triangles)(places)
+        to_mesh = RayCaster(mesh.vertices, mesh.triangles).distances(places)
         for d, what in ((0.02, "f_2cm"), (0.05, "f_5cm")):
             precision, recall = float(np.mean(to_truth < d)), float(np.mean(to_mesh < d))
             yield Measurement(name, what, 2.0 * precision * recall / max(precision + recall, 1e-12))
@@ -226,24 +226,6 @@ class Judge:
         yield Measurement(name, "mean_mm", 1e3 * float(np.mean(np.minimum(to_truth, 0.5))))
         yield Measurement(name, "area_ratio", mesh.area() / self.seen.area)
         yield Measurement(name, "seen_m2", self.seen.area)
-
-
-class _distances_to:
-    """Distances of points to a mesh [m]."""
-
-    def __init__(self, vertices: Array, triangles: npt.NDArray[np.integer]) -> None:
-        o3d = import_open3d()
-        self.tensor = o3d.core.Tensor
-        self.centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self.scene.add_triangles(
-            self.tensor(np.ascontiguousarray(vertices - self.centre, dtype=np.float32)),
-            self.tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
-        )
-
-    def __call__(self, points: Array) -> Array:
-        at = self.tensor(np.ascontiguousarray(points - self.centre, dtype=np.float32))
-        return np.asarray(self.scene.compute_distance(at, nthreads=1).numpy(), dtype=np.float64)
 
 
 def log_odds_mesh(scans: list[Scan], voxel: float, most_range: float) -> Mesh:
@@ -258,7 +240,7 @@ def log_odds_mesh(scans: list[Scan], voxel: float, most_range: float) -> Mesh:
 def poisson_mesh(scans: list[Scan], c: SurfaceConfig) -> Mesh:
     """Open3D's screened Poisson surface of the same points and normals, cells as wide as voxels or narrower, without
     what lies farther than three voxels from every point."""
-    o3d = import_open3d()
+    o3d = import_extra("open3d", "a Poisson surface")
     points = np.concatenate([p[np.linalg.norm(p - o, axis=1) < c.most_range] for p, o in scans])
     origins = np.concatenate(
         [np.broadcast_to(o, (int(np.sum(np.linalg.norm(p - o, axis=1) < c.most_range)), 3)) for p, o in scans]

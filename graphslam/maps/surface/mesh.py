@@ -13,6 +13,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError, FormatError
+from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.maps.surface.layer import PieceId, SurfaceLayer
 from graphslam.maps.surface.piece import SurfacePiece
@@ -155,8 +156,7 @@ def _edges(changed: Ints) -> list[Ints]:
 def _triangles(
     coordinates: Ints, phi: Array, known: npt.NDArray[np.bool_], tile: tuple[int, int, int]
 ) -> tuple[Array, Ints] | None:
-    from skimage.measure import marching_cubes
-
+    measure = import_extra("skimage.measure", "a surface")
     n = _SPAN + 1
     values, there = np.ones((n, n, n), np.float32), np.zeros((n, n, n), np.bool_)
     for (x, y, z), p, k in zip((8 * (coordinates - TILE * np.array(tile))).tolist(), phi, known):
@@ -174,7 +174,7 @@ def _triangles(
     mask = np.zeros((n, n, n), np.bool_)
     mask[1:, 1:, 1:] = cells  # of a cell, its last corner
     try:
-        vertices, triangles, _, _ = marching_cubes(values, 0.0, mask=mask, allow_degenerate=False)
+        vertices, triangles, _, _ = measure.marching_cubes(values, 0.0, mask=mask, allow_degenerate=False)
     except (RuntimeError, ValueError):  # no cell of the mask is crossed
         return None
     at = vertices[:, ::-1].astype(np.float64) + 0.5 + _SPAN * np.array(tile)
@@ -244,9 +244,10 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike[str], colours: npt.NDArray[np.
         Another ending.
     DataError
         No triangle.
+    MissingExtraError
+        The extra ``surface`` is not installed.
     """
-    import trimesh
-
+    trimesh = import_extra("trimesh", "a file of a surface")
     target = Path(path)
     if target.suffix not in FORMATS:
         raise FormatError("unknown ending of a mesh", where=str(path), got=target.suffix, wanted=", ".join(FORMATS))

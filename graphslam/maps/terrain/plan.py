@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import ConfigError, DataError, FormatError
+from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
 from graphslam.maps.terrain.vehicle import Vehicle
@@ -126,15 +127,16 @@ def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
     ------
     DataError
         A place outside the map.
+    MissingExtraError
+        The extra ``surface`` is not installed.
     """
-    from skimage.graph import MCP_Geometric
-
+    graph = import_extra("skimage.graph", "a way over terrain")
     ends = [costs.index(g) for g in np.atleast_2d(goal)]
     ends = [b for b in ends if np.isfinite(costs.cost[b])]
     a = _way_out(costs, costs.index(start))
     if not ends or a is None:
         return None
-    search = MCP_Geometric(np.where(np.isfinite(costs.cost), costs.cost, -1.0))
+    search = graph.MCP_Geometric(np.where(np.isfinite(costs.cost), costs.cost, -1.0))
     totals = search.find_costs([a], ends, find_all_ends=False)[0]  # it ends at the cheapest one
     b = min(ends, key=lambda end: totals[end])
     if not np.isfinite(totals[b]):
