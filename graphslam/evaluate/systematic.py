@@ -125,6 +125,9 @@ class Systematic:
         Each error of :data:`KINDS` as if it were the only one, and its σ.
     taken : (p,)
         χ² that correcting it takes away.
+    drift, drift_dof : (p,)
+        Mean of ``g² / S`` over the windows, weighted by S: 1 where noise is white in a window, more where an error
+        lasts for as long; and its degrees of freedom ``(Σ S)² / Σ S²``.
     """
 
     windows: int
@@ -133,6 +136,8 @@ class Systematic:
     error: Array
     sigma: Array
     taken: Array
+    drift: Array
+    drift_dof: Array
 
     @property
     def ratio(self) -> float:
@@ -159,7 +164,9 @@ def sums(reports: Sequence[Mapping[str, Any]]) -> Systematic | None:
         left = total["score2"] - 2 * error * total["score_information"] + error**2 * total["information2"]
         scatter = left * windows / (windows - 1)
     sigma = np.sqrt(np.maximum(s, scatter)) / s
-    return Systematic(windows, float(total["chi2"]), int(total["dof"]), error, sigma, total["score"] ** 2 / s)
+    drift, dof = total["score2"] / s, s**2 / np.maximum(total["information2"], 1e-24)
+    taken = total["score"] ** 2 / s
+    return Systematic(windows, float(total["chi2"]), int(total["dof"]), error, sigma, taken, drift, dof)
 
 
 def systematic_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:

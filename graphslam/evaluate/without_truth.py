@@ -18,8 +18,18 @@ from scipy import stats
 
 from graphslam.core.geometry import Array
 from graphslam.evaluate.consistency import Verdict
+from graphslam.evaluate.whiteness import Whiteness, whiteness
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factors.batch import UniformBatch
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.gps import GpsBatch
+from graphslam.graph.noise import robust_terms
 from graphslam.graph.pose_graph import PoseGraph
+
+LASTING = "correlated: over-confident"
+"""Verdict on residuals that are alike from one to the next, whatever their size."""
+LONGEST_SERIES = 1200
+"""Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
 
 def two_sided(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
@@ -82,6 +92,12 @@ class ClassConsistency:
     mean_weight: float
     least_weight: float
     confidence: float = 0.95
+    whiteness: Whiteness | None = None
+
+    @property
+    def independent(self) -> float:
+        """Degrees of freedom that independent residuals would have: :attr:`dof` over their correlation time."""
+        return self.dof / (1.0 if self.whiteness is None else self.whiteness.tau)
 
     @property
     def ratio(self) -> float:
@@ -92,11 +108,14 @@ class ClassConsistency:
         """One row of a table, with the two-sided bounds of the ratio and the verdict.
 
         The bounds are those of ``χ²_dof``. One class of several is a part of a projection and varies less, so they are
-        wide rather than narrow.
+        wide rather than narrow. Residuals that are alike from one to the next are over-confident whatever their size:
+        a map that follows errors that last has small residuals.
         """
         low, high, verdict = float("nan"), float("nan"), "no redundancy"
+        w = self.whiteness
         if np.isfinite(self.ratio):
-            low, high, verdict = two_sided(self.ratio, self.dof, self.confidence)
+            low, high, verdict = two_sided(self.ratio, self.independent, self.confidence)
+            verdict = LASTING if w is not None and w.lasting() else verdict
         return {
             "class": self.name,
             "factors": self.factors,
@@ -110,6 +129,9 @@ class ClassConsistency:
             "verdict": verdict,
             "mean_weight": self.mean_weight,
             "least_weight": self.least_weight,
+            "lag1": None if w is None else w.lag1,
+            "lag1_score": None if w is None else w.score,
+            "correlation_time": None if w is None else w.tau,
         }
 
 
@@ -137,6 +159,7 @@ def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str
         again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
         dof = record.rows - 2.0 * w * h + again
         sums.setdefault(record.group, []).append((record.rows, w * h, dof, float(d2), float(w)))
+    series = _series(graph, covariance)
     out = {}
     for name, rows in sums.items():
         n, leverage, dof, chi2, weight = np.array(rows).T
@@ -150,8 +173,65 @@ def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str
             mean_weight=float(weight.mean()),
             least_weight=float(weight.min()),
             confidence=confidence,
+            whiteness=series.get(name),
         )
     return out
+
+
+def _series(graph: PoseGraph, covariance: JointCovariance) -> dict[str, Whiteness]:
+    """Whiteness of every class whose factors have an order of time: fixes and readings, and chains of increments."""
+    values = graph.values
+    found: dict[str, list[tuple[float, Array, Array, Array]]] = {}
+    for batch in graph.flat().batches:
+        if not isinstance(batch, UniformBatch) or batch.prior or not len(batch):
+            continue
+        at = [_order(batch.records[k]) for k in range(len(batch))]
+        if all(t is None for t in at):
+            continue
+        r, J = batch.whitened(values)
+        if isinstance(batch, GpsBatch):  # errors that last do so in the frame of the fixes
+            turn = batch.turns(values)
+            r, J = np.einsum("kij,kj->ki", turn, r), turn @ J
+        root = np.sqrt(robust_terms(np.sum(r**2, axis=1), batch.code, batch.k)[1])
+        columns = batch.columns.reshape(len(batch), -1)
+        for k, t in enumerate(at):
+            if t is not None:
+                row = (t, root[k] * r[k], root[k] * J[k], columns[k])
+                found.setdefault(batch.group or batch.records[k].group, []).append(row)
+    out = {}
+    for name, rows in found.items():
+        if len({len(row[1]) for row in rows}) > 1:
+            continue
+        rows.sort(key=lambda row: row[0])
+        d = len(rows[0][1])
+        most = LONGEST_SERIES // d
+        first = max(0, (len(rows) - most) // 2)
+        w = _whiteness_of(rows[first : first + most], covariance)
+        if w is not None:
+            out[name] = w
+    return out
+
+
+def _order(record: Any) -> float | None:
+    """What puts a factor into a series: its time, or its place in a chain of increments."""
+    if isinstance(record, BetweenRecord):
+        return float(record.i) if record.j == record.i + 1 and record.group == "dense-submap" else None
+    time = getattr(record, "time", None)
+    return None if time is None else float(time)
+
+
+def _whiteness_of(rows: list[tuple[float, Array, Array, Array]], covariance: JointCovariance) -> Whiteness | None:
+    n, d = len(rows), len(rows[0][1])
+    needed, where = np.unique(np.stack([row[3] for row in rows]), return_inverse=True)
+    at = where.reshape(n, -1)
+    held = int(needed[0] < 0)
+    A = np.zeros((n, d, len(needed)))
+    J = np.stack([row[2] for row in rows])
+    for c in range(at.shape[1]):  # a column may stand twice in a factor
+        A[np.arange(n), :, at[:, c]] += J[:, :, c]
+    flat = A[:, :, held:].reshape(n * d, -1)
+    C = np.eye(n * d) - flat @ covariance.columns(needed[held:]) @ flat.T
+    return whiteness(np.array([row[0] for row in rows]), np.stack([row[1] for row in rows]), C.reshape(n, d, n, d))
 
 
 def _sandwich(covariance: JointCovariance, blocks: Any) -> Array:

@@ -72,6 +72,7 @@ from graphslam.evaluate.refined import (
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
+from graphslam.evaluate.trust import rows_as_json
 from graphslam.evidence.compact import move
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.grid import EvidenceGrid
@@ -450,6 +451,7 @@ def _judge(
         "objective": solution.objective,
         "converged": solution.converged,
         "graph": graph_facts(back.graph, checks.classes),
+        "evidence": rows_as_json(checks.evidence(submaps)),
     }
     if refined is not None:
         report["refine"] = refinement_facts(refined.refinement)

@@ -18,7 +18,8 @@ from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.trust import Evidence, Trust, rows_of_json, trust
+from graphslam.evaluate.without_truth import LASTING, two_sided
 
 CONFIDENCE = 0.95
 CERTAIN = 0.999
@@ -28,6 +29,12 @@ IN_WORDS = {
     "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
     "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
 }
+RESIDUALS_IN_WORDS = {
+    "consistent": "inside them: residuals are as large as the noise that was stated leaves them",
+    "over-confident": "above them: residuals are larger than the noise that was stated leaves them",
+    "pessimistic": "below them: residuals are smaller than the noise that was stated leaves them",
+}
+"""Of residuals, which were fitted: what they say of the errors of the map, the line on its covariances says."""
 CERTAIN_OVER_CONFIDENT = two_sided_width(CERTAIN) / two_sided_width(CONFIDENCE)
 """Ratio of the two-sided bounds of a normal variable at the two levels."""
 EXACT = 1e-12
@@ -84,6 +91,7 @@ def stated(figures: Figures) -> list[Finding]:
     return [
         _state(figures),
         _chi2(figures),
+        *_trust(figures),
         *_nees(figures),
         *_tests(figures),
         _certificate(figures),
@@ -95,6 +103,7 @@ _STATED = frozenset(
     {
         "state",
         "chi2",
+        "trust",
         "nees",
         "consistency-test",
         "certificate",
@@ -205,14 +214,14 @@ def whole_chi2(figures: Figures) -> tuple[float, float] | None:
     return (sum(float(r["chi2"]) for r in rows if number(r.get("chi2"))), dof) if dof > 0 else None
 
 
-def bounded(ratio: float, dof: float) -> tuple[str, Level]:
+def bounded(ratio: float, dof: float, words: Mapping[str, str] = IN_WORDS) -> tuple[str, Level]:
     """A ratio with its bounds in words, and the level of its line."""
     low, high, said = two_sided(ratio, dof, CONFIDENCE)
     text = f"{ratio:.3g}, {CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({dof:.4g} degrees of freedom); "
     level: Level = "good"
     if said != "consistent":  # one honest run in forty is outside on either side: bad is what one in a thousand is not
         level = "bad" if ratio > two_sided(ratio, dof, CERTAIN)[1] else "look"
-    return text + IN_WORDS[said], level
+    return text + words[said], level
 
 
 def number(value: Any) -> bool:
@@ -250,8 +259,46 @@ def _chi2(figures: Figures) -> Finding:
     chi2, dof = found
     if chi2 < EXACT * dof:
         return Finding("", "chi2", "χ² of the whole graph is 0: nothing in it is redundant that could contradict.")
-    text, level = bounded(chi2 / dof, dof)
+    text, level = bounded(chi2 / dof, dof, RESIDUALS_IN_WORDS)
     return Finding(level, "chi2", f"χ²/dof of the whole graph: {text}.")
+
+
+def _said(row: Evidence) -> str:
+    """A row of evidence with its figures."""
+    if row.lasting and row.dof == 1.0:
+        return f"{row.name} ({row.value:.1f} σ)"
+    return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
+
+
+def _trust(figures: Figures) -> list[Finding]:
+    """Can the covariances be believed? Nothing here was held against a truth, and the line says what it rests on."""
+    rows = rows_of_json(figures.report.get("evidence"))
+    if figures.report.get("evidence") is None:
+        return []
+    fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
+    found: Trust = trust(rows, fixes=fixes)
+    said = "; ".join(_said(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
+    rest = "It rests on residuals and on what was withheld, not on a truth"
+    if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
+        rest += ", and takes for granted that landmarks were told apart rightly"
+    if found.word == "over-confident":
+        text = f"Covariances are too small: over-confident. What speaks against them: {said}. {rest}."
+        return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
+    if found.word == "undecided":
+        held = f" What is known: {said}." if said else ""
+        text = (
+            "Whether the covariances can be believed cannot be decided from this log: nothing in it could have seen "
+            f"that errors of {' and of '.join(found.missing)} are larger than stated.{held}"
+        )
+        return [Finding("", "trust", text)]
+    if found.word == "pessimistic":
+        text = (
+            f"Covariances are larger than they need be: pessimistic. Too small are {said}; nothing lasts from one "
+            f"residual to the next. {rest}."
+        )
+        return [Finding("look", "trust", text)]
+    text = f"Covariances are consistent with all that this log can check: {said}. {rest}."
+    return [Finding("good", "trust", text)]
 
 
 def _nees(figures: Figures) -> list[Finding]:
@@ -285,9 +332,11 @@ def _tests(figures: Figures) -> list[Finding]:
 
     for row in class_rows(figures):
         cause = "these measurements contradict the others, or state too little noise."
-        judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), row.get("dof"), cause)
-        if row.get("class") == "gps" and number(row.get("chi2_per_dof")) and number(row.get("dof")):
-            out += _too_small(float(row["chi2_per_dof"]), float(row["dof"]))
+        last = row.get("correlation_time")
+        dof = float(row["dof"]) / (float(last or 1.0) if number(last) else 1.0) if number(row.get("dof")) else None
+        judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
+        if row.get("verdict") == LASTING:
+            out.append(_lasting(row))
     m = figures.metrics
     cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
     judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
@@ -309,16 +358,18 @@ _LASTS = (
 )
 
 
-def _too_small(ratio: float, dof: float) -> list[Finding]:
-    """Fixes that lie nearer to the map than they say."""
-    low = two_sided(ratio, dof, CERTAIN)[0] if dof > 0 else 0.0
-    if ratio >= low:
-        return []
+def _lasting(row: Mapping[str, Any]) -> Finding:
+    """Residuals that are alike from one to the next: the map follows errors that last."""
     text = (
-        f"Fixes lie nearer to the map than they say (χ²/dof {ratio:.3g}, an honest run stays above {low:.3g} in 999 of "
+        f"Residuals of the factors of kind “{row.get('class')}” are alike from one to the next (correlation "
+        f"{float(row['lag1']):.2f}, {float(row['lag1_score']):.1f} σ; it lasts for "
+        f"{float(row['correlation_time']):.3g} of them), whatever their size (χ²/dof "
+        f"{float(row['chi2_per_dof']):.3g}): the map follows errors that last and is over-confident. "
     )
-    text += f"1000 runs). Either their σ is stated too large, which costs accuracy only; or {_LASTS}"
-    return [Finding("look", "gps-correlated", text)]
+    if row.get("class") == "gps":
+        text += _LASTS[0].upper() + _LASTS[1:]
+        return Finding("look", "gps-correlated", text)
+    return Finding("look", "correlated", text)
 
 
 def _certificate(figures: Figures) -> Finding:

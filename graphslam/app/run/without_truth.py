@@ -16,11 +16,16 @@ from graphslam.core.markup import frame
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
+from graphslam.evaluate.intervals import two_sided_width
 from graphslam.evaluate.loop_consistency import LoopConsistency, find_loops, loop_consistency
 from graphslam.evaluate.metrics import Metrics
+from graphslam.evaluate.systematic import sums
+from graphslam.evaluate.trust import Evidence, Of, by_score, by_size, of_systematic
 from graphslam.evaluate.without_truth import ClassConsistency, class_consistency
 from graphslam.graph.pose_graph import PoseGraph
 
+OF_THE_MAP = ("submap", "dense-submap", "match", "loop", "tie")
+"""Classes of factors whose χ² covers motion and sightings."""
 MOST_FORETOLD = {2: 1000, 3: 300}
 """Withheld fixes whose prediction is looked at, spread evenly over the run, by dimension of the graph."""
 
@@ -57,6 +62,26 @@ class WithoutTruth:
             r = self.loops.test()
             rows.append(("loops", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
         return pd.DataFrame(rows, columns=columns)
+
+    def evidence(self, submaps: Sequence[Submap]) -> list[Evidence]:
+        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.trust`)."""
+        out = of_systematic(sums([s.report for s in submaps]))
+        for name, c in self.classes.items():
+            of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
+            out += by_size(f"χ² of {name}", of, c.ratio, c.independent)
+            if c.whiteness is not None and np.isfinite(c.ratio):
+                score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
+                out.append(by_score(f"residuals of {name} from one to the next", of, score))
+        if self.gps is not None:
+            for r in self.gps.tests().to_dict("records"):
+                out += by_size(f"withheld fixes, {r['test']}", "fixes", r["value"], r["dof"])
+                if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
+                    score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
+                    out.append(by_score("withheld fixes from one to the next", "fixes", score))
+        if self.loops is not None:
+            r = self.loops.test()
+            out += by_size("loops against each other", "map", r["value"], r["dof"])
+        return out
 
     def _repr_html_(self) -> str:
         return frame(self.table())

@@ -284,6 +284,14 @@ class GpsBatch(UniformBatch):
             J[some] = np.concatenate([by[:, :, :split], I, by[:, :, split:]], axis=2)
         return r, J
 
+    def turns(self, values: Values) -> Array:
+        """Rotations ``(k, dim, dim)`` from the axes of the residuals into those of the fixes."""
+        x, datum, _, _ = self.gather(values)
+        known = self._rows[:, 3] >= 0
+        J = antenna_terms(x, datum[0], values.tilt, self._arm, ~known)[1]
+        turn = J[:, :, :2] if self.dim == 2 else J[:, :, 3:6]
+        return np.where(self._uneven[:, None, None], np.eye(self.dim), turn)
+
     def _in_node_frame(self, x: Array, datum: Array, bias: Array, tilt: Array) -> tuple[Array, Array]:
         """Residuals and Jacobians as if all were equally uncertain in all directions."""
         if self.dim == 2:

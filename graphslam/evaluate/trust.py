@@ -1,0 +1,165 @@
+"""Can the covariances of a map be believed, where no truth is known? One word, and what it rests on.
+
+Every test without truth that a run has made is one row of evidence: its statistic, the degrees of freedom that
+independent residuals would have, and with these how probable it is that an honest run shows so large or so small a
+value. The word follows from all of them together:
+
+- *over-confident* if errors are too large in any of them, or last: alike from one residual to the next, from window to
+  window, or as a constant error of calibration. Rows share one level (Bonferroni), so that an honest run is called
+  wrong in at most :data:`LEVEL` of the cases however many tests it has;
+- *cannot be decided from this log* where the rows could not have seen an error that matters: of motion and sightings,
+  and of fixes if any were used, some row must exclude that variances are :data:`MATTERS` times as large as stated;
+- *pessimistic* if errors are too small in any of them, and none of the above;
+- *consistent* else.
+
+Small residuals alone never make a map pessimistic: the first rule comes before the third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from graphslam.evaluate.systematic import Systematic
+
+Word = Literal["consistent", "over-confident", "pessimistic", "undecided"]
+Of = Literal["map", "fixes", "other"]
+LEVEL = 0.05
+"""Share of honest runs that are called wrong, at most."""
+MATTERS = 1.5
+"""Ratio of true to stated variances that a decision must exclude."""
+SURE = 0.975
+"""Confidence with which it is excluded."""
+LEAST_DOF = 4.0
+"""Fewer degrees of freedom are no evidence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One test without truth.
+
+    Parameters
+    ----------
+    name : str
+        What is said of it: “χ² of gps”.
+    of : "map", "fixes" or "other"
+        What it covers: motion and sightings, fixes, or something else that a decision need not rest on.
+    value : float
+        1 if stated noise is right.
+    dof : float
+        Of independent residuals.
+    too_large, too_small : float
+        Probability that an honest run shows at least, or at most, this value.
+    lasting : bool
+        It looks for errors that last, not for their size.
+    """
+
+    name: str
+    of: Of
+    value: float
+    dof: float
+    too_large: float
+    too_small: float
+    lasting: bool = False
+
+    @property
+    def upper(self) -> float:
+        """Ratio of true to stated variances that is still possible."""
+        return self.value * self.dof / max(float(stats.chi2.ppf(1.0 - SURE, self.dof)), 1e-12)
+
+
+def by_size(name: str, of: Of, value: float, dof: float) -> list[Evidence]:
+    """A statistic χ²/dof; none where it has hardly any degrees of freedom."""
+    if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
+        return []
+    chi2 = value * dof
+    large, small = float(stats.chi2.sf(chi2, dof)), float(stats.chi2.cdf(chi2, dof))
+    return [Evidence(name, of, float(value), float(dof), large, small)]
+
+
+def by_score(name: str, of: Of, score: float, *, tests: int = 1) -> Evidence:
+    """A score that is N(0, 1) if nothing lasts, the largest of so many."""
+    p = min(1.0, tests * float(stats.norm.sf(score)))
+    return Evidence(name, of, float(score), 1.0, p, 1.0, lasting=True)
+
+
+def of_systematic(found: Systematic | None) -> list[Evidence]:
+    """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
+    if found is None:
+        return []
+    out = by_size("χ² of motion and sightings in short windows", "map", found.ratio, found.dof)
+    p = len(found.taken)
+    out.append(by_score("constant errors of calibration", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
+    drifts = [by_size("errors that last for a window", "map", v, d) for v, d in zip(found.drift, found.drift_dof)]
+    worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)
+    if worst is not None:
+        chance = min(1.0, p * worst.too_large)
+        out.append(Evidence(worst.name, "map", worst.value, worst.dof, chance, 1.0, lasting=True))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """The word, and what it rests on.
+
+    Parameters
+    ----------
+    word : str
+    speaking : tuple of Evidence
+        Rows that decided it: those that are too large or too small; for the other words those that cover it.
+    chance : float
+        Probability that an honest run has a row like the worst, all rows counted.
+    missing : tuple of str
+        What nothing in this log could have seen.
+    """
+
+    word: Word
+    speaking: tuple[Evidence, ...]
+    chance: float
+    missing: tuple[str, ...] = ()
+
+
+def trust(rows: Sequence[Evidence], *, fixes: bool) -> Trust:
+    """The word on all rows.
+
+    Parameters
+    ----------
+    rows : sequence of Evidence
+    fixes : bool
+        Fixes are in the graph: a decision must rest on a row of them, too.
+    """
+    m = max(1, sum(1 if r.lasting else 2 for r in rows))
+    large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
+    if large:
+        return Trust("over-confident", tuple(large), min(1.0, m * large[0].too_large))
+    wanted: dict[Of, str] = {"map": "motion and sightings"}
+    if fixes:
+        wanted["fixes"] = "fixes"
+    covers = {of: [r for r in rows if r.of == of and not r.lasting and r.upper <= MATTERS] for of in wanted}
+    missing = tuple(what for of, what in wanted.items() if not covers[of])
+    if missing:
+        return Trust("undecided", tuple(r for found in covers.values() for r in found), 1.0, missing)
+    small = sorted((r for r in rows if m * r.too_small < LEVEL), key=lambda r: r.too_small)
+    if small:
+        return Trust("pessimistic", tuple(small), min(1.0, m * small[0].too_small))
+    return Trust("consistent", tuple(r for found in covers.values() for r in found), 1.0)
+
+
+def rows_of_json(value: Any) -> list[Evidence]:
+    """Rows as a report holds them; what is none of ours is left out."""
+    out = []
+    for row in value if isinstance(value, list) else []:
+        if isinstance(row, Mapping) and set(row) == set(Evidence.__slots__):
+            numbers = [row[k] for k in ("value", "dof", "too_large", "too_small")]
+            if all(isinstance(v, (int, float)) for v in numbers) and row["of"] in ("map", "fixes", "other"):
+                out.append(Evidence(**row))
+    return out
+
+
+def rows_as_json(rows: Iterable[Evidence]) -> list[dict[str, Any]]:
+    """The same as JSON objects."""
+    return [asdict(r) for r in rows]

@@ -1,0 +1,110 @@
+"""Are residuals independent from one to the next? What errors that last do to a series, and what it is still worth.
+
+A map follows errors that last, so their residuals are *small*, and a test of size alone calls such a map pessimistic
+while it is wrong by several of its own σ. What is left of them is alike from one to the next. So the sign of a verdict
+comes from the correlation first, and the size is judged by as many degrees of freedom as independent residuals there
+are.
+
+Residuals at an optimum are not quite independent even where the noise is: their covariance is ``C = I - H``, H being
+the hat matrix of their class. A sum of products over neighbours, ``rᵀ A r``, then has the mean ``tr(A C)`` and the
+variance ``2 tr(A C A C)``; both are taken from C, so that a chain that was bent by one loop is not called correlated
+for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from graphslam.core.geometry import Array
+
+LAST = 1.5
+"""Integrated correlation time, in residuals, from which on errors last; below it is a matter of the bounds."""
+LEAST = 12
+"""Fewer residuals in a row do not tell their correlation."""
+LONGEST = 60
+"""Lags that are looked at, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whiteness:
+    """Correlation of standardised residuals in the order of time.
+
+    Parameters
+    ----------
+    pairs : int
+        Neighbours that were compared.
+    lag1 : float
+        Correlation from one to the next, less what the fit to the unknowns makes of white noise.
+    score : float
+        The same in units of its σ for white noise: N(0, 1) where the noise is white.
+    tau : float
+        Integrated correlation time ``1 + 2 Σ ρ_k``, in residuals, up to the first ``ρ_k`` within its noise; at least 1.
+    """
+
+    pairs: int
+    lag1: float
+    score: float
+    tau: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability that white residuals are so much alike."""
+        return float(stats.norm.sf(self.score))
+
+    def lasting(self, level: float = 0.005) -> bool:
+        """Do errors last for longer than from one residual to the next?"""
+        return self.p_value < level and self.tau > LAST
+
+
+def whiteness(times: Array, residuals: Array, covariance: Array | None = None) -> Whiteness | None:
+    """Correlation of a series; None where it is too short to tell.
+
+    Parameters
+    ----------
+    times : (n,)
+        In order.
+    residuals : (n, d)
+        Standardised.
+    covariance : (n, d, n, d), optional
+        Of the residuals if the noise is white; by default the identity.
+    """
+    n, d = residuals.shape
+    if n < 2:
+        return None
+    usual = float(np.median(np.diff(times)))
+    C = None if covariance is None else covariance.reshape(n * d, n * d)
+    size = float(np.mean(residuals**2)) or 1.0
+    expected = 1.0 if C is None else max(float(np.trace(C)) / (n * d), 1e-9)
+    first: tuple[int, float, float] | None = None
+    tau = 1.0
+    for lag in range(1, min(LONGEST, n - 1) + 1):
+        near = np.flatnonzero(times[lag:] - times[:-lag] < (lag + 1) * usual)
+        if len(near) < LEAST // 2:
+            break
+        products = float(np.sum(residuals[near] * residuals[near + lag]))
+        # scaled by the size that was found, so that the test is one of correlation alone
+        mean, variance = 0.0, float(len(near) * d)
+        if C is not None:
+            at = ((near[:, None] * d) + np.arange(d)).ravel()
+            behind = at + lag * d
+            mean = float(np.sum(C[at, behind])) * size / expected
+            if lag == 1:
+                A = np.zeros_like(C)
+                A[at, behind] += 0.5
+                A[behind, at] += 0.5
+                A[np.arange(n * d), np.arange(n * d)] -= mean / (size * n * d)  # in units of the size that was found
+                AC = A @ C
+                variance = 2.0 * float(np.sum(AC * AC.T)) / expected**2
+        scale = len(near) * d * size
+        rho = (products - mean) / scale
+        if first is None:
+            if len(near) < LEAST:
+                return None
+            first = len(near), rho, (products - mean) / (size * np.sqrt(max(variance, 1e-12)))
+        if rho < 2.0 / np.sqrt(len(near) * d):
+            break
+        tau += 2.0 * rho
+    return None if first is None else Whiteness(first[0], float(first[1]), float(first[2]), float(tau))

@@ -1,0 +1,168 @@
+"""The word on the covariances of a map without truth: it must not point the wrong way, and seldom cry wolf."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from graphslam.app.run.verdict import Figures, stated
+from graphslam.core.records import Gps
+from graphslam.evaluate.systematic import sums
+from graphslam.evaluate.trust import Evidence, by_score, by_size, of_systematic, rows_as_json, rows_of_json, trust
+from graphslam.evaluate.whiteness import whiteness
+from graphslam.evaluate.without_truth import LASTING, class_consistency
+from graphslam.graph.gps import GpsConfig
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.solve.registry import make_solver
+from tests.reference.graph_chain import make_chain
+
+
+def walk(rng: np.random.Generator, n: int, keep: float, d: int = 2) -> np.ndarray:
+    """A Gauss–Markov series of unit size."""
+    out = rng.standard_normal((n, d))
+    for k in range(1, n):
+        out[k] = keep * out[k - 1] + np.sqrt(1.0 - keep**2) * out[k]
+    return out
+
+
+def test_scores_of_white_residuals_are_standard_normal_and_lasting_ones_are_found(rng):
+    times = np.arange(120.0)
+    scores = [w.score for _ in range(300) if (w := whiteness(times, rng.standard_normal((120, 2))))]
+    assert stats.kstest(scores, "norm").pvalue > 0.01
+    found = [whiteness(times, 0.3 * walk(rng, 120, 0.6)) for _ in range(50)]
+    assert all(w is not None and w.lasting() for w in found)  # small as they are
+    # integrated over all lags (1 + 0.6) / (1 - 0.6) = 4
+    assert np.mean([w.tau for w in found if w]) == pytest.approx(4.0, rel=0.25)
+
+
+def test_what_the_fit_makes_of_white_noise_is_not_called_lasting(rng):
+    """Residuals of white noise with its rough part fitted away are alike; the score knows by how much."""
+    n = 80
+    t = np.arange(float(n))
+    rough = np.cos(np.pi * np.outer(t + 0.5, np.arange(50, n)) / n)  # what is left is smooth
+    B = np.linalg.qr(rough)[0]
+    C = np.eye(n) - B @ B.T
+    told, naive = [], []
+    for _ in range(300):
+        r = (C @ rng.standard_normal(n))[:, None]
+        told.append(whiteness(t, r, C.reshape(n, 1, n, 1)).score)
+        naive.append(whiteness(t, r).score)
+    # scaled by the size that was found: the mean is right to a tenth of σ
+    assert abs(np.mean(told)) < 0.15
+    assert 0.8 < np.std(told) < 1.2
+    assert np.mean(naive) > 2.0
+
+
+def test_pauses_are_not_bridged_and_few_residuals_tell_nothing(rng):
+    assert whiteness(np.arange(8.0), rng.standard_normal((8, 2))) is None
+    times = np.concatenate([np.arange(30.0), 1000.0 + np.arange(30.0)])
+    w = whiteness(times, rng.standard_normal((60, 2)))
+    assert w is not None
+    assert w.pairs == 58
+
+
+def solved(rng, errors) -> PoseGraph:
+    """A chain with a fix each second, whose errors [m] have the size of their σ."""
+    chain = make_chain(rng, m=8, landmarks=12)
+    times = np.arange(0.5, 80.0, 0.5)
+    where = []
+    for t in times:
+        k = min(int(t // 10), 7)
+        T = chain.submaps[k].trajectory.interpolate(np.array([t]))[0]
+        c, s = np.cos(chain.poses[k, 2]), np.sin(chain.poses[k, 2])
+        where.append(chain.poses[k, :2] + np.array([[c, -s], [s, c]]) @ T[:2])
+    fixes = np.array(where) + errors(len(times))
+    graph = PoseGraph()
+    graph.add_gps(
+        Gps(times=times, positions=fixes, sigma=np.ones(len(times)), lever=np.zeros(2)), config=GpsConfig(baseline=5.0)
+    )
+    for s in chain.submaps:
+        graph.add_submap(s)
+    graph.finish_gps()
+    make_solver("batch", graph).solve_to_optimum()
+    return graph
+
+
+def test_fixes_whose_errors_last_are_over_confident_however_small_their_residuals(rng):
+    white = [class_consistency(solved(rng, lambda n: rng.standard_normal((n, 2))))["gps"] for _ in range(12)]
+    lasting = [class_consistency(solved(rng, lambda n: walk(rng, n, 0.97)))["gps"] for _ in range(6)]
+    assert sum(c.as_row()["verdict"] == LASTING for c in white) <= 1
+    assert all(c.as_row()["verdict"] == LASTING for c in lasting)
+    # by size alone most of them would be honest or pessimistic
+    assert np.median([c.ratio for c in lasting]) < 1.0
+    assert all(c.independent < 0.4 * c.dof for c in lasting)
+
+
+HONEST = by_size("map", "map", 1.0, 2000.0) + by_size("fixes", "fixes", 1.0, 400.0)
+
+SMALL = by_size("fixes", "fixes", 0.13, 400.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "fixes", "word"),
+    [
+        (HONEST, True, "consistent"),
+        (HONEST[:1], False, "consistent"),
+        (HONEST[:1], True, "undecided"),  # nothing says how good the fixes are
+        (by_size("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
+        ([], False, "undecided"),
+        (by_size("map", "map", 1.3, 2000.0), False, "over-confident"),
+        (by_size("map", "map", 0.7, 2000.0), False, "pessimistic"),
+        # small residuals, and alike from one to the next: never pessimistic
+        ([*HONEST[:1], *SMALL, by_score("next", "fixes", 9.0)], True, "over-confident"),
+        ([*HONEST[:1], *SMALL], True, "pessimistic"),
+        ([*by_size("map", "map", 0.5, 2000.0), by_score("calibration", "map", 6.0, tests=16)], False, "over-confident"),
+    ],
+)  # fmt: skip
+def test_the_word(rows: list[Evidence], fixes: bool, word: str) -> None:
+    assert trust(rows, fixes=fixes).word == word
+
+
+def test_honest_runs_are_seldom_called_wrong(rng):
+    wrong = 0
+    for _ in range(400):
+        rows = [by_size(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)]
+        rows += [by_score(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
+        wrong += trust(rows, fixes=False).word in ("over-confident", "pessimistic")
+    assert wrong <= stats.binom.ppf(0.999, 400, 0.05)
+
+
+def windows(rng, n: int, lasts: float) -> dict[str, object]:
+    """What a front end reports of n windows; an error of calibration is drawn anew for each."""
+    S = np.tile(rng.uniform(50.0, 150.0, (n, 1)), (1, 8))
+    g = np.sqrt(S) * rng.standard_normal((n, 8))
+    g[:, 7] += S[:, 7] * lasts * rng.standard_normal(n)
+    sums_of = {"score": g, "score2": g**2, "score_information": g * S, "information2": S**2}
+    out: dict[str, object] = {k: v.sum(axis=0).tolist() for k, v in sums_of.items()}
+    return {
+        "systematic": {"windows": n, "chi2": 1000.0, "dof": 1000, "information": np.diag(S.sum(axis=0)).tolist(), **out}
+    }
+
+
+def test_errors_that_last_for_a_window_are_found(rng):
+    def named(lasts: float) -> int:
+        found = 0
+        for _ in range(40):
+            rows = of_systematic(sums([windows(rng, 6, lasts), windows(rng, 6, lasts)]))
+            found += next(r for r in rows if r.name.startswith("errors that last")).too_large < 0.01
+        return found
+
+    assert named(0.0) <= 3
+    assert named(0.4) >= 38
+
+
+def test_the_line_says_what_it_rests_on_and_survives_the_file():
+    rows = json.loads(json.dumps(rows_as_json(HONEST)))
+    assert rows_of_json(rows) == HONEST
+    assert rows_of_json([{"name": "x"}, 3, None]) == rows_of_json(None) == []
+    lines = {f.code: f for f in stated(Figures({"converged": True, "evidence": rows}, {}))}
+    assert lines["trust"].level == "good"
+    assert "not on a truth" in lines["trust"].text
+    assert "errors are as large" not in " ".join(f.text for f in lines.values())
+    alone = rows_as_json(by_size("map", "map", 1.0, 8.0))
+    (line,) = [f for f in stated(Figures({"converged": True, "evidence": alone}, {})) if f.code == "trust"]
+    assert "cannot be decided from this log" in line.text
+    assert line.level == ""
