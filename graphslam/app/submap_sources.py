@@ -91,7 +91,7 @@ def submap_source(
     if isinstance(source, PoseProblem):
         return SubmapSource([], problem=source)
     if isinstance(source, Run) and is_dense(source.submaps):
-        if source.graph is not None:
+        if source.holds("graph"):
             return SubmapSource(list(source.submaps), poses_only(source.truth), problem=problem_of_run(source))
         if source.folder is not None:
             return submap_source(source.folder)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,11 @@ from graphslam.app.run.calibration import calibrate_log as calibrate_log
 from graphslam.app.run.front_ends import front_end_names, recommended
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
-from graphslam.app.run.outputs import open_run as open_run
+from graphslam.app.run.outputs import open_run as read_run
 from graphslam.app.run.pipeline import run as run
-from graphslam.app.run.run import Run
+from graphslam.app.run.pipeline import solve_again
+from graphslam.app.run.remake_map import map_of_folder
+from graphslam.app.run.run import Later, Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.studies.definition import find_study as find_study
 from graphslam.app.studies.study import open_study as open_study
@@ -25,7 +29,7 @@ from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.config import build
-from graphslam.core.errors import DataError
+from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
@@ -97,6 +101,50 @@ def worlds() -> list[str]:
     True
     """
     return sorted({**WORLDS, **MESH_WORLDS})
+
+
+def open_run(path: str | Path) -> Run:
+    """Read a finished run folder, all of it of one state.
+
+    Its ``graph`` and ``solution`` are solved again, and its fused map (``fused``) is made again, once, when they are
+    first asked for; the log is not read for any of them.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    RunFolderError
+        Not a finished run.
+    FormatError
+        A file is damaged, or not of one state with the others.
+
+    Examples
+    --------
+    >>> run = gs.open_run("runs/vp")
+    >>> run.metric("nees_per_dof")
+    >>> run.solution.marginal(3)
+    """
+    run = read_run(path)
+
+    @cache
+    def solved() -> tuple[Any, Any]:
+        return solve_again(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
+
+    def fused() -> Any:
+        try:
+            return map_of_folder(path)[1]
+        except MissingDataError:  # a front end without dense maps
+            return None
+
+    parts: dict[str, Any] = {"graph": Later(lambda: solved()[0]), "solution": Later(lambda: solved()[1])}
+    parts["fused"] = Later(fused)
+    return replace(run, **parts)
 
 
 def load(source: str | Path, **options: Any) -> SensorLog:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from typing import Any
 
 from graphslam.core.errors import FormatError
@@ -156,3 +157,16 @@ def read_json_lines(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
             raise FormatError("not a JSON object", where=where, got=_said(value))
         out.append(value)
     return out
+
+
+def finite(value: Any) -> Any:
+    """The value with NumPy scalars as Python numbers and non-finite numbers as None (JSON has none)."""
+    if isinstance(value, Mapping):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    if hasattr(value, "tolist"):
+        return finite(value.tolist())
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value

@@ -69,7 +69,7 @@ class BeamLabels:
         return self.labels[k]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Truth:
     """What a simulator or a surveyor knows.
 
@@ -88,6 +88,9 @@ class Truth:
     landmark_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
     moving: Mapping[str, BeamLabels] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Truth({self.trajectory!r}, {len(self.landmarks)} landmarks)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

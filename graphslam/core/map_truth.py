@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.reading import usable
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MapTruth:
     """Truth of a chain of submaps, everything in the frame of the first base.
 
@@ -31,6 +31,9 @@ class MapTruth:
     exit_poses: Array
     landmark_ids: npt.NDArray[np.int64]
     landmarks: Array
+
+    def __repr__(self) -> str:
+        return f"MapTruth(ends of {len(self.keys)} submaps, {len(self.landmark_ids)} landmarks)"
 
     def __post_init__(self) -> None:
         keys = np.ascontiguousarray(self.keys, dtype=np.int64)

@@ -17,7 +17,7 @@ from graphslam.core.records import check_times
 Index = npt.NDArray[np.intp]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Trajectory:
     """A path ``T_frame_body(t)``.
 
@@ -62,6 +62,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    def __repr__(self) -> str:
+        when = f", {self.times[0]:.6g} to {self.times[-1]:.6g} s" if len(self) else ""
+        sure = "" if self.covariances is None else ", with covariances"
+        return f"Trajectory({len(self)} poses in {'the plane' if self.poses.shape[1] == 3 else 'space'}{when}{sure})"
 
     @property
     def dim(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,6 +46,23 @@ def is_time(key: object) -> bool:
     return TIMES.search(str(key)) is not None
 
 
+class FigureTable(pd.DataFrame):
+    """A table of figures of all sizes, each shown with six digits: 7, not 7.000000e+00 because another one is small.
+
+    What is made of it is a plain DataFrame.
+    """
+
+    @property
+    def _constructor(self) -> Callable[..., pd.DataFrame]:
+        return pd.DataFrame
+
+    def __repr__(self) -> str:
+        return str(self.to_string(float_format="{:.6g}".format))
+
+    def _repr_html_(self) -> str:
+        return str(self.to_html(float_format="{:.6g}".format))
+
+
 @dataclass
 class Metrics:
     """Rows of ``metrics.json`` and ``timings.json``."""
@@ -58,7 +75,7 @@ class Metrics:
 
     def table(self) -> pd.DataFrame:
         """As a table."""
-        return pd.DataFrame(self.rows, columns=["key", "value", "unit", "direction"])
+        return FigureTable(self.rows, columns=["key", "value", "unit", "direction"])
 
 
 def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:

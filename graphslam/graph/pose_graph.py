@@ -69,6 +69,9 @@ class PoseGraph(GraphRecord):
         2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
     """
 
+    def __repr__(self) -> str:
+        return f"PoseGraph({len(self.submaps)} submaps, {len(self.values.landmarks)} landmarks, dim={self.dim})"
+
     def add_submap(
         self,
         submap: Submap,

@@ -13,7 +13,7 @@ from graphslam.loops.places import Ints
 from graphslam.solve.solution import Solution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GlobalMap:
     """The solved map, in the frame of the first base.
 
@@ -43,6 +43,10 @@ class GlobalMap:
     landmark_hits: Ints
     T_gps_world: Array | None = None
     base_nodes: Ints | None = None
+
+    def __repr__(self) -> str:
+        nodes, landmarks = len(self.node_poses), len(self.landmarks)
+        return f"GlobalMap({self.trajectory!r}, {nodes} nodes, {landmarks} landmarks, in the frame of the first base)"
 
     def landmarks_in(self, T: Array) -> tuple[Array, Array]:
         """Landmarks ``(n, 2)`` and their covariances ``(n, 2, 2)`` in another frame, ``T_frame_world`` ``(3,)``."""

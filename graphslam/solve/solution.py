@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from graphslam.solve.network.certificate import Certificate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """A solved graph, independent of what happens to the graph afterwards.
 
@@ -147,9 +148,20 @@ class Solution:
         """Joint covariance at these values; made at the first use."""
         return JointCovariance(self._flat.layout, self._flat.evaluate(self.values).A)
 
-    def marginal(self, name: str) -> Array:
-        """Covariance of one variable (``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``); poses in the right tangent."""
-        return self.covariance.marginal(name)
+    def marginal(self, name: str | int) -> Array:
+        """Covariance of one variable ``(d, d)``; of a pose in its right tangent: ``[δx, δy, δθ]`` or ``[δω, δv]``.
+
+        Parameters
+        ----------
+        name : str or int
+            Such as ``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``; a number k is the pose ``"xk"``.
+
+        Raises
+        ------
+        SolverError
+            There is no such variable.
+        """
+        return self.covariance.marginal(name if isinstance(name, str) else f"x{operator.index(name)}")
 
     def joint_marginal(self, names: Iterable[str]) -> Array:
         """Joint covariance of several variables in that order."""
@@ -266,6 +278,13 @@ class Solution:
         mixed = F @ P_ab @ Kt
         C = F @ P[at] @ Ft + b.gain @ P[at + 1] @ Kt + mixed + np.swapaxes(mixed, 1, 2) + b.left
         return poses, 0.5 * (C + np.swapaxes(C, 1, 2))
+
+    def __repr__(self) -> str:
+        at = "at the optimum" if self.converged else "not at its optimum"
+        return (
+            f"Solution({self.solver!r}: {len(self.poses)} nodes, {len(self.landmarks)} landmarks, "
+            f"objective {self.objective:.6g}, {at})"
+        )
 
     def _repr_html_(self) -> str:
         verdict = "at the optimum" if self.converged else f"not at its optimum (may still fall by {self.decrement:.3g})"

@@ -30,6 +30,7 @@ from graphslam.core.records import VelocityControls
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
+from graphslam.evaluate.metrics import FigureTable
 from graphslam.evaluate.without_truth import ClassConsistency
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.ledger import Ledger
@@ -67,7 +68,7 @@ def evil(value: Any, depth: int = 0) -> Any:
         return type(value)(evil(v, depth) for v in value)
     if isinstance(value, pd.DataFrame):
         texts = [c for c in value if not pd.api.types.is_numeric_dtype(value[c])]
-        return value.assign(**dict.fromkeys(texts, EVIL))
+        return type(value)(value.assign(**dict.fromkeys(texts, EVIL)))
     if isinstance(value, Study):
         return value  # made with evil names: its table and its definition must agree on them
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and depth < 6:
@@ -165,6 +166,7 @@ CLASS: dict[str, Any] = {
     "least_weight": 1.0,
 }
 MAKERS: dict[str, Callable[[Path], Any]] = {
+    "graphslam.evaluate.metrics.FigureTable": lambda _: FigureTable(metrics()),
     "graphslam.core.log.SensorLog": a_log,
     "graphslam.core.submap.Submap": lambda _: submap(),
     "graphslam.io.cards.Card": lambda _: copy.deepcopy(list_cards()[0]),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import sys
 
 import typer
@@ -34,7 +35,6 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # or else [m] in a help text is taken for markup and disappears
-    add_completion=False,
 )
 
 
@@ -79,7 +79,7 @@ def main() -> None:
 def one_line(error: BaseException) -> str:
     """What a user reads of an error: ours as they are, those of the machine with what can be done."""
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
+        return f"interrupted; {_go_on(sys.argv[1:])}"
     if isinstance(error, MemoryError):  # NumPy says how much was asked for
         return f"not enough memory; use a smaller part of the data, or another machine. {error}".strip()
     if isinstance(error, RecursionError):
@@ -89,6 +89,18 @@ def one_line(error: BaseException) -> str:
         advice = _ADVICE.get(error.errno or 0, "")
         return f"{': '.join([*files, error.strerror or str(error)])}{advice}"
     return " ".join(str(error).split())
+
+
+def _go_on(arguments: list[str]) -> str:
+    """How an interrupted command is continued."""
+    command = shlex.join(["graphslam", *arguments])
+    verb = next((a for a in arguments if not a.startswith("-")), "")
+    if verb == "run":
+        again = command if "--resume" in arguments else f"{command} --resume"
+        return f"finished submaps are kept; go on with: {again}"
+    if verb in ("demo", "study"):
+        return f"what is finished is kept; go on with: {command}"
+    return "files that were there before are as they were"
 
 
 def _drop_output() -> None:

@@ -50,6 +50,15 @@ def reader_options(settings: list[str]) -> dict[str, Any]:
 JSON = typer.Option(False, "--json", help="Print one JSON object on stdout, and nothing else.")
 
 
+SHORT = (
+    *("submaps", "landmarks_confirmed", "objective", "converged", "join_chi2_per_dof", "join_dof"),
+    *("gps_rmse", "gps_withheld_rmse", "path_rmse", "path_rmse_aligned", "landmark_rmse_aligned"),
+    *("nees_per_dof", "nees_dof", "ci", "map_entropy", "seconds_total", "times_real_time"),
+)
+"""Figures that are printed without ``--all``."""
+EVERY = typer.Option(False, "--all", help="Print all figures; without it those that a reader asks for first.")
+
+
 def register(app: typer.Typer) -> None:
     """Add the verbs to the command line."""
     app.command()(run)
@@ -83,6 +92,7 @@ def run(
         help="Record what the viewer would show; replay it with `rerun FILE`.",
     ),
     max_size: str | None = MAX_SIZE,
+    every: bool = EVERY,
     as_json: bool = JSON,
 ) -> None:
     """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on how far to trust it."""
@@ -110,14 +120,14 @@ def run(
     )
     rows = result.metrics.to_dict("records")
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
-    text = _summary(result, out)
+    text = _summary(result, out, every)
     if saved:
         from graphslam.app.sessions.merge import continue_runs
 
         joined = continue_runs(saved, result, out=out / "continued")
         value["continued"] = joined.report
-        figures = table(joined.metrics.to_dict("records"), ["key", "value", "unit"])
-        text += f"\n{figures}\n{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"
+        text += "\n".join(["", *figures(joined, every), ""])
+        text += f"{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"
     emit(value, text, as_json=as_json)
 
 
@@ -130,9 +140,18 @@ def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
     return values
 
 
-def _summary(result: Any, out: Path) -> str:
+def figures(result: Any, every: bool) -> list[str]:
+    """Table of the figures of a run, and how many of them it leaves out."""
+    rows = result.metrics.to_dict("records")
+    shown = [r for r in rows if every or r["key"] in SHORT]
+    left = len(rows) - len(shown)
+    more = [f"({left} more figures: --all, or metrics.json)"] if left else []
+    return [table(shown, ["key", "value", "unit"]), *more]
+
+
+def _summary(result: Any, out: Path, every: bool) -> str:
     dropped = result.report["records_dropped"]
-    lines = [table(result.metrics.to_dict("records"), ["key", "value", "unit"])]
+    lines = figures(result, every)
     lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
     lines += join_note(result)
     lines += ["", *verdict_text(result.verdict), ""]
@@ -175,6 +194,7 @@ def demo(
     ),
     seed: int = typer.Option(0, help="Seed for sensor noise, clutter and the filter."),
     preset: str = typer.Option("garage", help="World of the demo: garage, or quick for a small one."),
+    every: bool = EVERY,
     as_json: bool = JSON,
 ) -> None:
     """Simulate a robot in a garage with two levels, map it with SegSLAM, and solve one factor graph."""
@@ -183,7 +203,7 @@ def demo(
     result = run_demo(out, seed=seed, preset=preset, progress=not as_json)
     rows = result.metrics.to_dict("records")
     text = (
-        f"{table(rows, ['key', 'value', 'unit'])}"
+        f"{chr(10).join(figures(result, every))}"
         f"\n\n{chr(10).join(verdict_text(result.verdict))}"
         f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
         f"\nreport: {out / 'report.html'}"

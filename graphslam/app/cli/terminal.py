@@ -10,8 +10,8 @@ from typing import Any
 
 import typer
 
-from graphslam.app.folders.output_files import finite
 from graphslam.core.findings import Finding, headline
+from graphslam.core.json_file import finite
 
 
 def emit(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:

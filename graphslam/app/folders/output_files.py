@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 
 from graphslam.core.atomic import atomic_open
+from graphslam.core.json_file import finite
 
 
 class OutputFiles:
@@ -50,19 +51,6 @@ class OutputFiles:
         """Write a table as CSV: the shortest digits that read back as the same number, with pandas' ``round_trip``."""
         with atomic_open(self.path / name, "w") as stream:
             table.to_csv(stream, index=False, na_rep="nan", lineterminator="\n")
-
-
-def finite(value: Any) -> Any:
-    """The value with NumPy scalars as Python numbers and non-finite numbers as None (JSON has none)."""
-    if isinstance(value, Mapping):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
-    if hasattr(value, "tolist"):
-        return finite(value.tolist())
-    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
-        return None
-    return value
 
 
 def json_lines(rows: Iterable[Mapping[str, Any]]) -> str:

@@ -27,6 +27,7 @@ from graphslam.core.reading import LARGEST, read_text
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
+from graphslam.evaluate.metrics import FigureTable
 from graphslam.loops.ledger import EVENT, Decision, LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 
@@ -272,7 +273,7 @@ def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
     """
     file = root / name
     rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
-    table = pd.DataFrame(rows, columns=["key", "value", "unit", "direction"])
+    table = FigureTable(rows, columns=["key", "value", "unit", "direction"])
     table["value"] = [np.nan if r.get("value") is None else float(r["value"]) for r in rows]
     for name in ("unit", "direction"):
         table[name] = [r.get(name) or "" for r in rows]

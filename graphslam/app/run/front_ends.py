@@ -23,8 +23,40 @@ def front_end_names() -> list[str]:
     return sorted({e.name for e in entry_points(group=GROUP)})
 
 
-def _kind(name: str) -> tuple[Any, Any]:
-    """Class of front end ``name`` and its configuration class."""
+def check_name(name: str) -> None:
+    """See that a front end of that name is installed.
+
+    Raises
+    ------
+    UnknownNameError
+    """
+    if name not in front_end_names():
+        raise UnknownNameError("front end", name, front_end_names())
+
+
+def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
+    """Name of a front end that is given by its name, as a class or as an object.
+
+    Raises
+    ------
+    ConfigError
+        Something else was given.
+    """
+    if isinstance(front, str):
+        return front
+    kind = front if isinstance(front, type) else type(front)
+    if FrontEnd not in kind.__mro__:
+        raise ConfigError(
+            f"front end {kind.__name__} is none; wanted a name, a class that inherits from "
+            "graphslam.frontends.base.FrontEnd, or an object of one"
+        )
+    return str(getattr(kind, "name", kind.__name__))
+
+
+def _kind(name: str | type[FrontEnd]) -> tuple[Any, Any]:
+    """Class of a front end and its configuration class."""
+    if isinstance(name, type):
+        return name, typing.get_type_hints(name)["config"]
     found = [e for e in entry_points(group=GROUP) if e.name == name]
     if not found:
         raise UnknownNameError("front end", name, front_end_names())
@@ -35,14 +67,25 @@ def _kind(name: str) -> tuple[Any, Any]:
     return kind, typing.get_type_hints(kind)["config"]
 
 
-def make_front_end(name: str, options: Mapping[str, Any]) -> FrontEnd:
-    """Build front end ``name`` with ``options`` checked against its own configuration class.
+def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str, Any]) -> FrontEnd:
+    """Build a front end with ``options`` checked against its own configuration class.
+
+    Parameters
+    ----------
+    front : str, class or object
+        An object has its configuration and is taken as it is.
+    options : mapping
 
     Raises
     ------
     UnknownNameError, ConfigError
     """
-    kind, config_type = _kind(name)
+    name = name_of(front)
+    if not isinstance(front, (str, type)):
+        if options:
+            raise ConfigError(f"front end {name!r} is given as an object, which has its options; got also {options}")
+        return front
+    kind, config_type = _kind(front)
     made = kind(config=build(config_type, options, "frontend"))
     if not isinstance(made, FrontEnd):
         raise ConfigError(
@@ -76,7 +119,8 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
     values = cfg.preset(f"{preset_of(log, frontend)[0]}.{frontend}")
     noise = log.meta.get("noise", {})
     simulated = log.meta.get("source") == "simulation" and {"speed", "steering"} <= set(noise)
-    if simulated and "motion" in typing.get_type_hints(_kind(frontend)[1]):
+    registered = frontend in front_end_names()
+    if simulated and registered and "motion" in typing.get_type_hints(_kind(frontend)[1]):
         scale = float(noise.get("scale", 1.0))
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
         values = merge({"frontend": {"motion": motion}}, values)

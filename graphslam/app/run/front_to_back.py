@@ -32,6 +32,7 @@ class ProgressBar(Observer):
     def __init__(self, log: SensorLog, shown: bool) -> None:
         first, last = log.interval
         self.bar = tqdm(total=round(last - first, 1), unit="s", desc=log.name, disable=not shown, leave=False)
+        self.bar.bar_format = "{l_bar}{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}{postfix}]"
         self.bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
 
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:

@@ -43,7 +43,7 @@ from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.metrics import is_time
+from graphslam.evaluate.metrics import FigureTable, is_time
 from graphslam.evaluate.without_truth import ClassConsistency
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.network import to_network
@@ -268,7 +268,7 @@ def _open(home: Path, root: Path) -> Run:
         values = {k: v for k, v in values.items() if v == v}  # what is no number was not measured
         report[RESUMED] = int(values.pop(RESUMED, 0.0))
         report["seconds"] = {k.removeprefix("seconds_"): v for k, v in values.items() if k.startswith("seconds_")}
-        metrics = pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True)
+        metrics = FigureTable(pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True))
     if root == home:  # plain files: a copy, or of an older version
         check_state(root)
     _check_submaps(home, root)

@@ -21,7 +21,7 @@ from graphslam.app.run.calibration import named_causes, own_noise, prepared, sui
 from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
-from graphslam.app.run.front_ends import make_front_end, preset_of, recommended
+from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended
 from graphslam.app.run.front_to_back import FrontEndWork, FrontToBack, ProgressBar
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_facts, write_outputs
@@ -35,7 +35,7 @@ from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.refining import refine_run, refined_ledger
 from graphslam.backend.streams import FixPart, ImuPart, beacons_of, compasses_of, split, used_fixes
 from graphslam.core.config import as_dict, build, dump_toml, merge
-from graphslam.core.errors import GraphSlamError, MissingDataError
+from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
 from graphslam.core.feed import Feed
 from graphslam.core.findings import verdict_json
 from graphslam.core.heap import give_back
@@ -76,6 +76,8 @@ from graphslam.evaluate.trust import rows_as_json
 from graphslam.evidence.compact import move
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.frontends.base import FrontEnd
+from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
@@ -83,6 +85,7 @@ from graphslam.maps.global_map import GlobalMap, make_map
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
 from graphslam.refine.scans import Scans
+from graphslam.solve.registry import SOLVERS
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -91,7 +94,7 @@ logger = logging.getLogger(__name__)
 def run(
     source: str | Path | SensorLog,
     *,
-    frontend: str | None = None,
+    frontend: str | FrontEnd | type[FrontEnd] | None = None,
     solver: str = "isam2",
     seed: int = 0,
     out: str | Path | None = None,
@@ -109,8 +112,9 @@ def run(
     Parameters
     ----------
     source : card name, file, folder, or SensorLog
-    frontend : str, optional
-        Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`).
+    frontend : str, class or object, optional
+        Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`). Or a class
+        that inherits from :class:`~graphslam.frontends.base.FrontEnd`, or an object of one, which has its own options.
     solver : str
         Registered name.
     seed : int
@@ -147,13 +151,22 @@ def run(
     >>> run = gs.run("victoria-park", frontend="rbpf-ekf", out="runs/vp", config={"gps": {"use": "every-second"}})
     >>> run.metric("gps_withheld_rmse")
     """
+    # what is wrong with the call is said before anything is read
+    name = None if frontend is None else name_of(frontend)
+    if isinstance(frontend, str):
+        check_name(frontend)
+    if solver not in SOLVERS:
+        raise UnknownNameError("solver", solver, SOLVERS)
     with one_blas_thread():
         begin = time.perf_counter()
         log = load_log_source(source, reader=reader, **(reader_options or {}))
         loading = time.perf_counter() - begin
-        frontend, suggested, own = _chosen(log, frontend, preset)
+        name, suggested, own = _chosen(log, name, preset)
+        front: str | FrontEnd | type[FrontEnd] = name if frontend is None else frontend
+        if not isinstance(front, (str, type)):
+            suggested = {k: v for k, v in suggested.items() if k != "frontend"}
         asked = config or {}
-        return _run(log, loading, frontend, solver, seed, out, suggested, own, asked, resume, progress, undo, observers)
+        return _run(log, loading, front, solver, seed, out, suggested, own, asked, resume, progress, undo, observers)
 
 
 def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[str, dict[str, Any], bool]:
@@ -176,7 +189,7 @@ def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[s
 def _run(
     log: SensorLog,
     loading: float,
-    frontend: str,
+    frontend: str | FrontEnd | type[FrontEnd],
     solver: str,
     seed: int,
     out: str | Path | None,
@@ -200,7 +213,7 @@ def _run(
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]
-    effective = effective_config(log.name, frontend, solver, seed, front.config, settings)
+    effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
     back = back_end(Feed(log), settings, solver, [ProgressBar(log, progress), *observers])
 
     def finish(folder: RunFolder | None, undone: Sequence[int | Decision]) -> Run:
@@ -275,18 +288,42 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
     begin = time.perf_counter()
     with one_blas_thread(), locked(root):
         taken, _ = consistent(root, read_taken)
-        effective = read_options(root)
-        wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
-        said = check_json(effective, wanted, str(root / CONFIG))["run"]
-        settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-        back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
-        submaps = read_submaps(root, load_grid=load_npz if with_grids(settings) else None)
+        effective, settings, back, submaps = _stored(root, taken, progress=progress)
         seconds = {"load": time.perf_counter() - begin}
         for s in submaps:
             back.add(s)
         work = FrontEndWork(0.0, len(submaps), np.zeros(0))
         result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
         return write_outputs(root, result)
+
+
+def solve_again(folder: str | Path) -> tuple[PoseGraph, Solution]:
+    """Graph and solution of a finished run, from what its folder holds, without the loops that were undone.
+
+    Raises
+    ------
+    MissingDataError
+        An older version wrote the folder, which does not hold enough.
+    RunFolderError, FormatError
+    """
+    root = Path(folder)
+    with one_blas_thread():
+        taken, _ = consistent(root, read_taken)
+        _, _, back, submaps = _stored(root, taken, progress=False)
+        for s in submaps:
+            back.add(s)
+        solution = back.finish(undone_of_run(root))
+    return back.graph, solution
+
+
+def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any], cfg.RunConfig, BackEnd, list[Submap]]:
+    """Options and submaps of a run folder, and a back end that is to have them."""
+    effective = read_options(root)
+    wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
+    said = check_json(effective, wanted, str(root / CONFIG))["run"]
+    settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+    back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
+    return effective, settings, back, read_submaps(root, load_grid=load_npz if with_grids(settings) else None)
 
 
 def back_end(feed: Feed, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,37 @@ if TYPE_CHECKING:
     from graphslam.solve.solution import Solution
 
 Ints = npt.NDArray[np.int64]
+
+
+class Later:
+    """A part of a run that is made when it is first asked for.
+
+    Parameters
+    ----------
+    make : callable
+        Without arguments.
+    """
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self.make = make
+
+
+class _Part:
+    """A field of a run that may be a :class:`Later`; None by default."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, run: Any, owner: type) -> Any:
+        if run is None:
+            return None  # the default of the field
+        part = run.__dict__[self.name]
+        if isinstance(part, Later):
+            part = run.__dict__[self.name] = part.make()
+        return part
+
+    def __set__(self, run: Any, value: Any) -> None:
+        run.__dict__[self.name] = value
 
 
 @dataclass(frozen=True)
@@ -62,11 +93,13 @@ class Run:
     truth_path, dead_reckoning : Trajectory or None
         In the frame of the first base.
     solution, graph : Solution, PoseGraph or None
-        The solver's own view; None for a run read back from disk.
+        The solver's own view. Of a run that :func:`graphslam.open_run` read they are solved again, once, when they are
+        first asked for; None where its folder does not hold what that needs.
     checks : WithoutTruth or None
         What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
-        Fused evidence grid of submaps that have grids. For a run read back from disk: ``remake_map.map_of_folder``.
+        Fused evidence grid of submaps that have grids. Of a run that :func:`graphslam.open_run` read it is made again,
+        once, when it is first asked for.
     graph_path : Trajectory or None
         Of a refined run the path of the graph, where the refinement began; from disk without covariances.
     refined : Refined or None
@@ -94,12 +127,16 @@ class Run:
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
     dead_reckoning: Trajectory | None = None
-    solution: Solution | None = None
-    graph: PoseGraph | None = None
+    solution: Solution | None = _Part()  # type: ignore[assignment]
+    graph: PoseGraph | None = _Part()  # type: ignore[assignment]
     checks: WithoutTruth | None = None
-    fused: RunMap | None = None
+    fused: RunMap | None = _Part()  # type: ignore[assignment]
     graph_path: Trajectory | None = None
     refined: Refined | None = None
+
+    def holds(self, part: str) -> bool:
+        """Is ``solution``, ``graph`` or ``fused`` there, made already?"""
+        return self.__dict__[part] is not None and not isinstance(self.__dict__[part], Later)
 
     def metric(self, key: str) -> float:
         """Value of one metric.

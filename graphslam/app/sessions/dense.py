@@ -111,7 +111,7 @@ def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
         raise DataError(
             "a run whose submaps have no inner nodes cannot be tied", where=run.name, wanted="backend.node_spacing > 0"
         )
-    if run.graph is not None:
+    if run.holds("graph") and run.graph is not None:
         return ties_of_graph(run.graph)
     net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
     if net is None:
