@@ -149,7 +149,7 @@ def figures(result: Any, every: bool) -> list[str]:
     return [table(shown, ["key", "value", "unit"]), *more]
 
 
-def _summary(result: Any, out: Path, every: bool) -> str:
+def _summary(result: Any, out: Path, every: bool = False) -> str:
     dropped = result.report["records_dropped"]
     lines = figures(result, every)
     lines += [f"dropped: {n} {what}" for what, n in dropped.items()]

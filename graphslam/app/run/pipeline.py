@@ -151,9 +151,9 @@ def run(
     >>> run = gs.run("victoria-park", frontend="rbpf-ekf", out="runs/vp", config={"gps": {"use": "every-second"}})
     >>> run.metric("gps_withheld_rmse")
     """
-    # what is wrong with the call is said before anything is read
+    # what is wrong with the call is said before anything is read (of a log in memory, a moment later)
     name = None if frontend is None else name_of(frontend)
-    if isinstance(frontend, str):
+    if isinstance(frontend, str) and not isinstance(source, SensorLog):
         check_name(frontend)
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)
