@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from graphslam.app.run.verdict import bounded, number
+from graphslam.app.run.summary import headline, in_metres
+from graphslam.app.run.verdict import Judged, number
 from graphslam.core.findings import Finding
 from graphslam.join.submap_solver import SubmapEstimate
 
@@ -26,23 +27,52 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
         What the graph of the submaps holds besides.
     """
     out = [_state(row, estimate)]
-    if (dof := row.get("dof")) is not None and row["objective_polished"] is not None:
-        if dof <= 0:
-            text = "χ² says nothing of the covariances: nothing in these submaps is redundant that could contradict."
-            out.append(Finding("", "chi2", text))
-        else:
-            text, level = bounded(row["objective_polished"] / dof, dof)
-            out.append(Finding(level, "chi2", f"χ²/dof at the optimum: {text}."))
-    if number(row.get("nees")) and row["nees_dof"]:
-        n = row["nees_dof"]
-        text, level = bounded(row["nees"] / n, n)
-        before = row.get("nees_unpolished")
-        said = f"; before the refinement {before / n:.3g}" if number(before) else ""
-        out.append(Finding(level, "nees", f"NEES/n against the truth: {text}{said}."))
+    judged = {j.code: j for j in join_judged(row)}
+    if chi2 := judged.get("chi2"):
+        out.append(Finding(chi2.level, "chi2", f"χ²/dof at the optimum: {chi2.text}."))
+    elif row.get("dof") is not None and row["objective_polished"] is not None:
+        text = "χ² says nothing of the covariances: nothing in these submaps is redundant that could contradict."
+        out.append(Finding("", "chi2", text))
+    if nees := judged.get("nees"):
+        before: Any = row.get("nees_unpolished")
+        said = f"; before the refinement {before / nees.dof:.3g}" if number(before) else ""
+        out.append(Finding(nees.level, "nees", f"NEES/n against the truth: {nees.text}{said}."))
     if left_out:
         text = f"Not part of it, because joiners take submaps and what ties them alone: {', '.join(left_out)}."
         out.append(Finding("", "left-out", text))
     return out
+
+
+def join_judged(row: Mapping[str, Any]) -> list[Judged]:
+    """What the covariances of a joined map were held against."""
+    out = []
+    best: Any = row["objective_polished"]
+    if (dof := row.get("dof") or 0) > 0 and number(best):
+        out.append(Judged("chi2", "χ²/dof", best / dof, dof))
+    if number(row.get("nees")) and row["nees_dof"]:
+        out.append(Judged("nees", "NEES/n", row["nees"] / row["nees_dof"], row["nees_dof"]))
+    return out
+
+
+def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submaps: int, length: float) -> Finding:
+    """First line of the verdict on one joined map.
+
+    Parameters
+    ----------
+    row : mapping
+        Of :func:`graphslam.app.compare.join_json`.
+    findings : sequence of Finding
+        Of :func:`join_verdict`.
+    submaps : int
+        That were joined.
+    length : float
+        Of the path through the nodes [m].
+    """
+    marks = f", {row['landmarks']} landmarks" if row["landmarks"] else ""
+    judged = join_judged(row)
+    known = any(j.code == "nees" for j in judged)
+    facts = [f"{in_metres(length)} through {submaps} submaps{marks}", "" if known else "true error not known"]
+    return headline(findings, facts, judged, known=known)
 
 
 def _state(row: Mapping[str, Any], estimate: SubmapEstimate) -> Finding:

@@ -48,26 +48,15 @@ def worst(findings: Iterable[Finding]) -> Level:
     return max((f.level for f in findings), key=LEVELS.index, default="")
 
 
-def headline(findings: Iterable[Finding]) -> Finding:
-    """What all findings together say, as one sentence."""
-    found = list(findings)
-    level = worst(found)
-    n = sum(f.level == level for f in found)
-    points = f"the {n} points" if n > 1 else "the point"
-    if level == "bad":
-        text = f"Do not trust this map before you have looked at {points} marked “bad”."
-    elif level == "look":
-        text = f"Nothing is known to be wrong; look at {points} marked “look”."
-    else:
-        text = "Nothing that this run can check speaks against the map."
-    return Finding(level or "good", "headline", text)
-
-
-def verdict_json(findings: Iterable[Finding]) -> dict[str, Any]:
+def verdict_json(headline: Finding, findings: Iterable[Finding]) -> dict[str, Any]:
     """All findings as one JSON object: ``level``, ``headline``, and ``lines`` of ``level, code, text``."""
-    found = list(findings)
-    said = headline(found)
-    return {"level": said.level, "headline": said.text, "lines": [f.as_row() for f in found]}
+    return {"level": headline.level, "headline": headline.text, "lines": [f.as_row() for f in findings]}
+
+
+def headline_of_json(value: Any) -> Finding | None:
+    """The first line of the JSON object that :func:`verdict_json` makes; None where there is none."""
+    said = value if isinstance(value, Mapping) else {}
+    return Finding.from_row({"level": said.get("level"), "code": "headline", "text": said.get("headline")})
 
 
 def findings_of_json(value: Any) -> list[Finding]:

@@ -64,7 +64,11 @@ KINDS = {
         "ranges look {} too long", "ranges look {} too short", "%", 0.05, "check the unit and the scale of the ranges"
     ),
     "range-offset": Kind(
-        "ranges look {} too long", "ranges look {} too short", "m", 0.2, "state it as frontend.noise.range_offset"
+        "ranges look {} too long",
+        "ranges look {} too short",
+        "m",
+        0.2,
+        "state the offset of the ranges as frontend.noise.range_offset",
     ),
     "bearing-offset": Kind(
         "bearings look {} too large, as from a sensor that is turned to the right",

@@ -37,6 +37,9 @@ class Page(HTMLParser):
         self.tables: list[Table] = []
         self.items: dict[str, list[str]] = {}
         self.verdict: list[tuple[str, str]] = []
+        self.text = ""
+        self.headline = ""
+        self._headline = False
         self._section = ""
         self._item: tuple[str, str] | None = None
         self._cell: list[str] | None = None
@@ -65,6 +68,7 @@ class Page(HTMLParser):
             self.tables[-1].classes.append(values.get("class", ""))
         if tag in ("td", "th"):
             self._cell = []
+        self._headline = "headline" in values.get("class", "").split()
         if tag == "li":
             self._item = (values.get("class", ""), "")
 
@@ -73,6 +77,7 @@ class Page(HTMLParser):
         assert self.open, f"</{tag}> closes nothing"
         assert self.open[-1] == tag, f"</{tag}> closes <{self.open[-1]}>"
         self.open.pop()
+        self._headline = False
         if tag in ("td", "th"):
             assert self._cell is not None
             self.tables[-1].rows[-1].append("".join(self._cell))
@@ -86,6 +91,9 @@ class Page(HTMLParser):
             self._section = ""
 
     def handle_data(self, data: str) -> None:
+        self.text += data
+        if self._headline:
+            self.headline += data
         if self._section:
             self.sections[self._section] += data
         if self._cell is not None:

@@ -44,9 +44,12 @@ def join(
     as_json: bool = JSON,
 ) -> None:
     """Join submaps into one map with one method, refine it, and say whether its covariances are honest."""
-    from graphslam.app.compare import JSON_COLUMNS, join_json
-    from graphslam.app.join_verdict import join_verdict
+    import numpy as np
+
+    from graphslam.app.compare import JSON_COLUMNS, join_json, keys_of
+    from graphslam.app.join_verdict import join_headline, join_verdict
     from graphslam.app.submap_sources import submap_source
+    from graphslam.core.trajectory import Trajectory
     from graphslam.io.joined_map import write_joined
     from graphslam.join.registry import join as join_by
     from graphslam.join.registry import methods_for, prepared
@@ -83,8 +86,10 @@ def join(
             anchors=estimate.anchors,
         )
     found = join_verdict(value["methods"][0], estimate, () if s.problem is None else s.problem.left_out)
-    value["verdict"] = [f.as_row() for f in found]
-    text = "\n".join([table(value["methods"], JSON_COLUMNS), *verdict_text(found)])
+    length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
+    said = join_headline(value["methods"][0], found, submaps=len(keys_of(material)), length=length)
+    value |= {"headline": said.text, "verdict": [f.as_row() for f in found]}
+    text = "\n".join([table(value["methods"], JSON_COLUMNS), *verdict_text(said, found)])
     emit(value, text, as_json=as_json)
 
 

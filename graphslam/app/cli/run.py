@@ -154,7 +154,7 @@ def _summary(result: Any, out: Path, every: bool = False) -> str:
     lines = figures(result, every)
     lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
     lines += join_note(result)
-    lines += ["", *verdict_text(result.verdict), ""]
+    lines += ["", *verdict_text(result.headline, result.verdict), ""]
     lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
     return "\n".join(lines)
 
@@ -204,7 +204,7 @@ def demo(
     rows = result.metrics.to_dict("records")
     text = (
         f"{chr(10).join(figures(result, every))}"
-        f"\n\n{chr(10).join(verdict_text(result.verdict))}"
+        f"\n\n{chr(10).join(verdict_text(result.headline, result.verdict))}"
         f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
         f"\nreport: {out / 'report.html'}"
         f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from graphslam.core.findings import Finding, headline
+from graphslam.core.findings import Finding
 from graphslam.core.json_file import finite
 
 
@@ -29,9 +29,9 @@ def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = Non
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths)).rstrip() for line in cells)
 
 
-def verdict_text(findings: Sequence[Finding]) -> list[str]:
-    """Lines of a verdict: the headline, then each finding behind its level."""
-    return [f"verdict: {headline(findings).text}", *(f"  {f.level or '-':4}  {f.text}" for f in findings)]
+def verdict_text(headline: Finding, findings: Sequence[Finding]) -> list[str]:
+    """Lines of a verdict: what all of it says, then each finding behind its level."""
+    return [f"verdict: {headline.text}", *(f"  {f.level or '-':4}  {f.text}" for f in findings)]
 
 
 def _cell(value: Any) -> str:

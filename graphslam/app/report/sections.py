@@ -11,9 +11,10 @@ import pandas as pd
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import compact, folded, missing, note, section
 from graphslam.app.run.files import RESUMED
+from graphslam.app.run.summary import headline, summary
 from graphslam.app.run.verdict import CONFIDENCE, Figures, class_rows, verdict
 from graphslam.core.config import dump_toml
-from graphslam.core.findings import Finding, headline
+from graphslam.core.findings import Finding
 from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
 from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.without_truth import two_sided
@@ -294,8 +295,12 @@ def figures_of(folder: ReportFolder) -> Figures:
 
 def verdict_lines(folder: ReportFolder) -> Markup:
     """A headline, and lines with a colour each; the words say the same as the colours."""
-    found = interrupted(folder) if folder.kind == "interrupted" else verdict(figures_of(folder))
-    said = headline(found)
+    if folder.kind == "interrupted":
+        found = interrupted(folder)
+        said = headline(found, [stopped(folder)])
+    else:
+        found = verdict(figures_of(folder))
+        said = summary(figures_of(folder), found)
     return join(
         [
             element("p", said.text, class_=f"headline {said.level}"),

@@ -28,6 +28,7 @@ from graphslam.app.run.outputs import graph_facts, write_outputs
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.run.stream_use import stream_use
+from graphslam.app.run.summary import summary
 from graphslam.app.run.taken import Taken, read_taken, take
 from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
@@ -438,6 +439,7 @@ def _judge(
         seconds["total"] += seconds["map"]
     scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
     time_metrics(out, seconds, log.duration, scans, work.per_scan)
+    out.add("path_length", global_map.trajectory.length(), "m")
     residuals = {}
     reckoned = dead_reckoning(log, global_map.trajectory)
     if gps is not None:
@@ -508,9 +510,8 @@ def _judge(
     corrected = "noise" in effective.get("frontend", {})
     causes = named_causes(log, settings.calibrate, *join, ranges_corrected=corrected)
     seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
-    report["verdict"] = verdict_json(
-        [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
-    )
+    lines = [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
+    report["verdict"] = verdict_json(summary(figures, lines), lines)
     return Run(
         name=log.name,
         submaps=identified,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from graphslam.core.findings import Finding, findings_of_json
+from graphslam.core.findings import Finding, findings_of_json, headline_of_json
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.markup import element, frame, join
@@ -151,6 +151,11 @@ class Run:
     def verdict(self) -> list[Finding]:
         """What the run says of itself: is it solved, honest, whole, and was everything used that was asked for."""
         return findings_of_json(self.report.get("verdict"))
+
+    @property
+    def headline(self) -> Finding:
+        """The first line of the verdict: what was made, how far it is to be trusted, what to do."""
+        return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "There is no verdict.")
 
     def plot(self, ax: Any = None) -> Any:
         """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""

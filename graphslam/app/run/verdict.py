@@ -214,14 +214,67 @@ def whole_chi2(figures: Figures) -> tuple[float, float] | None:
     return (sum(float(r["chi2"]) for r in rows if number(r.get("chi2"))), dof) if dof > 0 else None
 
 
-def bounded(ratio: float, dof: float, words: Mapping[str, str] = IN_WORDS) -> tuple[str, Level]:
-    """A ratio with its bounds in words, and the level of its line."""
-    low, high, said = two_sided(ratio, dof, CONFIDENCE)
-    text = f"{ratio:.3g}, {CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({dof:.4g} degrees of freedom); "
-    level: Level = "good"
-    if said != "consistent":  # one honest run in forty is outside on either side: bad is what one in a thousand is not
-        level = "bad" if ratio > two_sided(ratio, dof, CERTAIN)[1] else "look"
-    return text + words[said], level
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A ratio that is 1 where covariances are honest, held against its bounds.
+
+    Parameters
+    ----------
+    code : {"chi2", "nees"}
+    name : str
+        ``χ²/dof``.
+    ratio, dof : float
+    about : str
+        Of what.
+    """
+
+    code: str
+    name: str
+    ratio: float
+    dof: float
+    about: str = ""
+
+    @property
+    def said(self) -> str:
+        """``consistent``, ``over-confident`` or ``pessimistic``."""
+        return two_sided(self.ratio, self.dof, CONFIDENCE)[2]
+
+    @property
+    def level(self) -> Level:
+        """One honest run in forty is outside on either side: bad is what one in a thousand is not."""
+        if self.said == "consistent":
+            return "good"
+        return "bad" if self.ratio > two_sided(self.ratio, self.dof, CERTAIN)[1] else "look"
+
+    @property
+    def text(self) -> str:
+        """The ratio with its bounds, in words."""
+        low, high, said = two_sided(self.ratio, self.dof, CONFIDENCE)
+        bounds = f"{CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({self.dof:.4g} degrees of freedom)"
+        return f"{self.ratio:.3g}, {bounds}; {(IN_WORDS if self.code == 'nees' else RESIDUALS_IN_WORDS)[said]}"
+
+
+def judged_chi2(figures: Figures) -> Judged | None:
+    """χ² of the whole graph; None where nothing is redundant that could contradict, or that is not known."""
+    found = whole_chi2(figures)
+    if found is None or found[0] < EXACT * found[1]:
+        return None
+    return Judged("chi2", "χ²/dof", found[0] / found[1], found[1])
+
+
+def judged_nees(figures: Figures) -> list[Judged]:
+    """NEES against the truth, where it is known, in each gauge in which it was taken."""
+    m = dict(figures.metrics)
+    gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
+    bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
+    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
+        m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
+        gauges += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
+    return [
+        Judged("nees", "NEES/dof", m[f"{key}_per_dof"], m[f"{key}_dof"], gauge)
+        for key, gauge in gauges
+        if number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
+    ]
 
 
 def number(value: Any) -> bool:
@@ -252,15 +305,13 @@ def _state(figures: Figures) -> Finding:
 
 
 def _chi2(figures: Figures) -> Finding:
-    found = whole_chi2(figures)
-    if found is None:
+    if j := judged_chi2(figures):
+        return Finding(j.level, "chi2", f"χ²/dof of the whole graph: {j.text}.")
+    if whole_chi2(figures) is None:
         text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
-        return Finding("", "chi2", text)
-    chi2, dof = found
-    if chi2 < EXACT * dof:
-        return Finding("", "chi2", "χ² of the whole graph is 0: nothing in it is redundant that could contradict.")
-    text, level = bounded(chi2 / dof, dof, RESIDUALS_IN_WORDS)
-    return Finding(level, "chi2", f"χ²/dof of the whole graph: {text}.")
+    else:
+        text = "χ² of the whole graph is 0: nothing in it is redundant that could contradict."
+    return Finding("", "chi2", text)
 
 
 def _said(row: Evidence) -> str:
@@ -270,13 +321,20 @@ def _said(row: Evidence) -> str:
     return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
 
 
+def judged_trust(figures: Figures) -> Trust | None:
+    """Can the covariances be believed, by what the log itself holds? None in folders that do not say."""
+    if figures.report.get("evidence") is None:
+        return None
+    rows = rows_of_json(figures.report.get("evidence"))
+    fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
+    return trust(rows, fixes=fixes)
+
+
 def _trust(figures: Figures) -> list[Finding]:
     """Can the covariances be believed? Nothing here was held against a truth, and the line says what it rests on."""
-    rows = rows_of_json(figures.report.get("evidence"))
-    if figures.report.get("evidence") is None:
+    found = judged_trust(figures)
+    if found is None:
         return []
-    fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
-    found: Trust = trust(rows, fixes=fixes)
     said = "; ".join(_said(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
     rest = "It rests on residuals and on what was withheld, not on a truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
@@ -302,20 +360,10 @@ def _trust(figures: Figures) -> list[Finding]:
 
 
 def _nees(figures: Figures) -> list[Finding]:
-    m = dict(figures.metrics)
-    judged = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
-    bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
-    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
-        m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
-        judged += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
-    out: list[Finding] = []
-    for key, gauge in judged:
-        if number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0:
-            text, level = bounded(m[f"{key}_per_dof"], m[f"{key}_dof"])
-            line = f"NEES/dof against the truth ({gauge}): {text}. One run: a sample, not a proof."
-            out.append(Finding(level, "nees", line))
+    one = "One run: a sample, not a proof."
+    said = [(j, f"NEES/dof against the truth ({j.about}): {j.text}. {one}") for j in judged_nees(figures)]
     none = "No truth was known, or none to compare with: nothing is said of the true error."
-    return out or [Finding("", "nees", none)]
+    return [Finding(j.level, "nees", text) for j, text in said] or [Finding("", "nees", none)]
 
 
 def _tests(figures: Figures) -> list[Finding]:
