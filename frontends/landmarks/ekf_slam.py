@@ -15,12 +15,14 @@ from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.path_points import PathPoints
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam.frontends.landmarks.ekf_filter import EkfMap
+from graphslam.frontends.landmarks.fix_points import carried_points, fix_points, fixes_awaited, fixes_inside
 from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
 from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.frontends.landmarks.stopping import Stopping
@@ -117,33 +119,12 @@ class _Run:
             out |= {"jcbb_nodes": m.nodes, "jcbb_capped_scans": m.capped}
         return out
 
-    def submap(self, key: int, report: dict[str, Any]) -> Submap:
-        """The filter's own Gaussian as a submap."""
-        slots = self.map.landmarks(self.config.min_hits)
-        mean, P = self.map.joint(slots)
-        rows, landmark = self.sightings(slots)
-        path = np.array(self.poses)
-        places = mean[3:].reshape(-1, 2)
-        report |= {"systematic": systematic(self.data, self.first, self.next, rows, landmark, path, places)}
-        return self._hand_over(
-            key,
-            Gaussian(mean, P, (2,)),
-            self.identities(slots),
-            np.column_stack([self.data.original[rows], landmark]),
-            self.trajectory(path, vector_to_tangent_covariance(path, np.array(self.covariances))),
-            report | {"handover": "filter"} | self.report(len(rows)),
-        )
-
-    def smoothed_submap(self, key: int, report: dict[str, Any], trim: float) -> Submap:
+    def _smoothed(self, places: Array, rows: Ints, landmark: Ints, trim: float) -> Smoothed:
         """Gauss-Newton over the submap's poses and landmarks under the filter's association."""
-        data, obs, c = self.data, self.data.observations, self.config
-        slots = self.map.landmarks(c.min_hits)
-        mean, _ = self.map.joint(slots)
-        rows, landmark = self.sightings(slots)
-        span = slice(self.first, self.next)
-        s: Smoothed = smooth(
+        data, obs, span = self.data, self.data.observations, slice(self.first, self.next)
+        return smooth(
             np.array(self.poses),
-            mean[3:].reshape(-1, 2),
+            places,
             data.odometry.increments[span],
             data.odometry.covariances[span],
             np.searchsorted(obs.offsets, rows, side="right") - 1 - self.first,
@@ -151,8 +132,40 @@ class _Run:
             np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]]),
             obs.T_base_sensor,
             trim=trim,
-            min_hits=c.min_hits,
+            min_hits=self.config.min_hits,
         )
+
+    def submap(self, key: int, report: dict[str, Any], feed: Feed | None = None) -> Submap:
+        """The filter's own Gaussian as a submap; points of its path at the fixes of a feed are smoothed beside it."""
+        slots = self.map.landmarks(self.config.min_hits)
+        mean, P = self.map.joint(slots)
+        rows, landmark = self.sightings(slots)
+        path = np.array(self.poses)
+        places = mean[3:].reshape(-1, 2)
+        report |= {"systematic": systematic(self.data, self.first, self.next, rows, landmark, path, places)}
+        times, points = self.data.observations.times[self.first : self.next], None
+        if feed is not None and fixes_inside(feed, self.t_start, times):
+            s = self._smoothed(places, rows, landmark, 0.0)
+            if np.all(s.landmark_kept):
+                points = carried_points(fix_points(feed, s, self.t_start, times), s.gaussian, mean, P)
+        return self._hand_over(
+            key,
+            Gaussian(mean, P, (2,)),
+            self.identities(slots),
+            np.column_stack([self.data.original[rows], landmark]),
+            self.trajectory(path, vector_to_tangent_covariance(path, np.array(self.covariances))),
+            report | {"handover": "filter"} | self.report(len(rows)),
+            points,
+        )
+
+    def smoothed_submap(self, feed: Feed, key: int, report: dict[str, Any], trim: float) -> Submap:
+        """The optimum under the filter's association as a submap."""
+        obs, c = self.data.observations, self.config
+        slots = self.map.landmarks(c.min_hits)
+        mean, _ = self.map.joint(slots)
+        rows, landmark = self.sightings(slots)
+        s = self._smoothed(mean[3:].reshape(-1, 2), rows, landmark, trim)
+        data, span = self.data, slice(self.first, self.next)
         index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
         used = int(s.kept.sum())
         places = s.gaussian.mean[3:].reshape(-1, 2)
@@ -175,10 +188,18 @@ class _Run:
                 "chi2_bearing": float(s.parts[2]),
                 "converged": s.converged,
             },
+            fix_points(feed, s, self.t_start, obs.times[span]),
         )
 
     def _hand_over(
-        self, key: int, g: Gaussian, ids: Ints, sightings: Ints, path: Trajectory, report: dict[str, Any]
+        self,
+        key: int,
+        g: Gaussian,
+        ids: Ints,
+        sightings: Ints,
+        path: Trajectory,
+        report: dict[str, Any],
+        points: PathPoints | None = None,
     ) -> Submap:
         landmarks = LandmarkMap(
             ids=ids,
@@ -187,6 +208,7 @@ class _Run:
             covariance=g.covariance,
             sightings=sightings,
             chart="group",
+            path=points,
         )
         return Submap.from_landmarks(
             key,
@@ -256,9 +278,11 @@ class Ekf(FrontEnd):
                 ended = "gap"
         run.data = growing.prepared
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
+        while fixes_awaited(growing.feed, float(run.data.observations.times[run.next - 1])):
+            yield None
         if self.config.handover == "filter":
-            return run.submap(key, report), run.next
-        return run.smoothed_submap(key, report, self.config.trim), run.next
+            return run.submap(key, report, growing.feed), run.next
+        return run.smoothed_submap(growing.feed, key, report, self.config.trim), run.next
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,9 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 from graphslam.frontends.landmarks.filter import ParticleSet
+from graphslam.frontends.landmarks.fix_points import fix_points, fixes_awaited
 from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
-from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, landmark_stream
+from graphslam.frontends.landmarks.prepare import Preparing, known_slots, landmark_stream
 from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from graphslam.frontends.landmarks.stopping import Stopping
 from graphslam.frontends.landmarks.summarise import Smoothed, winning_association
@@ -112,7 +113,9 @@ class RbpfEkf(FrontEnd):
             if data.splits(scan):
                 ended = "gap"
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        made = self._summarise(growing.prepared, filters, key, first, scan, t_start, slots, report)
+        while fixes_awaited(growing.feed, float(growing.prepared.observations.times[scan - 1])):
+            yield None
+        made = self._summarise(growing, filters, key, first, scan, t_start, slots, report)
         return made, particles, scan
 
     def _known(self, obs: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
@@ -123,7 +126,7 @@ class RbpfEkf(FrontEnd):
 
     def _summarise(
         self,
-        data: Prepared,
+        growing: Preparing,
         filters: list[ParticleSet],
         key: int,
         first: int,
@@ -132,7 +135,8 @@ class RbpfEkf(FrontEnd):
         slots: dict[int, int],
         report: dict[str, Any],
     ) -> Submap:
-        c, obs, particles = self.config, data.observations, filters[0]
+        c, data, particles = self.config, growing.prepared, filters[0]
+        obs = data.observations
         association = winning_association(particles, c.min_hits)
         offset = int(obs.offsets[first])
         rows = offset + association.observation
@@ -209,6 +213,7 @@ class RbpfEkf(FrontEnd):
             covariance=handed.covariance,
             sightings=np.column_stack([data.original[used], lm_index]),
             chart="group" if c.handover == "smoothed" else "cartesian",  # particles: as the paper has them
+            path=fix_points(growing.feed, smoothed, t_start, obs.times[span]) if c.handover == "smoothed" else None,
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
         if c.handover != "smoothed":  # the path's end is the Gaussian's

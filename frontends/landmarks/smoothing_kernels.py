@@ -314,3 +314,63 @@ def smoothed_covariances(poses, landmarks, evidence):
         X = Xk
         marginal[k] = S
     return joint, marginal
+
+
+@numba.njit(cache=True, error_model="numpy")
+def path_covariances(poses, landmarks, evidence, at, G0, G1):
+    """Joint covariances of points of the path, by the backward recursion of :func:`smoothed_covariances`.
+
+    Point p moves by ``G0[p] ξ_k + G1[p] ξ_{k+1}`` with k = at[p] (right tangents; k = -1 is the base, which is held).
+
+    Parameters
+    ----------
+    at : (q,)
+        In increasing order, -1 ... T - 2.
+    G0, G1 : (q, 2, 3)
+
+    Returns
+    -------
+    cross : (2q, 3 + 2L)
+        With {exit pose (right tangent), landmarks}.
+    own : (2q, 2q)
+    """
+    T, n, q = len(poses), 2 * len(landmarks), len(at)
+    A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
+    H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
+    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
+    normal = Normal(A, B, C, H, g, gl)
+    _linearise(poses, landmarks, evidence, normal)
+    _eliminate(normal, last_seen, Ainv)
+    joint = np.linalg.inv(_reduced(A, C, H))
+    joint = 0.5 * (joint + joint.T)
+    Sl = joint[3:, :].copy()  # landmarks with {exit, landmarks}
+    Y1, S1 = joint[:3, :].copy(), joint[:3, :3].copy()  # pose k + 1 with {exit, landmarks}, and with itself
+    Z1 = np.zeros((3, 2 * q))  # pose k + 1 with the points so far
+    Zl = np.zeros((n, 2 * q))  # landmarks with the points so far
+    cross, own = np.zeros((2 * q, 3 + n)), np.zeros((2 * q, 2 * q))
+    p = q - 1
+    for k in range(T - 2, -2, -1):
+        Y0, Z0, S0, S01 = np.zeros((3, 3 + n)), np.zeros((3, 2 * q)), np.zeros((3, 3)), np.zeros((3, 3))
+        if k >= 0:
+            F = Ainv[k] @ B[k]
+            G = Ainv[k] @ C[k]
+            Y0 = -(F @ Y1 + G @ Sl)
+            Z0 = -(F @ Z1 + G @ Zl)
+            X1 = Y1[:, 3:].copy()
+            S01 = -(F @ S1 + G @ X1.T)
+            S0 = Ainv[k] - S01 @ F.T - Y0[:, 3:].copy() @ G.T
+            S0 = 0.5 * (S0 + S0.T)
+        while p >= 0 and at[p] == k:
+            a, b = np.ascontiguousarray(G0[p]), np.ascontiguousarray(G1[p])
+            mine = slice(2 * p, 2 * p + 2)
+            row = a @ Y0 + b @ Y1
+            cross[mine] = row
+            Z0[:, mine] = S0 @ a.T + S01 @ b.T
+            Z1[:, mine] = S01.T.copy() @ a.T + S1 @ b.T
+            Zl[:, mine] = row[:, 3:].T
+            both = a @ Z0 + b @ Z1
+            own[mine] = both
+            own[:, mine] = both.T
+            p -= 1
+        Y1, S1, Z1 = Y0, S0, Z0
+    return cross, own

@@ -208,6 +208,10 @@ class Smoothed:
     parts : (3,)
         Shares of the objective: odometry, range, bearing.
     converged : bool
+    landmarks : (L, 2)
+        Those that were kept.
+    evidence : Evidence
+        What was smoothed.
     """
 
     gaussian: Gaussian
@@ -219,6 +223,8 @@ class Smoothed:
     dof: int
     parts: Array
     converged: bool
+    landmarks: Array
+    evidence: Evidence
 
 
 def smooth(
@@ -293,4 +299,4 @@ def smooth(
     gaussian = Gaussian(np.concatenate([p[-1], l.ravel()]), G @ joint @ G.T, (2,))
     channels = int(kept.sum() + np.isfinite(observations[kept, 3]).sum())
     dof = channels - 2 * len(l)
-    return Smoothed(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged))
+    return Smoothed(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged), l, evidence)

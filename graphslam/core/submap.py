@@ -20,6 +20,7 @@ from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.markup import element, join, pairs
+from graphslam.core.path_points import PathPoints
 from graphslam.core.reading import usable
 from graphslam.core.trajectory import Trajectory
 
@@ -49,6 +50,8 @@ class LandmarkMap:
         association; no solver reads it.
     chart : "cartesian" or "group"
         Maps from elsewhere and those of the papers are Cartesian; our front ends make the other kind.
+    path : PathPoints or None
+        Points of the path where fixes were taken, jointly Gaussian with all of this (2-D only).
     """
 
     ids: npt.NDArray[np.int64]
@@ -58,6 +61,7 @@ class LandmarkMap:
     information: sp.csc_matrix | None = None
     sightings: npt.NDArray[np.int64] | None = None
     chart: str = "cartesian"
+    path: PathPoints | None = None
 
     def __post_init__(self) -> None:
         check_chart(self.chart)
@@ -86,6 +90,8 @@ class LandmarkMap:
             if not np.all(usable(info.data)):
                 raise CovarianceError("submap information is not finite", wanted="finite numbers")
             object.__setattr__(self, "information", info)
+        if self.path is not None and (self.path.cross.shape[1] != n or len(self.path.lever) != dim):
+            raise GeometryError("points of the path do not fit the map", got=self.path.cross.shape, wanted=f"(…, {n})")
         if self.sightings is not None:
             rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
             if len(rows) and (rows[:, 1].min() < 0 or rows[:, 1].max() >= len(ids)):
@@ -139,6 +145,7 @@ class LandmarkMap:
             positions=self.positions[k],
             covariance=self.dense_covariance()[np.ix_(ix, ix)],
             chart=self.chart,
+            path=None if self.path is None else self.path.of_landmarks(ix),
         )
 
     def difference(self, x: Array) -> Array:

@@ -15,7 +15,7 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_floor import fix_segments
@@ -23,6 +23,8 @@ from graphslam.evaluate.without_truth import correlated_dof, two_sided
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
 from graphslam.graph.gps import arm_jacobian, datum_columns, lever_arm
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.submap_model import submap_jacobians, submap_residual
+from graphslam.graph.submap_node import SubmapNode
 
 Ints = npt.NDArray[np.int64]
 
@@ -149,7 +151,7 @@ def gps_innovations(
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:
         raise DataError("withheld fixes cannot be predicted: the graph has no GPS datum", wanted="a graph with GPS")
-    node, arm, arm_cov = _arms(graph, gps)
+    node, arm, arm_cov, inner = _arms(graph, gps)
     found = node >= 0
     if not np.any(found):
         raise DataError("no withheld fix lies inside a submap's path", got=len(gps.times))
@@ -162,24 +164,31 @@ def gps_innovations(
     predicted, by = antenna_terms(values.poses[node], values.datum, values.tilt, arm)
     predicted[own] += values.biases[bias[own]]
 
-    # everything the innovations depend on: nodes, datum, tilt, biases; the first base is fixed and has no column
+    # everything the innovations depend on: nodes, datum, tilt, biases, and what holds the points of a landmark submap's
+    # path; the first base is fixed and has no column
     base = datum_columns(graph, node)
     columns = np.concatenate([base, lay.at("bias", np.where(own, bias, -1))], axis=1)
     J = np.concatenate([by[:, :, : base.shape[1]], np.tile(np.eye(d), (n, 1, 1))], axis=2)
-    needed, at = np.unique(columns, return_inverse=True)
-    at = at.reshape(columns.shape)
-    first = int(needed[0] < 0)
-    A = np.zeros((n, d, len(needed)))
-    np.put_along_axis(A, np.broadcast_to(at[:, None], J.shape).copy(), J, axis=2)
-    jacobian = A[:, :, first:].reshape(d * n, -1)
-    S = jacobian @ graph.covariance().columns(needed[first:]) @ jacobian.T
+    parts = [(slice(d * k, d * k + d), c, j) for k, (c, j) in enumerate(zip(columns, J))]
+    turn = by[:, :, :2] if d == 2 else by[:, :, 3:6]  # the node's axes in the GPS frame
+    rank = np.cumsum(found) - 1
+    for told in inner:
+        for k, fix in enumerate(rank[told.fixes].tolist()):
+            moved = turn[fix] @ told.jacobian[2 * k : 2 * k + 2]
+            parts.append((slice(d * fix, d * fix + d), told.columns, moved))
+    needed = np.unique(np.concatenate([c for _, c, _ in parts]))
+    needed = needed[needed >= 0]
+    A = np.zeros((d * n, len(needed)))
+    for rows, c, j in parts:
+        free = np.flatnonzero(c >= 0)
+        np.add.at(A, np.ix_(np.arange(rows.start, rows.stop), np.searchsorted(needed, c[free])), j[:, free])
+    S = A @ graph.covariance().columns(needed) @ A.T
     S = S.reshape(n, d, n, d)
     new = (bias >= 0) & ~own
     if np.any(new):
         assert bias_sigma is not None
         same = (bias[:, None] == bias[None]) & new[:, None]
         S += bias_sigma**2 * same[:, None, :, None] * np.eye(d)[None, :, None, :]
-    turn = by[:, :, :2] if d == 2 else by[:, :, 3:6]  # the node's axes in the GPS frame
     arm_cov = arm_cov.reshape(len(found), d, len(found), d)[np.ix_(found, np.arange(d), found, np.arange(d))]
     S += np.einsum("aij,ajbk,bmk->aibm", turn, arm_cov, turn, optimize=True)
     each = gps.noise[found][:, :d, :d] if sigma is None else np.tile(sigma**2 * np.eye(d), (n, 1, 1))
@@ -194,13 +203,78 @@ def gps_innovations(
     )
 
 
-def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Inner:
+    """Fixes at points of the path of a landmark submap, given what the graph solves for.
+
+    Parameters
+    ----------
+    fixes : (k,)
+        Numbers of the fixes.
+    places : (k, 2)
+        Antennas in the submap's base frame.
+    columns : (c,)
+    jacobian : (2k, c)
+        Of the antennas in the base frame, the base held.
+    left : (2k, 2k)
+        Covariance that is left.
+    """
+
+    fixes: Ints
+    places: Array
+    columns: Ints
+    jacobian: Array
+    left: Array
+
+
+def _inner(graph: PoseGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner:
+    """Points of a path given exit, landmarks, and those of its points that the graph solves for."""
+    inner, values, lay = s.inner_points, graph.values, graph.flat().layout
+    assert inner is not None
+    ids = graph.landmark_ids_of(s.key)
+    used = sorted(inner.rows)
+    rows = np.array([inner.rows[k] for k in used], dtype=np.int64)
+    path, ix, own = inner.path, inner.path.scalars(points), inner.path.scalars(used)
+    joint = np.block([[inner.joint, path.cross[own].T], [path.cross[own], path.covariance[np.ix_(own, own)]]])
+    cross = np.hstack([path.cross[ix], path.covariance[np.ix_(ix, own)]])
+    gain = np.linalg.solve(joint, cross.T).T
+    z = np.concatenate([inner.mean, path.positions[used].ravel()])
+    marks = np.array([lay.row_of[i] for i in ids.tolist()], dtype=np.int64)
+    places = np.concatenate([values.landmarks[marks].reshape(-1, 2), values["point"][rows].reshape(-1, 2)])
+    start, end = values.poses[s.node], values.poses[s.exit_node]
+    record = graph.records[s.factor_id]
+    chart = str(getattr(record, "chart", "cartesian"))
+    u = submap_residual(start, end, places, z, chart)
+    J_start, J_end, J_mark = submap_jacobians(start, end, places, z, chart, tangent=True)
+    m = len(places)
+    J = np.zeros((len(z), 6 + 2 * m))
+    J[:, :3], J[:, 3:6] = J_start, J_end
+    for k in range(m):
+        J[3 + 2 * k : 5 + 2 * k, 6 + 2 * k : 8 + 2 * k] = J_mark
+    Vi = J_mark @ rotation2(start[2])  # V⁻¹: the chart's residual of a difference in the base frame
+    V = np.linalg.inv(Vi)
+    off = (gain @ u).reshape(-1, 2) @ V.T
+    columns = np.concatenate(
+        [
+            lay.pose_columns(np.array([s.node, s.exit_node])).ravel(),
+            lay.at("l", marks).ravel(),
+            lay.at("point", rows).ravel(),
+        ]
+    )
+    left = inner.scale * (path.covariance[np.ix_(ix, ix)] - gain @ cross.T)
+    turned = np.kron(np.eye(len(points)), V)
+    return _Inner(fixes, path.positions[points] + off, columns, turned @ gain @ J, 0.5 * (left + left.T))
+
+
+def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array, list[_Inner]]:
     """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
 
-    Fixes of one stretch of path, from a node to the next, share what the path has lost since the node.
+    Fixes of one stretch of path, from a node to the next, share what the path has lost since the node. Those at points
+    of a landmark submap's path come by the joint rows of its Gaussian.
     """
     n, d = len(gps.times), graph.dim
     node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, d)), np.zeros((d * n, d * n))
+    inner: list[_Inner] = []
     for k, s in enumerate(graph.submaps):
         path = s.trajectory
         if path is None or not len(path):
@@ -208,16 +282,28 @@ def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array]:
         t0, t1 = max(s.interval[0], path.times[0]), min(s.interval[1], path.times[-1])
         last = k == len(graph.submaps) - 1
         inside = (gps.times >= t0) & ((gps.times <= t1) if last else (gps.times < t1))
-        at = s.before(gps.times)
+        known = s.inner_points
+        if known is not None:
+            mine = np.flatnonzero(inside)
+            at = [known.path.at(t, gps.lever[:d]) for t in gps.times[mine].tolist()]
+            pairs = [(f, p) for f, p in zip(mine.tolist(), at) if p is not None]
+            if pairs:
+                told = _inner(graph, s, np.array([f for f, _ in pairs]), np.array([p for _, p in pairs]))
+                inner.append(told)
+                inside[told.fixes] = False
+                node[told.fixes], arm[told.fixes] = s.node, told.places
+                ix = (d * told.fixes[:, None] + np.arange(d)).ravel()
+                cov[np.ix_(ix, ix)] = told.left
+        at_node = s.before(gps.times)
         for i in range(len(s.nodes) - 1):
-            rows = np.flatnonzero(inside & (at == i))
+            rows = np.flatnonzero(inside & (at_node == i))
             if len(rows):
-                T, P = s.local(gps.times[rows], at[rows])
+                T, P = s.local(gps.times[rows], at_node[rows])
                 node[rows] = s.nodes[i]
                 arm[rows], _ = lever_arm(T, None, gps.lever[:d])
                 ix = (d * rows[:, None] + np.arange(d)).ravel()
                 cov[np.ix_(ix, ix)] = _arm_covariance(T, P, gps.lever[:d])
-    return node, arm, cov
+    return node, arm, cov, inner
 
 
 def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:

@@ -28,6 +28,8 @@ from graphslam.graph.pose_graph import PoseGraph
 
 LASTING = "correlated: over-confident"
 """Verdict on residuals that are alike from one to the next, whatever their size."""
+JUDGED_WITH = {"path": "gps"}
+"""Factors that measure nothing by themselves: points of a path are there for the fixes, and share their residuals."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -158,7 +160,8 @@ def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str
         h = float(np.sum(H_free * covariance.columns(c))) if len(c) else 0.0
         again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
         dof = record.rows - 2.0 * w * h + again
-        sums.setdefault(record.group, []).append((record.rows, w * h, dof, float(d2), float(w)))
+        name = JUDGED_WITH.get(record.group, record.group)
+        sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w)))
     series = _series(graph, covariance)
     out = {}
     for name, rows in sums.items():

@@ -6,7 +6,7 @@ The factor itself is in :mod:`graphslam.graph.factors.gps`.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,9 +20,10 @@ from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, antenna_terms
+from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.noise import Robust, whitener
-from graphslam.graph.submap_node import SubmapNode
+from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 if TYPE_CHECKING:
     from graphslam.graph.graph_record import GraphRecord
@@ -95,6 +96,8 @@ class TiedFix:
     node: int
     arm: Array
     covariance: Array
+    point: int | None = None
+    """Row of the point of the path that it measures, where its submap has one."""
 
 
 def arm_of(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:
@@ -266,7 +269,8 @@ class GpsFixes:
             kernel = t.fix.config.robust
             g.insert(
                 GpsRecord(
-                    t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, kernel, bias, tilt=tilt, uneven=uneven
+                    t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, kernel, bias, tilt=tilt, uneven=uneven,
+                    point=t.point,
                 )
             )  # fmt: skip
         self.tied = []
@@ -275,6 +279,8 @@ class GpsFixes:
         """Covariance of a fix with its arm: in the node's frame, or in that of an uneven fix."""
         if t.fix.uneven is None:
             return t.covariance
+        if t.point is not None:
+            return t.fix.uneven
         values = self.graph.values
         assert values.datum is not None
         J = antenna_terms(values.poses[[t.node]], values.datum, values.tilt, t.arm[None])[1][0]
@@ -290,6 +296,7 @@ class GpsFixes:
         tied = [t.fix.factor_id for t in self.tied if t.node in own]
         self.tied = [t for t in self.tied if t.node not in own]
         self._drop([(i, "its submap was removed") for i in [*tied, *inside]])
+        self._leave_points(self.graph.submap(s.key))
 
     def tidy(self) -> None:
         """A datum that no fix holds any more goes, and the biases with it."""
@@ -326,10 +333,77 @@ class GpsFixes:
                 dropped.append((f.factor_id, "outside the submap's trajectory"))
                 continue
             sigma = f.sigma if f.config.sigma is None else f.config.sigma
+            point = self._inner_point(s, f)
+            if point is not None:  # what the path is unsure of is in the point
+                cov = np.zeros_like(cov)
             # of a fix that is not equally sure in all directions the arm's alone, until the datum says how to turn it
             covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
-            self.tied.append(TiedFix(f, s.nodes[int(at[0])], arm[0], covariance))
+            self.tied.append(TiedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
+        self._tie_points(s)
         return dropped
+
+    def _inner_point(self, s: SubmapNode, fix: Fix) -> int | None:
+        """Row of the point of a submap's path at a fix; a new one where it has none yet. None: no such point."""
+        g, s = self.graph, self.graph.submap(s.key)
+        inner = s.inner_points
+        k = None if inner is None else inner.path.at(fix.time, fix.lever)
+        if inner is None or k is None:
+            return None
+        if k not in inner.rows:
+            place = group_of(g.structure.poses).transform(g.pose(s.node), inner.path.positions[k])
+            rows = {**inner.rows, k: g.structure.append("point", place)}
+            self._keep(s, replace(inner, rows=rows))
+            return rows[k]
+        return inner.rows[k]
+
+    def _keep(self, s: SubmapNode, inner: InnerPoints | None) -> None:
+        submaps = self.graph.submaps
+        k = next(k for k, other in enumerate(submaps) if other.key == s.key)
+        submaps[k] = replace(submaps[k], inner_points=inner)
+
+    def _tie_points(self, s: SubmapNode) -> None:
+        """Tie the points of a submap that are used to its exit and landmarks, by one factor."""
+        g, s = self.graph, self.graph.submap(s.key)
+        inner = s.inner_points
+        if inner is None or not inner.rows:
+            return
+        fid = inner.factor_id
+        held = None if fid is None else g.records[fid]
+        if isinstance(held, PathRecord) and len(held.points) == len(inner.rows):
+            return
+        submap = g.records[s.factor_id]
+        assert isinstance(submap, SubmapRecord)
+        if fid is None:
+            fid = g.next_factor()
+            g.ledger.spend(fid, f"path of submap {s.key} at its fixes", ["-"], s.interval, "prior")
+        self._keep(s, replace(inner, factor_id=fid))
+        g.insert(inner.record(submap, fid))
+
+    def _leave_points(self, s: SubmapNode) -> None:
+        """Take out the points of a submap that goes; those of others move up."""
+        g, inner = self.graph, s.inner_points
+        if inner is None or not inner.rows:
+            return
+        if inner.factor_id is not None:
+            del g.records[inner.factor_id]
+            g.ledger.refund(inner.factor_id)
+        gone = set(inner.rows.values())
+        kept = [k for k in range(g.structure.count("point")) if k not in gone]
+        new = {old: k for k, old in enumerate(kept)}
+        for fid, r in list(g.records.items()):
+            if isinstance(r, PathRecord):
+                g.records[fid] = replace(r, points=np.array([new[k] for k in r.points.tolist()], dtype=np.int64))
+            elif isinstance(r, GpsRecord) and r.point is not None:
+                g.records[fid] = replace(r, point=new[r.point])
+        for other in list(g.submaps):
+            if other.inner_points is not None and other.key != s.key:
+                rows = {k: new[v] for k, v in other.inner_points.rows.items()}
+                self._keep(other, replace(other.inner_points, rows=rows))
+        if any(other.key == s.key for other in g.submaps):
+            self._keep(s, replace(inner, factor_id=None, rows={}))
+        self.tied = [t if t.point is None else replace(t, point=new[t.point]) for t in self.tied]
+        g.values["point"] = g.values["point"][kept]
+        g.revision += 1
 
     def _datum_if_ready(self, poses: Array, origin: Array, baseline: float) -> Array | None:
         """First ``T_gps_world`` from the tied fixes, once they span ``baseline`` on the ground and in the map."""

@@ -18,7 +18,7 @@ from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import GpsRecord
-from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsFixes
@@ -247,7 +247,7 @@ class GraphRecord:
         if owner is not None:
             self.gps.leave(owner)
             used = {n for r in self.records.values() for n in r.variables()}
-            if owner is self.submaps[-1] and not any(f"x{n}" in used for n in owner.nodes[1:]):
+            if owner.key == self.submaps[-1].key and not any(f"x{n}" in used for n in owner.nodes[1:]):
                 self.values.poses = self.values.poses[: owner.node + 1].copy()
                 self._place.pop(self.submaps.pop().key)
         self.gps.tidy()
@@ -283,6 +283,7 @@ class GraphRecord:
             ids = np.where(record.landmark_ids == drop, keep, record.landmark_ids)
             self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
             self._seen_in[keep].add(fid)
+            self._path_follows(record.submap_key, ids)
         self._seen_in[drop] = set()
         self._drop_landmarks([drop])
         self.revision += 1
@@ -315,8 +316,17 @@ class GraphRecord:
         if old not in ids:
             self._seen_in[old].discard(factor_id)
         self.insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
+        self._path_follows(record.submap_key, ids)
         self._event("split", factor_id=factor_id, submap=record.submap_key, landmark=old, new=new)
         return new
+
+    def _path_follows(self, submap_key: int, ids: npt.NDArray[np.int64]) -> None:
+        """The points of a submap's path hang on the landmarks that the submap sees now."""
+        inner = self.submap(submap_key).inner_points
+        if inner is not None and inner.factor_id is not None:
+            path = self.records[inner.factor_id]
+            assert isinstance(path, PathRecord)
+            self.records[inner.factor_id] = replace(path, landmark_ids=ids)
 
     def set_values(self, values: Values) -> None:
         """Take a solver's values (same variables).

@@ -52,7 +52,7 @@ from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners, whitener
 from graphslam.graph.readings import BeaconConfig, CompassConfig
-from graphslam.graph.submap_node import SubmapNode
+from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
 
@@ -156,6 +156,9 @@ class PoseGraph(GraphRecord):
         record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W, chart=lm.chart)
         ends = np.stack([np.zeros(3), submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
+        if lm.path is not None:
+            inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale)
+            self.submaps[-1] = replace(self.submaps[-1], inner_points=inner)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self.gps.tie(self.submaps[-1])
         self.readings.tie(self.submaps[-1])
@@ -232,7 +235,7 @@ class PoseGraph(GraphRecord):
                 times,
                 T_base_node,
                 ids,
-                *covariances,
+                *covariances,  # type: ignore[arg-type]
             )
         )
         for record in records:

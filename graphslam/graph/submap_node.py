@@ -7,6 +7,7 @@ pose whose covariance is what the path says to have lost between the two.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,8 +16,11 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.path_points import PathPoints
 from graphslam.core.poses import Group, group_of
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
+from graphslam.graph.noise import whitener
 
 # What two marginals of a path leave of the error between them is made positive semi-definite; directions below this
 # share of the path's own variance are rounding.
@@ -47,6 +51,42 @@ class Bridge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class InnerPoints:
+    """Points of the path of a landmark submap, and what a graph makes of them.
+
+    Parameters
+    ----------
+    path : PathPoints
+    mean, joint : (n,), (n, n)
+        Of exit and landmarks, as the submap states them.
+    scale : float
+        Factor on all covariances.
+    factor_id : int or None
+        Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
+    rows : mapping of int to int
+        Points that are used → rows of the graph's points.
+    """
+
+    path: PathPoints
+    mean: Array
+    joint: Array
+    scale: float = 1.0
+    factor_id: int | None = None
+    rows: Mapping[int, int] = field(default_factory=dict)
+
+    def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
+        """Factor of the points that are used, beside the submap's own."""
+        used = sorted(self.rows)
+        gain, left = self.path.given(self.joint, used)
+        W = whitener(left, what=f"path of submap {submap.submap_key} at its fixes", scale=self.scale)
+        return PathRecord(
+            factor_id, submap.submap_key, submap.start, submap.landmark_ids,
+            np.array([self.rows[k] for k in used], dtype=np.int64),
+            np.concatenate([self.mean, self.path.positions[used].ravel()]), np.hstack([-W @ gain, W]), submap.chart,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SubmapNode:
     """A submap in a graph.
 
@@ -71,6 +111,8 @@ class SubmapNode:
     stated : (k + 1, d, d)
         The same as the submap stated them, before a levelled exit gave up its relative roll and pitch: what a chain of
         relative poses by itself is worth, for instance in cycles of loops and chain.
+    inner_points : InnerPoints or None
+        Of a landmark submap that holds points of its path.
     factor_ids : tuple of int
         The chain from node to node, and what came with it (the attitude of a levelled exit).
     """
@@ -86,6 +128,7 @@ class SubmapNode:
     factor_ids: tuple[int, ...] = ()
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    inner_points: InnerPoints | None = None
 
     @property
     def exit_node(self) -> int:

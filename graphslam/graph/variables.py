@@ -4,10 +4,11 @@ A kind is a row of :data:`KINDS`. Values, columns, GTSAM's keys, thresholds of r
 of freedom and the words of a diagnosis are all made from that table, so that a new kind of variable is one row.
 
 Variables are named by short strings that also stand in messages: ``x3`` (pose of node 3), ``l17`` (landmark 17),
-``datum`` (``T_gps_world``), ``bias2`` (position bias of GPS segment 2), ``tilt`` (where up is in the frame of the first
-base, in space only), ``velocity4`` and ``imubias4`` (of an IMU, in the order in which its nodes were tied),
-``compass0`` (zero and deviation of a compass), ``beacon7`` (position of beacon 7). The first base ``x0`` is fixed at
-the origin and is no variable at all: no prior has to hold it, and nothing is lost to a badly scaled one.
+``point3`` (where the antenna was at a fix inside a landmark submap), ``datum`` (``T_gps_world``), ``bias2`` (position
+bias of GPS segment 2), ``tilt`` (where up is in the frame of the first base, in space only), ``velocity4`` and
+``imubias4`` (of an IMU, in the order in which its nodes were tied), ``compass0`` (zero and deviation of a compass),
+``beacon7`` (position of beacon 7). The first base ``x0`` is fixed at the origin and is no variable at all: no prior has
+to hold it, and nothing is lost to a badly scaled one.
 
 Poses are SE(2) ``(3,)`` or SE(3) ``(7,)`` and move by right tangents in GTSAM's order: x, y, θ in the plane, rotation
 before translation in space. The datum is SE(2) in the plane. In space it is ``[x, y, z, heading]``: the GPS frame and
@@ -90,6 +91,10 @@ def register_variable(kind: VariableKind) -> VariableKind:
 for _kind in (
     VariableKind("x", "x", {2: "mmr", 3: "rrrmmm"}, group=True, classes=("submap", "dense-submap", "*")),
     VariableKind("l", "l", {2: "mm", 3: "mmm"}, classes=("submap", "dense-submap", "*")),
+    VariableKind(
+        "point", "y", {2: "mm"}, classes=("path",),
+        remedy="a point of a submap's path hangs on no submap: remove the fixes that hang on it.",
+    ),
     # In space the datum's heading stands last and it moves by addition.
     VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps",)),
     VariableKind(

@@ -17,6 +17,7 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.json_file import check_json, parse_json
 from graphslam.core.npz import check_arrays, flags, floats, ints, texts
+from graphslam.core.path_points import PathPoints
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 
@@ -56,6 +57,9 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
                 arrays[f"information_{part}"] = getattr(landmarks.information, part)
         if landmarks.sightings is not None:
             arrays["sightings"] = landmarks.sightings
+        if landmarks.path is not None:
+            for part in ("times", "lever", "positions", "covariance", "cross"):
+                arrays[f"path_{part}"] = getattr(landmarks.path, part)
     if submap.trajectory is not None:
         arrays["trajectory_times"] = submap.trajectory.times
         arrays["trajectory_poses"] = submap.trajectory.poses
@@ -140,6 +144,11 @@ _FIELDS = {
     "information_indices": ints("z", optional=True),
     "information_indptr": ints("v+1", optional=True),
     "sightings": ints("q", 2, optional=True),
+    "path_times": floats("f", optional=True),
+    "path_lever": floats("c", optional=True),
+    "path_positions": floats("f", "c", optional=True),
+    "path_covariance": floats("g", "g", optional=True),
+    "path_cross": floats("g", "v", optional=True),
     "trajectory_times": floats("n", optional=True),
     "trajectory_poses": floats("n", "p", optional=True),
     "trajectory_covariances": floats("n", "d", "d", optional=True),
@@ -187,7 +196,15 @@ def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
         information=information,
         sightings=a.get("sightings"),
         chart=_chart(a, where),
+        path=_path(a, where),
     )
+
+
+def _path(a: Arrays, where: str) -> PathPoints | None:
+    if "path_times" not in a:
+        return None
+    parts = ("times", "lever", "positions", "covariance", "cross")
+    return PathPoints(**{part: _need(a, f"path_{part}", where) for part in parts})
 
 
 def _chart(a: Arrays, where: str) -> str:

@@ -9,14 +9,14 @@ from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.factors.compass import CompassBatch, DeclinationBatch, DeviationPriorBatch
 from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
 from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
-from graphslam.graph.factors.landmark_submap import SubmapBatch
+from graphslam.graph.factors.landmark_submap import PathBatch, SubmapBatch
 from graphslam.graph.factors.odometer import OdometerBatch, OdometerPriorBatch
 from graphslam.graph.factors.pseudorange import ClockBatch, PseudorangeBatch, SatelliteBiasBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
 from graphslam.graph.factors.sighting import SightingBatch
 
 for _batch in (
-    *(SubmapBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
+    *(SubmapBatch, PathBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
     *(RangeBatch, BeaconRangeBatch, SightingBatch),

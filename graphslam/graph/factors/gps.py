@@ -60,6 +60,9 @@ class GpsRecord:
         The graph knows where up is, and the level datum is turned by it.
     uneven : bool
         Residual and whitener are in the GPS frame, since coordinates there are not equally sure.
+    point : int or None
+        Where the antenna was, as a point of its submap's path that the graph solves for (in the plane); residual
+        ``T_gps_world point + bias - z`` and whitener are in the GPS frame then, and node and arm only say where it is.
     """
 
     factor_id: int
@@ -73,6 +76,7 @@ class GpsRecord:
     group: str = "gps"
     tilt: bool = False
     uneven: bool = False
+    point: int | None = None
 
     @property
     def rows(self) -> int:
@@ -82,6 +86,8 @@ class GpsRecord:
     def variables(self) -> list[str]:
         """Names of the variables."""
         bias = [] if self.bias is None else [f"bias{self.bias}"]
+        if self.point is not None:
+            return ["datum", *bias, f"point{self.point}"]
         return [f"x{self.node}", "datum", *bias, *(["tilt"] if self.tilt else [])]
 
     def label(self) -> str:
@@ -256,7 +262,7 @@ class GpsBatch(UniformBatch):
     """Position fixes, in the plane or in space."""
 
     record = GpsRecord
-    slots = ("x", "datum", "bias", "tilt")
+    slots = ("x", "datum", "bias", "tilt", "point")
 
     def __init__(self, records: Sequence[GpsRecord], layout: Any) -> None:
         super().__init__(records, layout)
@@ -266,31 +272,48 @@ class GpsBatch(UniformBatch):
 
     @staticmethod
     def keys(record: GpsRecord) -> Sequence[int | None]:
-        """Node, datum, bias if there is one, tilt if the graph knows it."""
-        return record.node, 0, record.bias, 0 if record.tilt else None
+        """Node or point of the path, datum, bias if there is one, tilt if the graph knows it."""
+        return (
+            None if record.point is not None else record.node,
+            0,
+            record.bias,
+            0 if record.tilt else None,
+            record.point,
+        )
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""
-        r, J = self._in_node_frame(*blocks)
-        some = np.flatnonzero(self._uneven)
+        x, datum, bias, tilt, point = blocks
+        r, J = self._in_node_frame(x, datum, bias, tilt)
+        if self.dim == 2:
+            J = np.concatenate([J, np.zeros((len(J), 2, 2))], axis=2)
+        inside = np.flatnonzero(self._rows[:, 4] >= 0)
+        if len(inside):
+            RD, p = rotation2(datum[0, 2]), point[inside]
+            r[inside] = p @ RD.T + datum[0, :2] + bias[inside] - self._z[inside]
+            J[inside] = 0.0
+            J[inside, :, 3:5], J[inside, :, 8:10] = RD, RD
+            J[inside, :, 5] = np.stack([-p[:, 1], p[:, 0]], -1) @ RD.T
+            J[inside, :, 6:8] = np.where((self._rows[inside, 2] >= 0)[:, None, None], np.eye(2), 0.0)
+        some = np.flatnonzero(self._uneven & (self._rows[:, 4] < 0))
         if len(some):
-            x, datum, bias, tilt = blocks
             known, d = self._rows[some, 3] >= 0, self.dim
             up = tilt[some[np.argmax(known)]] if d == 3 else None
             y, by = antenna_terms(x[some], datum[0], up, self._arm[some], ~known)
             r[some] = y + bias[some] - self._z[some]
             split = 6 if d == 2 else 10
             I = np.where((self._rows[some, 2] >= 0)[:, None, None], np.eye(d), 0.0)
-            J[some] = np.concatenate([by[:, :, :split], I, by[:, :, split:]], axis=2)
+            J[some, :, : by.shape[2] + d] = np.concatenate([by[:, :, :split], I, by[:, :, split:]], axis=2)
         return r, J
 
     def turns(self, values: Values) -> Array:
         """Rotations ``(k, dim, dim)`` from the axes of the residuals into those of the fixes."""
-        x, datum, _, _ = self.gather(values)
+        x, datum, _, _, _ = self.gather(values)
         known = self._rows[:, 3] >= 0
         J = antenna_terms(x, datum[0], values.tilt, self._arm, ~known)[1]
         turn = J[:, :, :2] if self.dim == 2 else J[:, :, 3:6]
-        return np.where(self._uneven[:, None, None], np.eye(self.dim), turn)
+        in_theirs = self._uneven | (self._rows[:, 4] >= 0)
+        return np.where(in_theirs[:, None, None], np.eye(self.dim), turn)
 
     def _in_node_frame(self, x: Array, datum: Array, bias: Array, tilt: Array) -> tuple[Array, Array]:
         """Residuals and Jacobians as if all were equally uncertain in all directions."""
@@ -310,7 +333,7 @@ class GpsBatch(UniformBatch):
     @classmethod
     def gtsam(cls, record: GpsRecord, origin: Array) -> gtsam.NonlinearFactor:
         """A custom factor in scalars: every fix hangs on the datum, so that this runs more often than anything else."""
-        if record.uneven:
+        if record.uneven or record.point is not None:
             return super().gtsam(record, origin)
         names = record.variables()
         free = [n for n in names if n != "x0"]

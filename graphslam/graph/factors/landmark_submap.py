@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -23,6 +24,10 @@ from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_fact
 from graphslam.graph.variables import Layout, Values, gtsam_key
 
 _TWO_PI = 2.0 * math.pi
+
+
+def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64]) -> list[str]:
+    return [*(f"l{i}" for i in landmark_ids.tolist()), *(f"point{k}" for k in points.tolist())]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,31 +63,93 @@ class SubmapRecord:
         object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
 
     @property
+    def points(self) -> npt.NDArray[np.int64]:
+        """Rows of points of the path: none here."""
+        return np.zeros(0, dtype=np.int64)
+
+    @property
     def rows(self) -> int:
         """Dimension of the residual."""
-        return len(self.z)
+        return len(self.whitener)
+
+    def entries(self) -> list[str]:
+        """Names of what stands behind the two poses, in the order of z."""
+        return _entries(self.landmark_ids, self.points)
 
     def variables(self) -> list[str]:
         """Names of the free and fixed variables, each once."""
-        return [f"x{self.start}", f"x{self.start + 1}", *(f"l{i}" for i in dict.fromkeys(self.landmark_ids.tolist()))]
+        return [f"x{self.start}", f"x{self.start + 1}", *dict.fromkeys(self.entries())]
 
     def label(self) -> str:
         """Name for messages."""
         return f"submap {self.submap_key} (factor {self.factor_id})"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PathRecord:
+    """Points of the path inside a landmark submap, given its exit and its landmarks.
+
+    The joint Gaussian of exit, landmarks and points is that of exit and landmarks, which is the submap's own factor,
+    times that of the points given them, which is this: ``u_p - K u_o ~ N(0, S)`` for the residuals u of the submap's
+    chart, ``K = P_po P_oo⁻¹``, ``S = P_pp - K P_op``. So a point that nobody measures tells nothing of anything.
+
+    Parameters
+    ----------
+    factor_id, submap_key, start, landmark_ids, chart
+        See :class:`SubmapRecord`.
+    points : (p,) int64
+        Rows of the points among the graph's.
+    z : (3 + 2n + 2p,)
+        Exit, landmarks and points in the base frame.
+    whitener : (2p, 3 + 2n + 2p)
+        ``S^{-1/2} [-K, I]``.
+    """
+
+    factor_id: int
+    submap_key: int
+    start: int
+    landmark_ids: npt.NDArray[np.int64]
+    points: npt.NDArray[np.int64]
+    z: Array
+    whitener: Array
+    chart: str = "cartesian"
+    group: str = "path"
+    information: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return len(self.whitener)
+
+    def entries(self) -> list[str]:
+        """Names of what stands behind the two poses, in the order of z."""
+        return _entries(self.landmark_ids, self.points)
+
+    def variables(self) -> list[str]:
+        """Names of the free and fixed variables, each once."""
+        return [f"x{self.start}", f"x{self.start + 1}", *dict.fromkeys(self.entries())]
+
+    def label(self) -> str:
+        """Name for messages."""
+        return f"path of submap {self.submap_key} at its fixes (factor {self.factor_id})"
+
+
 class SubmapBatch(FactorBatch):
     """Landmark submaps (Combined SLAM eq. 15), by a compiled kernel."""
 
-    record = SubmapRecord
+    record: ClassVar[type] = SubmapRecord
 
-    def __init__(self, records: Sequence[SubmapRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[SubmapRecord | PathRecord], layout: Layout) -> None:
         super().__init__(records, layout)
-        row = layout.row_of
+        row, marks = layout.row_of, layout.count("l")
         self._start = np.array([r.start for r in records], dtype=np.int64)
-        self._entry_offset = offsets([len(r.landmark_ids) for r in records])
-        ids = np.concatenate([np.zeros(0, dtype=np.int64), *(r.landmark_ids for r in records)])
-        self._entry_row = np.array([row[i] for i in ids.tolist()], dtype=np.int64)
+        self._entry_offset = offsets([len(r.landmark_ids) + len(r.points) for r in records])
+        # points stand behind the landmarks
+        rows = [[*(row[i] for i in r.landmark_ids.tolist()), *(marks + r.points).tolist()] for r in records]
+        self._entry_row = np.array([i for some in rows for i in some], dtype=np.int64)
         self._z = np.concatenate([np.zeros(0), *(r.z for r in records)])
         self._z_offset = offsets([len(r.z) for r in records])
         self._info = np.concatenate([np.zeros(0), *(r.information for r in records)])
@@ -93,8 +160,11 @@ class SubmapBatch(FactorBatch):
         # every submap: two poses, then its entries
         heads = np.repeat(self._entry_offset[:-1], 2)
         poses = layout.first("x", np.stack([self._start, self._start + 1], axis=1)).ravel()
-        self.first = np.insert(layout.first("l", self._entry_row), heads, poses)
-        self.width = np.insert(np.full(len(ids), 2), heads, 3)
+        own = np.where(self._entry_row < marks, self._entry_row, -1)
+        points = np.where(self._entry_row < marks, -1, self._entry_row - marks)
+        columns = np.where(own < 0, layout.first("point", points), layout.first("l", own))
+        self.first = np.insert(columns, heads, poses)
+        self.width = np.insert(np.full(len(self._entry_row), 2), heads, 3)
 
     def squared(self, values: Values) -> Array:
         """``rᵀ Λ r`` ``(k,)``."""
@@ -116,37 +186,46 @@ class SubmapBatch(FactorBatch):
             self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
             self._bent,
         )  # fmt: skip
+        places = np.concatenate([values.landmarks, values["point"]]) if values.count("point") else values.landmarks
         submap_blocks(
-            np.ascontiguousarray(values.poses), np.ascontiguousarray(values.landmarks), submaps, hessian,
+            np.ascontiguousarray(values.poses), np.ascontiguousarray(places), submaps, hessian,
             SubmapBlocks(H, H_offset, g, g_offset, chi2),
         )  # fmt: skip
         return chi2
 
     @classmethod
-    def gtsam(cls, record: SubmapRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: SubmapRecord | PathRecord, origin: Array) -> gtsam.NonlinearFactor:
         """A custom factor in scalars and three products of matrices."""
         return submap_factor(record, origin)
 
 
-def submap_factor(record: SubmapRecord, origin: Array) -> gtsam.CustomFactor:
+class PathBatch(SubmapBatch):
+    """Points of the paths of landmark submaps, by the same kernel."""
+
+    record = PathRecord
+
+
+def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.CustomFactor:
     """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start where that is the fixed first base, at ``origin``.
 
     A landmark that stands twice gives one key, whose Jacobian sums both entries.
     """
-    unique, entry_of = np.unique(record.landmark_ids, return_inverse=True)
+    entries = record.entries()
+    unique = {name: k for k, name in enumerate(dict.fromkeys(entries))}
+    entry_of = np.array([unique[name] for name in entries], dtype=np.intp)
     fixed = record.start == 0
     names = [] if fixed else [f"x{record.start}"]
-    names += [f"x{record.start + 1}", *(f"l{i}" for i in unique.tolist())]
+    names += [f"x{record.start + 1}", *unique]
     widths = [3 if n[0] == "x" else 2 for n in names]
     terms = _terms([gtsam_key(n) for n in names], fixed, entry_of, record, origin)
     return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
 
 
 def _terms(
-    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord, origin: Array
+    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array
 ) -> Callable[..., Array]:
     z, W, group = record.z, record.whitener, record.chart == "group"
-    m = len(z)
+    rows, m = W.shape
     first_landmark = len(keys) - (len(np.unique(entry_of)) if len(entry_of) else 0)
     landmark_keys = keys[first_landmark:]
     u = len(landmark_keys)
@@ -155,12 +234,12 @@ def _terms(
     W_end, W_heading = W[:, :2].copy(), W[:, 2].copy()
     W_points = W[:, 3:]
     if repeated:  # columns of entries of one landmark are added up once and for all
-        W_unique = np.zeros((m, u, 2))
+        W_unique = np.zeros((rows, u, 2))
         for entry, k in enumerate(entry_of.tolist()):
             W_unique[:, k] += W_points[:, 2 * entry : 2 * entry + 2]
     else:
-        W_unique = W_points.reshape(m, -1, 2)[:, np.argsort(entry_of)]
-    W_unique = np.ascontiguousarray(W_unique.reshape(m * u, 2))
+        W_unique = W_points.reshape(rows, -1, 2)[:, np.argsort(entry_of)]
+    W_unique = np.ascontiguousarray(W_unique.reshape(rows * u, 2))
     W_sum = np.stack([W[:, 0] + W_points[:, 0::2].sum(1), W[:, 1] + W_points[:, 1::2].sum(1)], -1)  # Σ over all points
     end_key, start_key = keys[0 if fixed else 1], None if fixed else keys[0]
 
@@ -212,7 +291,7 @@ def _terms(
         # along an arc V⁻¹ stands before every rotation, and the end heading moves all points
         by_heading = W_heading if bent is None else W_heading + W @ bent
         if not fixed:
-            J = np.empty((m, 3), order="F")
+            J = np.empty((rows, 3), order="F")
             J[:, :2] = -W_sum if Vi is None else -W_sum @ Vi  # a step of the start moves every point by -1
             turn = np.empty(m)
             turn[0], turn[1], turn[2] = q_end[1], -q_end[0], -1.0
@@ -222,7 +301,7 @@ def _terms(
                 turn[2] = -1.0
             J[:, 2] = W @ turn
             H[0] = J
-        J = np.empty((m, 3), order="F")
+        J = np.empty((rows, 3), order="F")
         ce, se = math.cos(dt), math.sin(dt)
         ends = W_end if Vi is None else W_end @ Vi
         J[:, 0] = ends[:, 0] * ce + ends[:, 1] * se  # R_sᵀ R_e
@@ -231,7 +310,7 @@ def _terms(
         H[first_landmark - 1] = J
         if u:
             turned = R.T if Vi is None else Vi @ R.T
-            J_points = (W_unique @ turned).reshape(m, u, 2)  # R_sᵀ in each landmark's own rows
+            J_points = (W_unique @ turned).reshape(rows, u, 2)  # R_sᵀ in each landmark's own rows
             for i in range(u):
                 H[first_landmark + i] = J_points[:, i]
 

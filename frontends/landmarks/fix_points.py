@@ -1,0 +1,129 @@
+"""Where the antenna was on the smoothed path of a submap whenever a fix was taken, jointly with exit and landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.feed import Feed
+from graphslam.core.gaussian import Gaussian
+from graphslam.core.geometry import (
+    Array,
+    rotation2,
+    se2_compose,
+    se2_exp,
+    se2_inverse,
+    se2_log,
+    se2_transform,
+    wrap_angle,
+)
+from graphslam.core.path_points import SAME_TIME, PathPoints
+from graphslam.core.records import Gps
+from graphslam.frontends.landmarks.smoothing_kernels import path_covariances
+from graphslam.frontends.landmarks.summarise import Smoothed
+
+STEP = 1e-5
+"""Of the central differences [m, rad]."""
+FLOOR = 1e-4
+"""σ that a point has by itself at least [m]."""
+
+
+def fixes_awaited(feed: Feed, until: float) -> bool:
+    """May fixes of a log that grows still come that are older than ``until`` [s]?
+
+    What a front end makes must not depend on the portions in which a log comes.
+    """
+    name = feed.of_type(Gps)
+    return not feed.ended and name is not None and feed.until(name) < until
+
+
+def fixes_inside(feed: Feed, t_start: float, times: Array) -> bool:
+    """Was any fix taken between the ends of a submap?"""
+    name = feed.of_type(Gps)
+    if name is None:
+        return False
+    t = feed.part(name).times
+    return bool(np.any((t > t_start + SAME_TIME) & (t < times[-1] - SAME_TIME)))
+
+
+def carried_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, joint: Array) -> PathPoints | None:
+    """Points beside another Gaussian over exit and landmarks than the smoothed one that they were made with.
+
+    What exit and landmarks tell of the points stays as it is; what they are themselves, the other Gaussian says.
+    """
+    if points is None:
+        return None
+    gain, left = points.given(smoothed.covariance, np.arange(len(points)))
+    off = mean - smoothed.mean
+    off[2] = wrap_angle(off[2])
+    cross = gain @ joint
+    own = left + cross @ gain.T
+    return PathPoints(
+        times=points.times, lever=points.lever, positions=points.positions + (gain @ off).reshape(-1, 2),
+        covariance=0.5 * (own + own.T), cross=cross,
+    )  # fmt: skip
+
+
+def fix_points(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> PathPoints | None:
+    """Points of a submap's path at the fixes inside it; None where no fix was taken or none has come yet.
+
+    Between two scans the path is the arc from one pose to the next, and what it does besides has the variance of a
+    bridge, ``a (1 - a) Q`` at the share a of a step whose odometry has the covariance Q.
+
+    Parameters
+    ----------
+    feed : Feed
+    smoothed : Smoothed
+    t_start : float
+        Of the submap [s].
+    times : (T,)
+        Of the smoothed poses [s].
+    """
+    name = feed.of_type(Gps)
+    if name is None or not fixes_inside(feed, t_start, times):
+        return None
+    gps: Gps = feed.part(name)  # type: ignore[assignment]
+    inside = (gps.times > t_start + SAME_TIME) & (gps.times < times[-1] - SAME_TIME)
+    at_fixes = np.unique(gps.times[inside])
+    lever = np.asarray(gps.lever[:2], dtype=np.float64)
+    known = np.concatenate([[min(t_start, times[0])], times])
+    poses = np.concatenate([np.zeros((1, 3)), smoothed.poses])
+    k = np.clip(np.searchsorted(known, at_fixes, side="right") - 1, 0, len(known) - 2)
+    span = known[k + 1] - known[k]
+    share = np.where(span > 0, (at_fixes - known[k]) / np.where(span > 0, span, 1.0), 1.0)[:, None]
+
+    def antenna(a: Array, b: Array) -> Array:
+        between = share * se2_log(se2_compose(se2_inverse(a), b))
+        return se2_transform(se2_compose(a, se2_exp(between)), np.broadcast_to(lever, (len(a), 2)))
+
+    G = np.zeros((2, len(k), 2, 3))
+    for c in range(3):
+        step = np.zeros((1, 3))
+        step[0, c] = STEP
+        for end in range(2):
+            moved = []
+            for sign in (1.0, -1.0):
+                ends = [poses[k], poses[k + 1]]
+                ends[end] = se2_compose(ends[end], se2_exp(np.tile(sign * step, (len(k), 1))))
+                moved.append(antenna(*ends))
+            G[end, :, :, c] = (moved[0] - moved[1]) / (2.0 * STEP)
+    G[0, k == 0] = 0.0  # the base is held
+    cross, own = path_covariances(
+        smoothed.poses, smoothed.landmarks, smoothed.evidence, (k - 1).astype(np.int64), G[0], G[1]
+    )
+    exit_turn = rotation2(smoothed.poses[-1, 2])
+    cross[:, :2] = cross[:, :2] @ exit_turn.T  # right tangent of the exit -> plain vector of eq. 15
+    Q = np.linalg.inv(smoothed.evidence.W)[:, :2, :2]
+    for i in range(len(k)):
+        R = rotation2(poses[k[i] + 1, 2])
+        for j in range(i, len(k)):
+            if k[j] != k[i]:
+                break
+            bridge = float(share[i, 0] * (1.0 - share[j, 0])) * (R @ Q[k[i]] @ R.T)
+            own[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] += bridge
+            if j > i:
+                own[2 * j : 2 * j + 2, 2 * i : 2 * i + 2] += bridge
+    own[np.diag_indices(len(own))] += FLOOR**2
+    return PathPoints(
+        times=at_fixes, lever=lever, positions=antenna(poses[k], poses[k + 1]),
+        covariance=0.5 * (own + own.T), cross=cross,
+    )  # fmt: skip
