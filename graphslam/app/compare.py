@@ -180,6 +180,8 @@ def compare(
             estimate: SubmapEstimate = way.polish(submaps, joined) if polish else joined
         else:
             estimate = way.solvers[method](submaps, polish=polish, progress=False)
+            if polish and truth is not None:
+                own = _judge(way.solvers[method](submaps, polish=False, progress=False), keys, truth)
         rows.append(
             {
                 **_describe(method, submaps, estimate),
@@ -244,7 +246,47 @@ def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
             values[name] = int(value)
         else:
             values[name] = float(value)
-    return values
+    return values | before_and_after(values)
+
+
+def before_and_after(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Objective, NEES and CI of a method's own map, and of the optimum that the refinement reached from it.
+
+    Parameters
+    ----------
+    row : mapping
+        Of a method (:data:`JSON_COLUMNS`). Without a refinement the figures are those before it, and there are none
+        after it.
+
+    Returns
+    -------
+    dict
+        ``before`` and ``after``, each with ``objective``, ``nees`` and ``ci``.
+    """
+    refined = row["objective_polished"] is not None and not (row["nees"] is not None and row["nees_unpolished"] is None)
+    before = {"objective": row["objective"], "nees": row["nees_unpolished"], "ci": row["ci_unpolished"]}
+    if not refined:
+        before = {"objective": row["objective"], "nees": row["nees"], "ci": row["ci"]}
+        return {"before": before, "after": dict.fromkeys(before)}
+    return {
+        "before": before,
+        "after": {"objective": row["objective_polished"], "nees": row["nees"], "ci": row["ci"]},
+    }
+
+
+def comparison_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of :func:`methods_json` as a table for people: figures before and after the refinement side by side."""
+    out = []
+    for r in rows:
+        n = r["nees_dof"]
+        line: dict[str, Any] = {"method": r["method"]}
+        for key, name in (("objective", "objective"), ("nees", "NEES/n"), ("ci", "CI")):
+            for when in ("before", "after"):
+                value = r[when][key]
+                line[f"{name} {when}"] = value / n if key == "nees" and value is not None and n else value
+        out.append(line | {k: r[k] for k in ("seconds", "peak_mb", "states", "landmarks", "nnz", "dof")})
+    known = any(r["nees_dof"] for r in rows)
+    return out if known else [{k: v for k, v in x.items() if not k.startswith(("NEES", "CI"))} for x in out]
 
 
 def join_json(

@@ -8,7 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.compare import DEFAULT_METHODS, JSON_COLUMNS, compare, join_json, map_nees, methods_json
+from graphslam.app.compare import (
+    DEFAULT_METHODS,
+    JSON_COLUMNS,
+    compare,
+    comparison_rows,
+    join_json,
+    map_nees,
+    methods_json,
+)
 from graphslam.app.memory import MemoryProbe
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.gaussian import chi2_quantile
@@ -16,6 +24,7 @@ from graphslam.core.geometry import wrap_angle
 from graphslam.core.map_truth import MapTruth
 from graphslam.join.association import Association
 from graphslam.join.registry import join
+from graphslam.plots.comparison import AFTER, BEFORE, comparison_figure
 from tests.reference.submap_chain import submap_chain
 
 
@@ -41,13 +50,40 @@ def test_json_is_what_the_command_line_promises(rng: np.random.Generator) -> Non
     found = methods_json(compare(submaps, ["eif-tree", "batch"], polish=False, memory=False))
     text = json.dumps(found, allow_nan=False)
     rows = json.loads(text)["methods"]
-    assert [tuple(r) for r in rows] == [JSON_COLUMNS, JSON_COLUMNS]
+    assert [tuple(r) for r in rows] == [(*JSON_COLUMNS, "before", "after")] * 2
     assert rows[0]["objective_polished"] is None
     assert rows[1]["objective_polished"] == rows[1]["objective"]
     assert rows[0]["nees"] is rows[0]["nees_dof"] is rows[0]["ci"] is rows[0]["peak_mb"] is None
     one = join_json(submaps, "ekf", join(submaps, "ekf"), truth=truth)["methods"][0]
-    assert tuple(one) == JSON_COLUMNS
+    assert tuple(one) == (*JSON_COLUMNS, "before", "after")
     assert isinstance(one["nees_dof"], int)
+
+
+def test_figures_before_and_after_refinement_stand_side_by_side(rng: np.random.Generator) -> None:
+    """For all five methods; the filters' own figures are not those of the optimum."""
+    submaps, truth = submap_chain(rng, submaps=8)
+    found = compare(submaps, truth=truth, memory=False)
+    rows = methods_json(found)["methods"]
+    shown = {r["method"]: r for r in comparison_rows(rows)}
+    assert list(shown) == list(DEFAULT_METHODS)
+    for r in rows:
+        line, n = shown[r["method"]], r["nees_dof"]
+        assert (line["objective before"], line["objective after"]) == (r["objective"], r["objective_polished"])
+        assert (line["NEES/n before"], line["NEES/n after"]) == (r["nees_unpolished"] / n, r["nees"] / n)
+        assert (line["CI before"], line["CI after"]) == (r["ci_unpolished"], r["ci"])
+    assert shown["eif-tree"]["NEES/n before"] != pytest.approx(shown["eif-tree"]["NEES/n after"], rel=1e-9)
+    assert shown["batch"]["NEES/n before"] == pytest.approx(shown["batch"]["NEES/n after"], rel=1e-4)
+    alone = methods_json(compare(submaps, ["eif-tree"], truth=truth, polish=False, memory=False))["methods"]
+    (own,) = comparison_rows(alone)
+    assert own["NEES/n before"] == pytest.approx(shown["eif-tree"]["NEES/n before"])
+    assert (own["NEES/n after"], own["objective after"], own["CI after"]) == (None, None, None)
+    unknown = comparison_rows(methods_json(compare(submaps, ["ekf"], memory=False))["methods"])
+    assert not [k for k in unknown[0] if "NEES" in k]
+    ax = comparison_figure(found)
+    assert [a.get_xlabel()[:6] for a in ax.figure.axes] == ["χ² abo", "NEES/n", "consis"]
+    drawn = ax.figure.axes[1].collections
+    assert [c.get_label() for c in drawn if c.get_label() in (BEFORE, AFTER)] == [BEFORE, AFTER]
+    np.testing.assert_allclose(drawn[-2].get_offsets()[:, 0], [r["NEES/n before"] for r in shown.values()])
 
 
 def test_nees_is_eq_18(rng: np.random.Generator) -> None:

@@ -109,14 +109,16 @@ def compare(
     ),
     memory: bool = typer.Option(True, help="Measure the peak memory of every method in a process of its own."),
     submap_poses: int | None = SUBMAP_POSES,
-    figure: Path | None = typer.Option(None, help="PNG file for a figure that compares the objectives."),
+    figure: Path | None = typer.Option(None, help="PNG file for a figure of the methods before and after refinement."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Compare methods on the same submaps: objective, gap, time, memory, and NEES and CI where the truth is known."""
+    """Compare methods on the same submaps: objective, NEES and CI before and after refinement, time, and memory."""
     from graphslam.app import compare as comparing
     from graphslam.app.join_verdict import compare_verdict
+    from graphslam.app.run.verdict import CONFIDENCE
     from graphslam.app.submap_sources import submap_source
+    from graphslam.evaluate.without_truth import two_sided
 
     s = submap_source(source, submap_poses=submap_poses)
     options: dict[str, Any] = {"covariance_scale": s.covariance_scale if scale is None else scale}
@@ -131,12 +133,18 @@ def compare(
         progress=not as_json,
         **options,
     )
+    value: dict[str, Any] = comparing.methods_json(found)
     if figure is not None:
-        from graphslam.plots.comparison import plot_comparison
+        from graphslam.plots.comparison import comparison_figure
         from graphslam.plots.save import save
 
-        save(plot_comparison(None, found, "objective", log=True, label="objective before polishing"), figure)
-    value: dict[str, Any] = comparing.methods_json(found)
+        save(comparison_figure(found), figure)
     said = compare_verdict(value["methods"])
     value["verdict"] = [f.as_row() for f in said]
-    emit(value, "\n".join([table(value["methods"], comparing.JSON_COLUMNS), *(f.text for f in said)]), as_json=as_json)
+    text = [table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
+    if s.truth is None:
+        text.append("No truth is known of these submaps: NEES and CI are not known, either.")
+    elif n := found["nees_dof"].iloc[0]:
+        low, high, _ = two_sided(1.0, float(n), CONFIDENCE)
+        text.append(f"An honest map has NEES/n between {low:.3g} and {high:.3g} in 95 % of the runs (n = {n}).")
+    emit(value, "\n".join(text), as_json=as_json)

@@ -70,6 +70,8 @@ def test_join_and_compare_print_the_documented_json(run_folder):
         "nees_dof",
         "ci_unpolished",
         "ci",
+        "before",
+        "after",
     }
     done = graphslam("join", run_folder, "--method", "eif-sequential", "--json", "--out", run_folder.parent / "joined")
     assert done.returncode == 0, done.stderr
