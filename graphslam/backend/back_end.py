@@ -41,7 +41,7 @@ def find_config(c: BackEndConfig) -> FindConfig:
         appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
         ties=TieConfig() if c.loop_ties else None,
-        rounds=FindConfig().rounds if c.loops else 0,
+        rounds=FindConfig().rounds if c.looks else 0,
     )
 
 
@@ -143,7 +143,7 @@ class BackEnd:
         """While the run goes on: what IMUs say of the submaps so far, and loops."""
         if self.imu is not None and self.imu.tie(self.graph, more=True):
             self.solver.update()
-        if self.config.loops:
+        if self.config.looks:
             self.find_loops(last=False)
 
     def append(self, submap: Submap) -> float:
@@ -163,7 +163,7 @@ class BackEnd:
             level_sigma=c.level_sigma if dense and submap.dim == 3 and c.level_sigma > 0 else None,
         )
         self._add_matches(submap)
-        if c.loops:
+        if c.looks:
             self.submaps.append(submap)
         if self.imu is not None:
             self.imu.look(self.graph)
@@ -228,7 +228,7 @@ class BackEnd:
             if not self.merge():
                 break
             self.solver.solve_to_optimum()
-        if self.config.loops:
+        if self.config.looks:
             self.find_loops()
         for loop in undo:
             if isinstance(loop, Decision):

@@ -89,9 +89,10 @@ class BackEndConfig:
     """Robust kernel on every match."""
     match_width: float = 2.385
     """Width of that kernel in standard deviations."""
-    loops: bool = False
+    loops: Literal[True, False, "auto"] = "auto"
     """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
-    The front end's matches are decided on with them; without, each that has the support is a factor."""
+    The front end's matches are decided on with them; without, each that has the support is a factor. "auto": a run
+    looks for them where passes of its fused map deny each other, and keeps the map in which fewer points are denied."""
     look_every: int = 5
     """While the run goes on, tie in IMUs and look for loops after every so many submaps, too; 0 = at the end only."""
     loop_overlap: float = 8.0
@@ -102,6 +103,11 @@ class BackEndConfig:
     """With loops: also along submaps, where their bodies were in a map that held them."""
     loop_appearance: bool = False
     """Also try places that look alike, wherever they are."""
+
+    @property
+    def looks(self) -> bool:
+        """Are loops looked for from the start?"""
+        return self.loops is True
 
     def __post_init__(self) -> None:
         for name in ("node_spacing", "level_sigma", "match_support", "loop_overlap", "loop_height", "look_every"):

@@ -31,6 +31,8 @@ SURE = 0.9
 is taken for free by some settings, and a few such beams say little."""
 FEW = 50
 """Points of a pair below which nothing is said of it."""
+LOOK = 0.02
+"""Share of contradicted points of a map from which it is worth a look; right maps of recordings have up to 0.013."""
 DOUBTED = 0.2
 """Share of contradicted points from which a pair is counted."""
 
@@ -68,6 +70,16 @@ class Contradictions:
         share = self.denied / np.maximum(n, 1)
         rows = np.flatnonzero((n >= FEW) & (share > DOUBTED))
         return rows[np.argsort(-share[rows], kind="stable")]
+
+    @property
+    def denies(self) -> bool:
+        """Do passes deny each other, so that another graph may show one place where this one shows two?"""
+        return (self.share is not None and self.share > LOOK) or len(self.doubted) > 1
+
+    def agrees_better(self, other: Contradictions) -> bool:
+        """Is a smaller share denied here, of at least half as many points that were told of?"""
+        known = self.share is not None and other.share is not None
+        return known and self.share < other.share and 2 * self.points >= other.points  # type: ignore[operator]
 
     def facts(self) -> dict[str, Any]:
         """JSON-serialisable."""

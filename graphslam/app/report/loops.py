@@ -52,7 +52,7 @@ def loops(folder: ReportFolder) -> Markup:
 
 def _none(folder: ReportFolder) -> Markup:
     backend = folder.config.get("backend", {})
-    asked = bool(backend.get("loops")) if isinstance(backend, Mapping) else False
+    asked = backend.get("loops") is True if isinstance(backend, Mapping) else False
     if folder.kind == "merged":
         return note("No loops in the events; ties between sessions, where they are places, are below.")
     if asked:

@@ -20,6 +20,7 @@ from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
 from graphslam.evaluate.trust import Evidence, Trust, rows_of_json, trust
 from graphslam.evaluate.without_truth import LASTING, two_sided
+from graphslam.maps.contradictions import LOOK
 
 CONFIDENCE = 0.95
 CERTAIN = 0.999
@@ -47,8 +48,8 @@ QUARTER = 0.25
 """Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
 ALIKE = 2
 """Submaps of which the same is said in full; of more their keys are told."""
-DENIED = (0.02, 0.1)
-"""Share of solid points that another pass denies from which the verdict asks to look at the map, and to distrust it."""
+DENIED = 0.1
+"""Share of solid points that another pass denies from which a map is to be distrusted."""
 MOSTLY = 0.95
 """Share of the records of a stream below which the verdict asks to look at what became of the others."""
 
@@ -110,6 +111,7 @@ _STATED = frozenset(
         "map-left-out",
         "map-coarser",
         "passes",
+        "passes-two-graphs",
         "flagged",
         "imu-axes",
     }
@@ -449,7 +451,7 @@ def _passes(found: Mapping[str, Any]) -> list[Finding]:
     if not (isinstance(share, float) and isinstance(points, int) and points and isinstance(doubted, list)):
         return []
     text = f"{1 - share:.1%} of {points} solid points of submaps stand in others that came there by another way"
-    if share <= DENIED[0] and len(doubted) < 2:
+    if share <= LOOK and len(doubted) < 2:
         return [Finding("good", "passes", f"{text}.")]
     pairs = ", ".join(f"{p[0]} and {p[1]}" for p in doubted[:3] if isinstance(p, list) and len(p) == 2)
     most = f" (most in submaps {pairs})" if pairs else ""
@@ -458,7 +460,24 @@ def _passes(found: Mapping[str, Any]) -> list[Finding]:
         "not closed, unless so much was moved between the passes: look at the map. Other seeds (--seed), or the noise "
         "that the log states (--set calibrate.use=none), may find the loops that this run did not."
     )
-    return [Finding("bad" if share > DENIED[1] else "look", "passes", text)]
+    return [Finding("bad" if share > DENIED else "look", "passes", text)]
+
+
+def _attempts(found: Mapping[str, Any]) -> list[Finding]:
+    """Of two graphs of the same submaps, which one was kept, and why."""
+    shares = [p.get("share") if isinstance(p := found.get(n), Mapping) else None for n in ("matches", "loops")]
+    if not all(s is None or isinstance(s, float) for s in shares) or "kept" not in found:
+        return []
+    matches, loops = ("an unknown share" if s is None else f"{s:.1%}" for s in shares)
+    took = found["kept"] == "loops"
+    text = (
+        "Two graphs of the same submaps were tried: with the front end's matches alone passes of the map deny "
+        f"{matches} of each other's points, with loops that were looked for {loops}. The "
+        f"{'second' if took else 'first'} is the "
+        "result" + ("; its loops are those of `graphslam loops`." if took else ".")
+    )
+    settled = isinstance(share := shares[took], float) and share <= LOOK
+    return [Finding("" if settled else "look", "passes-two-graphs", text)]
 
 
 def _left_out(figures: Figures) -> list[Finding]:
@@ -467,7 +486,7 @@ def _left_out(figures: Figures) -> list[Finding]:
         out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
     if figures.report.get("map_coarser"):
         out.append(Finding("look", "map-coarser", str(figures.report["map_coarser"])))
-    out += [*_passes(figures.part("map_passes")), *_flagged(figures)]
+    out += [*_passes(figures.part("map_passes")), *_attempts(figures.part("map_attempts")), *_flagged(figures)]
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))

@@ -22,6 +22,7 @@ from graphslam.app.run.pipeline import again, run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.localise import localise
+from graphslam.backend.back_end import BackEnd
 from graphslam.core import se3
 from graphslam.core.errors import FormatError, GraphSlamError
 from graphslam.core.log import SensorLog
@@ -29,6 +30,8 @@ from graphslam.core.poses import SE3, level
 from graphslam.core.records import Gps
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.io.tum import read_tum
+from graphslam.maps import run_map
+from graphslam.maps.contradictions import Contradictions
 from graphslam.maps.refined import base_frames, refined_map
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -213,6 +216,38 @@ def test_switched_off_it_leaves_nothing_of_a_refined_state(copy: Path) -> None:
     for name in ("refined/index.json", "trajectory_graph.tum", "figures/refined.png"):
         assert not (copy / name).is_symlink(), name
     assert open_run(copy).graph_path is None
+
+
+@pytest.mark.parametrize(("denied", "kept"), [(1, "loops"), (90, "matches")])
+def test_passes_that_deny_each_other_are_given_loops(
+    copy: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch, denied: int, kept: str
+) -> None:
+    def told(share: int) -> Contradictions:
+        return Contradictions(np.array([[0, 2]]), np.array([1000 - 10 * share]), np.array([10 * share]))
+
+    options = copy / "config.toml"
+    options.write_text(options.read_text().replace("loops = true", 'loops = "auto"'))
+    # each graph has a map before its refinement and one after it
+    said = iter([told(40), told(40), told(denied), told(denied)])
+    monkeypatch.setattr(run_map, "contradictions", lambda *_: next(said))
+    looked: list[bool] = []
+    finish = BackEnd.finish
+
+    def watched(self: BackEnd, *undo: Any) -> Any:
+        looked.append(self.config.looks)
+        return finish(self, *undo)
+
+    monkeypatch.setattr(BackEnd, "finish", watched)
+    r = again(copy, [], progress=False)
+    assert looked == [False, True]
+    assert next(said, None) is None
+    attempts = r.report["map_attempts"]
+    assert attempts["kept"] == kept
+    assert (attempts["matches"]["share"], attempts["loops"]["share"]) == (0.4, denied / 100)
+    assert r.metric("map_denied") == (denied / 100 if kept == "loops" else 0.4)
+    line = next(f for f in r.verdict if f.code == "passes-two-graphs")
+    assert line.level == ("" if kept == "loops" else "look")
+    assert open_run(copy).verdict == r.verdict
 
 
 def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path) -> None:
