@@ -39,9 +39,11 @@ class GridFilterConfig:
     map_beams: int = 0
     """Beams of a step that go into the maps, spread over it; 0 = all there are."""
 
-    likelihood: Literal["endpoint", "cast"] = "endpoint"
+    likelihood: Literal["endpoint", "cast", "upright"] = "endpoint"
     """How beams are weighed. End points are flat, so that of particles all a little off the nearest still wins. Casting
-    is sharp, and asks for more particles or less motion noise."""
+    is sharp, and asks for more particles or less motion noise. ``upright``: end points of upright surfaces alone, which
+    say where the body is in the plan, and ``cast_beams`` casts, which say how high it is; end points of floors pull the
+    body down. Where no gravity is measured that is ``endpoint``."""
     weight_beams: int = 180
     """Beams of a step that are weighed, spread over it. Neighbours repeat each other, so fewer than go into the map."""
     endpoint_effective_beams: float = 60.0
@@ -63,6 +65,8 @@ class GridFilterConfig:
     """Casting: σ of a measured range about the expected one [m], a voxel's edge."""
     cast_clip: float = 3.0
     """Casting: standard deviations beyond which a beam is no worse."""
+    cast_beams: int = 60
+    """Beams of a step that are cast beside the end points of upright surfaces, spread over it."""
     young: int = 12
     """A map of fewer scans than this says little yet, and what it says is not to be held against maps that know more:
     its particle takes the mean evidence of the older ones. 12 are 5 s, after which a spun scanner has seen all round
@@ -93,6 +97,7 @@ class GridFilterConfig:
         for name, least in (
             ("particles", 1),
             ("weight_beams", 1),
+            ("cast_beams", 1),
             ("threads", 1),
             ("map_beams", 0),
             ("young", 0),
@@ -110,22 +115,29 @@ class GridFilterConfig:
         for name in ("motion_scale", *walks):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number ≥ 0")
-        if self.likelihood not in ("endpoint", "cast"):
-            raise ConfigError(f"likelihood = {self.likelihood!r}; known: endpoint, cast")
+        if self.likelihood not in ("endpoint", "cast", "upright"):
+            raise ConfigError(f"likelihood = {self.likelihood!r}; known: endpoint, cast, upright")
         self.beam_model()
-        self.likelihood_of(self.weight_beams)
+        self.by_end_points(self.weight_beams)
+        self.by_casting(self.weight_beams)
 
     def beam_model(self) -> BeamModel:
         """What a beam says of a voxel."""
         return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
 
-    def likelihood_of(self, beams: int) -> EndpointLikelihood | CastLikelihood:
-        """The likelihood of a step of which ``beams`` are weighed."""
-        cast = self.likelihood == "cast"
-        effective = self.cast_effective_beams if cast else self.endpoint_effective_beams
-        exponent = min(effective / max(beams, 1), self.greatest_exponent)
-        if cast:
-            return CastLikelihood(exponent=exponent, sigma=self.cast_sigma, clip=self.cast_clip)
+    def by_end_points(self, beams: int) -> EndpointLikelihood:
+        """The likelihood of a step of which the end points of so many beams are weighed."""
         return EndpointLikelihood(
-            exponent=exponent, floor=self.floor, interpolation=self.interpolation, unknown=self.unknown
+            exponent=self._exponent(self.endpoint_effective_beams, beams),
+            floor=self.floor,
+            interpolation=self.interpolation,
+            unknown=self.unknown,
         )
+
+    def by_casting(self, beams: int) -> CastLikelihood:
+        """The likelihood of a step of which so many beams are cast."""
+        exponent = self._exponent(self.cast_effective_beams, beams)
+        return CastLikelihood(exponent=exponent, sigma=self.cast_sigma, clip=self.cast_clip)
+
+    def _exponent(self, effective: float, beams: int) -> float:
+        return min(effective / max(beams, 1), self.greatest_exponent)

@@ -23,13 +23,14 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.random import SeedTree
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.likelihood import log_weights
+from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport
 from graphslam.frontends.grid.ancestry import Ancestry
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
 from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam.frontends.grid.upright import upright_beams
 from graphslam.frontends.grid.weights import informed, inherit, spread
 
 if TYPE_CHECKING:
@@ -193,6 +194,8 @@ class GridFilter:
             scores=np.zeros(n),
         )
         self._level(first)
+        wanted = config.likelihood == "upright" and steps.tilt is not None
+        self.upright = upright_beams(steps) if wanted else None
         self.ancestry = Ancestry(n, width, prune_every=prune_every)
 
     def __len__(self) -> int:
@@ -242,20 +245,22 @@ class GridFilter:
         with self._timed("weigh"):
             p, config = self.particles, self.config
             gains = np.zeros(len(p))
-            points, origins, returns = self.weighed_beams(k)
+            points, origins, returns = self.steps.scan(k)
+            weighed = self.weighed_beams(k)
             told = informed(p.ages, config.young)
             rows = np.flatnonzero(told)
-            if len(points) and len(rows):
-                gains[rows] = log_weights(
-                    [p.grids[i] for i in rows],
-                    p.poses[rows],
-                    points,
-                    config.likelihood_of(len(points)),
-                    origin=origins,
-                    max_range=self.steps.max_range,
-                    returns=returns,
-                    threads=config.threads,
-                )
+            if weighed and len(rows):
+                for beams, likelihood in weighed:
+                    gains[rows] += log_weights(
+                        [p.grids[i] for i in rows],
+                        p.poses[rows],
+                        points[beams],
+                        likelihood,
+                        origin=origins[beams],
+                        max_range=self.steps.max_range,
+                        returns=returns[beams],
+                        threads=config.threads,
+                    )
                 gains = inherit(gains, p.log_weights, told)
                 p.gain(gains)
             return gains
@@ -326,15 +331,22 @@ class GridFilter:
 
     # --- what they are made of -------------------------------------------------------------------------------
 
-    def weighed_beams(self, k: int) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Points, origins and returns of step k's beams that are weighed.
+    def weighed_beams(self, k: int) -> list[tuple[Ints, EndpointLikelihood | CastLikelihood]]:
+        """Beams of step k by which particles are weighed, and how; nothing of a step without any.
 
         End points are those of beams that met something; casting also compares beams that met nothing.
         """
-        points, origins, returns = self.steps.scan(k)
-        rows = np.arange(len(points)) if self.config.likelihood == "cast" else np.flatnonzero(returns)
-        rows = rows[spread(len(rows), self.config.weight_beams)]
-        return points[rows], origins[rows], returns[rows]
+        c, returns = self.config, self.steps.scan(k)[2]
+        out: list[tuple[Ints, EndpointLikelihood | CastLikelihood]] = []
+        if c.likelihood != "cast":
+            first = int(self.steps.offsets[k])
+            ends = returns if self.upright is None else self.upright[first : first + len(returns)]
+            rows = _some(np.flatnonzero(ends), c.weight_beams)
+            out.append((rows, c.by_end_points(len(rows))))
+        if c.likelihood == "cast" or self.upright is not None:
+            rows = spread(len(returns), c.weight_beams if self.upright is None else c.cast_beams)
+            out.append((rows, c.by_casting(len(rows))))
+        return [(rows, likelihood) for rows, likelihood in out if len(rows)]
 
     def _level(self, k: int) -> None:
         """Roll and pitch of all particles from gravity at step k, each with its error taken off."""
@@ -354,3 +366,8 @@ class GridFilter:
             yield
         finally:
             self.tally.seconds[part] += time.perf_counter() - begin
+
+
+def _some(rows: Ints, most: int) -> Ints:
+    """At most so many of some rows, evenly spread."""
+    return rows[spread(len(rows), most)]

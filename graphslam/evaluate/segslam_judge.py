@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array, arc_length, wrap_angle
 from graphslam.core.poses import group_of, heading_of, level
+from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
@@ -84,6 +85,51 @@ def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None)
         aligned=ate(moved, reference, alignment="se").statistics.rmse,
         height=float(np.sqrt(np.mean((est[:, 2] - true[:, 2]) ** 2))) if group.dim == 3 else 0.0,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Climbs:
+    """Climbs along a path against the true ones, a row for every ramp of the way.
+
+    Parameters
+    ----------
+    true : (m,)
+        Of the ramps [m]; negative where they lead down.
+    error : (m,)
+        By how much the path climbs more, as a share of the true one: above 0 where it is too steep, up or down.
+    """
+
+    true: Array
+    error: Array
+
+
+def climbs(path: Array, truth: Array, *, slope: float = 0.04, least: float = 1.0) -> Climbs:
+    """Climbs of the ramps of a way.
+
+    Parameters
+    ----------
+    path, truth : (n, 7)
+        Poses at the same stamps.
+    slope : float
+        A ramp is a stretch that is everywhere steeper, up or down.
+    least : float
+        Shorter climbs are left out [m].
+    """
+    est, true = relative(path)[:, 2], relative(truth)
+    way = arc_length(true[:, :3])
+    driven = np.gradient(way)
+    steep = np.zeros(len(way))
+    moving = driven > 1e-3
+    steep[moving] = np.gradient(true[:, 2])[moving] / driven[moving]
+    side = np.where(np.abs(steep) > slope, np.sign(steep), 0.0)
+    edges = np.flatnonzero(np.diff(side, prepend=np.nan, append=np.nan))
+    found = []
+    for a, b in zip(edges[:-1], edges[1:] - 1):
+        rise = true[b, 2] - true[a, 2]
+        if side[a] != 0.0 and abs(rise) >= least:
+            found.append((rise, (est[b] - est[a]) / rise - 1.0))
+    rows = np.array(found).reshape(-1, 2)
+    return Climbs(rows[:, 0], rows[:, 1])
 
 
 # --- re-entries ----------------------------------------------------------------------------------------------
@@ -249,12 +295,15 @@ class ExitErrors:
     default, matched, stated : Nees
         Particles and drift model; the paper's moment matching; particles and the drift that the motion's noise states
         (as ``default`` where the steps do not know it).
+    blocks : mapping of str to Nees
+        ``default`` by block: ``heading``, ``plan``, and in space ``height``.
     """
 
     lengths: Array
     default: Nees
     matched: Nees
     stated: Nees
+    blocks: Mapping[str, Nees]
 
 
 def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> ExitErrors:
@@ -281,16 +330,16 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     true = g.between(ends[t.start[chain]], ends[t.end[chain]])
     # roll and pitch of level frames are exact by definition
     components = (2, 3, 4, 5) if segmap.gravity else None
-    scores = [
-        exit_nees(
-            np.array([s.exit_pose for s in m]),
-            np.array([s.exit_covariance for s in m]),
-            true,
-            components=components,
-        )
-        for m in made
-    ]
-    return ExitErrors(segmap.path_length[t.end[chain]] - segmap.path_length[t.start[chain]], *scores)
+
+    def score(made: Sequence[Submap], components: Sequence[int] | None) -> Nees:
+        poses, covariances = (np.array([getattr(s, f"exit_{what}") for s in made]) for what in ("pose", "covariance"))
+        return exit_nees(poses, covariances, true, components=components)
+
+    blocks = {"heading": (2,), "plan": (0, 1)} if g.dim == 2 else {"heading": (2,), "plan": (3, 4), "height": (5,)}
+    scores = [score(m, components) for m in made]
+    lengths = segmap.path_length[t.end[chain]] - segmap.path_length[t.start[chain]]
+    by_block = {name: score(made[0], of) for name, of in blocks.items()}
+    return ExitErrors(lengths, scores[0], scores[1], scores[2], by_block)
 
 
 def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None) -> EvidenceGrid:

@@ -16,7 +16,7 @@ import numpy as np
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.studies.segmap_trial import GraphTrial, GraphTrialConfig
-from graphslam.app.studies.segslam_trial import Outcome
+from graphslam.app.studies.segslam_trial import GridTrialConfig, Outcome
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.random import SeedTree
@@ -75,10 +75,15 @@ def run_refinement_trial(config: RefinementTrialConfig, seed: int) -> list[Measu
     with one_blas_thread():
         grid = config.graph.grid
         if config.drawn:
-            rng = SeedTree(seed).child("robot").generator()
-            found = {k: float(np.exp(rng.uniform(np.log(a), np.log(b)))) for k, (a, b) in ROBOTS.items()}
-            grid = replace(grid, crawler=crawler_preset("light", **found), layout=str(rng.choice(list("ABCD"))))
+            grid = drawn_garage(grid, seed)
         return list(RefinementTrial(grid, seed, graph=replace(config.graph, grid=grid), study=config).run())
+
+
+def drawn_garage(config: GridTrialConfig, seed: int) -> GridTrialConfig:
+    """With the robot and the layout that a seed draws."""
+    rng = SeedTree(seed).child("robot").generator()
+    found = {k: float(np.exp(rng.uniform(np.log(a), np.log(b)))) for k, (a, b) in ROBOTS.items()}
+    return replace(config, crawler=crawler_preset("light", **found), layout=str(rng.choice(list("ABCD"))))
 
 
 @dataclass
@@ -133,6 +138,7 @@ class RefinementTrial(GraphTrial):
         yield Measurement(kind, "height_rmse", e.height)
         path, truth = Trajectory(scans.times, found.poses), Trajectory(scans.times, true)
         yield Measurement(kind, "heading_rms", heading_error(path, truth))
+        yield Measurement(kind, "rounds", len(found.rounds))
         yield Measurement(kind, "agreement", found.agreement[1])
         yield Measurement(kind, "agreement_start", found.agreement[0])
         yield Measurement(kind, "left_apart", len(found.refused))

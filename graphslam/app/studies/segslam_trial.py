@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Literal
 
 import numpy as np
@@ -20,10 +20,13 @@ from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.worlds import mesh_world
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
+from graphslam.evaluate.refined import heading_error
+from graphslam.evaluate.trajectory_error import ate
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
 from graphslam.frontends.grid.rbpf_grid import RbpfResult, run_rbpf
@@ -42,7 +45,7 @@ from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.world import World
 
-Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path"]
+Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path", "climbs"]
 DEAD_RECKONING = "dead-reckoning"
 PATH_POINTS = 100
 """Points of a path that are kept for the picture."""
@@ -182,14 +185,14 @@ class GridTrial:
         settings = self.config.filter if family == "rbpf" else self.config.segslam_filter
         filter = replace(settings, particles=particles)
         seed = SeedTree(self.seed).child("filter", family)
-        begin = perf_counter()
+        begin, spent = perf_counter(), process_time()
         if family == "rbpf":
             rbpf = run_rbpf(self.steps, filter, seed)
-            whole = perf_counter() - begin
-            return Outcome(rbpf.trajectory(), rbpf.final_pose, {**rbpf.tally.seconds, "total": whole}, rbpf)
+            whole = {"total": perf_counter() - begin, "cpu": process_time() - spent}
+            return Outcome(rbpf.trajectory(), rbpf.final_pose, {**rbpf.tally.seconds, **whole}, rbpf)
         segslam = run_segslam(self.steps, filter, self.config.segslam, seed)
-        whole = perf_counter() - begin
-        seconds = {**segslam.seconds, "total": whole}
+        whole = {"total": perf_counter() - begin, "cpu": process_time() - spent}
+        seconds = {**segslam.seconds, **whole}
         seconds["step_first_quarter"], seconds["step_last_quarter"] = judge.quarters(segslam.step_seconds)
         return Outcome(segslam.trajectory(), segslam.final_pose, seconds, segslam)
 
@@ -212,6 +215,8 @@ class GridTrial:
             yield Measurement(name, "maps_megabytes", result.used_bytes / 1e6)
         if "legs" in wanted:
             yield Measurement(name, "leg_angle", self.leg_angle(outcome.path.poses))
+        if "climbs" in wanted:
+            yield from self._climbs(name, outcome.path)
         if "entropy" in wanted:
             yield from self._entropy(name, outcome)
         if "loops" in wanted:
@@ -252,7 +257,22 @@ class GridTrial:
             yield Measurement(name, "exit_nees_stated", float(e.stated.values[k]), k)
             for axis, error in zip(("yaw", "x", "y", "z"), e.default.errors[k]):
                 yield Measurement(name, f"exit_{axis}", float(error), k)
+            for block, of in e.blocks.items():
+                yield Measurement(name, f"exit_nees_{block}", float(of.values[k]) / of.dof, k)
         yield Measurement(name, "exit_dof", e.default.dof)
+
+    def _climbs(self, name: str, path: Trajectory) -> Iterator[Measurement]:
+        """Climbs of the ramps up and down apart, mean error of a run; what is left of the path seen from above."""
+        found = judge.climbs(path.poses, self.truth)
+        for way, of in (("up", found.true > 0), ("down", found.true < 0)):
+            if of.any():
+                yield Measurement(name, f"climb_{way}", float(found.error[of].mean()))
+                yield Measurement(name, f"climb_{way}_size", float(np.abs(found.error[of]).mean()))
+        est, true = (judge.relative(poses) for poses in (path.poses, self.truth))
+        yield Measurement(name, "height_std", float(np.std(est[:, 2] - true[:, 2])))
+        flat = [Trajectory(path.times, np.column_stack([p[:, :2], heading_of(p)])) for p in (est, true)]
+        yield Measurement(name, "ate_plan", ate(flat[0], flat[1], alignment="se").statistics.rmse)
+        yield Measurement(name, "heading_rms", heading_error(path, Trajectory(path.times, self.truth)))
 
     def _entropy(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
         """Entropy of the scans fused along map samples, or along particles' own paths, the best first."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -52,7 +50,7 @@ def test_models_are_those_of_the_configuration() -> None:
                          cast_sigma=0.3, cast_clip=2.0, cast_effective_beams=3.0, greatest_exponent=0.5)  # fmt: skip
     model = c.beam_model()
     assert (model.hit, model.miss, model.clamp) == (0.8, 0.3, (0.05, 0.99))
-    end, cast = c.likelihood_of(120), replace(c, likelihood="cast").likelihood_of(30)
+    end, cast = c.by_end_points(120), c.by_casting(30)
     assert (end.exponent, end.floor, end.unknown, end.interpolation) == (0.5, 0.11, 0.2, "nearest")
     assert (cast.exponent, cast.sigma, cast.clip) == (0.1, 0.3, 2.0)
     GridFilterConfig(particles=1, weight_beams=1, threads=1, map_beams=0, young=0, lift=1.0, ess_fraction=1.0)
