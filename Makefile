@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 BASE   := $(VENV)/.base
+DOCS   := $(VENV)/.docs
 STAMP  := $(VENV)/.ready
 EXTRAS ?= dev,notebooks
 # Bytecode of everything installed is 0.2 GB, most of it never loaded; Python writes what it does load.
@@ -14,7 +15,7 @@ WORKERS ?= 2
 export NUMBA_THREADING_LAYER ?= workqueue
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup demo test lint types bench clean
+.PHONY: setup demo test docs lint types bench clean
 .DEFAULT_GOAL := demo
 
 setup: $(STAMP)
@@ -34,11 +35,20 @@ $(STAMP): $(BASE)
 	@touch $(STAMP)
 
 demo: $(BASE)
-	$(BIN)/graphslam demo --out demo-run
+	$(BIN)/graphslam demo --out demo-run $(DEMO)
 	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# The documentation site, build/site/index.html; a warning is an error.
+$(DOCS): $(BASE)
+	@$(PIP) --editable '.[docs]'
+	@touch $(DOCS)
+
+docs: $(DOCS)
+	NO_MKDOCS_2_WARNING=1 PYTHONPATH=. $(BIN)/mkdocs build --quiet --strict
+	@echo "look at build/site/index.html"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -14,40 +14,7 @@ from graphslam.backend.config import BackEndConfig
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [
-    "association-ambiguity.md",
-    "calibration.md",
-    "campus.md",
-    "combined-slam.md",
-    "concepts.md",
-    "evidence-grids.md",
-    "faults.md",
-    "gnss.md",
-    "how-to.md",
-    "imu.md",
-    "install.md",
-    "joiners.md",
-    "limits.md",
-    "loops.md",
-    "maps.md",
-    "mrclam.md",
-    "plaza.md",
-    "pose-graphs.md",
-    "refinement-recorded.md",
-    "refinement.md",
-    "registration.md",
-    "report.md",
-    "robust.md",
-    "scan-window.md",
-    "segmap-graph.md",
-    "segslam-recorded.md",
-    "segslam.md",
-    "simulated-robots.md",
-    "skeleton.md",
-    "steps.md",
-    "without-truth.md",
-    "your-log.md",
-]
+PAGES = sorted(p.name for p in (ROOT / "docs").glob("*.md"))
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 every_page = pytest.mark.parametrize("name", PAGES)
 
@@ -83,6 +50,7 @@ def test_links_lead_somewhere(name: str) -> None:
         "joiners.md",
         "maps.md",
         "registration.md",
+        "quick-start.md",
         "simulated-robots.md",
         "skeleton.md",
         "steps.md",
@@ -157,3 +125,34 @@ def test_run_folder_holds_the_files_that_the_how_to_names(tmp_path: Path) -> Non
     run = gs.run(log, out=tmp_path / "run", progress=False, solver="batch", config=options)
     there = {p.name for p in run.folder.iterdir() if p.is_file() and p.name != ".lock"}
     assert named == there
+
+
+def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_path: Path) -> None:
+    """As they stand there, but for time: the demo is its quick form, the tests are only named, and the environment,
+    with the package and its compiled kernels, is the one that runs this test."""
+    clone, venv = tmp_path / "clone", tmp_path / "clone" / ".venv"
+    subprocess.run(["git", "clone", "-q", "--no-local", str(ROOT), str(clone)], check=True)
+    for name in subprocess.check_output(["git", "ls-files", "-mo", "--exclude-standard"], cwd=ROOT, text=True).split(
+        "\n"
+    ):
+        if name and (ROOT / name).is_file():  # what is not committed yet
+            (clone / name).parent.mkdir(parents=True, exist_ok=True)
+            (clone / name).write_bytes((ROOT / name).read_bytes())
+    venv.mkdir()
+    (venv / "bin").symlink_to(Path(sys.executable).parent)
+    for stamp in (".base", ".ready"):
+        (venv / stamp).touch()
+    text = (clone / "README.md").read_text(encoding="utf-8")
+    commands = "\n".join(re.findall(r"^```sh\n(.*?)^```$", text, re.M | re.S))
+    assert commands.splitlines()[0].startswith("make demo ")
+    commands = commands.replace("make demo ", 'make demo DEMO="--preset quick" ').replace("make test ", "make -n test ")
+    (python,) = BLOCK.findall(text)
+    script = f"set -e\n{commands}\npython - <<'END'\n{python}\nEND\n"
+    # PYTHONSAFEPATH: `python -` would take the clone's package, whose kernels nobody has compiled
+    environment = {**os.environ, "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=clone, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
+    for made in ("demo-run/report.html", "runs/field/report.html", "runs/field/map.kml"):
+        assert (clone / made).is_file(), made
