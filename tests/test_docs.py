@@ -156,3 +156,9 @@ def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_pat
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
     for made in ("demo-run/report.html", "runs/field/report.html", "runs/field/map.kml"):
         assert (clone / made).is_file(), made
+
+
+@every_page
+def test_page_is_in_the_table_of_contents_of_the_site(name: str) -> None:
+    """Else `make docs` fails."""
+    assert re.search(rf"\b{re.escape(name)}$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M)
