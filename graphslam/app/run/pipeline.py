@@ -400,8 +400,9 @@ def _finished(
 def again_judged(run: Run, attempts: Mapping[str, Any]) -> Run:
     """A run that is one of two, with what became of the other in its report and verdict."""
     report = {**run.report, "map_attempts": dict(attempts)}
-    lines = verdict(Figures(report, dict(zip(run.metrics["key"], run.metrics["value"])), run.events))
-    return replace(run, report={**report, "verdict": verdict_json(lines)})
+    figures = Figures(report, dict(zip(run.metrics["key"], run.metrics["value"])), run.events)
+    lines = verdict(figures)
+    return replace(run, report={**report, "verdict": verdict_json(summary(figures, lines), lines)})
 
 
 def gps_stream(log: SensorLog) -> Gps | None:

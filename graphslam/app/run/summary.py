@@ -65,7 +65,7 @@ ADVICE: dict[str, str] = {
     "state": "solve it again from this graph (`graphslam solve RUN/graph.g2o --solver lm`)",
     "refine-motion": "look for a place taken for another one, or leave the refinement out (--set refine.use=false)",
     "input-better": "take the path of the odometry, or state its noise as small as it is",
-    "passes": "look where walls stand twice in the map, and try another seed (--seed 1)",
+    "passes*": "look where walls stand twice in the map, and try another seed (--seed 1)",
     "session": "check whether the sessions are of one place",
     "uneven-motion": "give the IMU of the lidar, or move it more steadily",
     "points-without-times": "give the points their times within the scan",
