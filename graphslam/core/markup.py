@@ -1,34 +1,60 @@
-"""HTML that is safe by its making: whatever is not markup yet is escaped where it becomes markup.
+"""HTML that is safe by its making: templates of Jinja2 with autoescape, so that all that is not markup yet is escaped.
 
 Pages and the tables that notebooks show are made with it, and with nothing else.
 """
 
 from __future__ import annotations
 
-import html
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
-_VOID = frozenset({"img", "meta", "br"})
+from markupsafe import Markup
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 # What HTML allows in no text at all: control characters, halves of surrogate pairs, non-characters.
 _UNFIT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
 NOTHING = "–"
+_ELEMENT = (
+    '<{{ tag }}{% for k, v in attributes.items() %} {{ k }}="{{ v }}"{% endfor %}>'
+    "{% if not void %}{% for c in children %}{{ c }}{% endfor %}</{{ tag }}>{% endif %}"
+)
+_TABLE = """\
+<div class="wide"><table{% if class_ %} class="{{ class_ }}"{% endif %}>{% if head %}<thead><tr>{% for h in head %}\
+<th scope="col">{{ h }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for r in rows %}\
+<tr{% if r.class_ %} class="{{ r.class_ }}"{% endif %}{% for k, v in r.data.items() %} data-{{ k }}="{{ v }}"\
+{% endfor %}>{% if r.name is not none %}<th scope="row">{{ r.name }}</th>{% endif %}{% for c in r.cells %}\
+<td{% if c.right %} class="n"{% endif %}>{{ c.text }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>"""
 
 
-class Markup(str):
-    """Text that is HTML already; everything else is text."""
+@cache
+def environment(package: str | None = None) -> Environment:
+    """The template engine, with autoescape; of a package with its folder ``templates``."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    __slots__ = ()
+    loader = None if package is None else PackageLoader(package)
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=False)
+
+
+@cache
+def _template(source: str) -> Any:
+    return environment().from_string(source)
+
+
+def plain(value: Any) -> str:
+    """The value as text that a page may hold: characters that none may hold become ``�``."""
+    return value if isinstance(value, Markup) else _UNFIT.sub("\ufffd", str(value))
 
 
 def escape(value: Any) -> Markup:
-    """The value as text of a page; markup stays as it is. Characters that no page may hold become ``�``."""
-    if isinstance(value, Markup):
-        return value
-    return Markup(html.escape(_UNFIT.sub("\ufffd", str(value)), quote=True))
+    """The value as text of a page; markup stays as it is."""
+    return value if isinstance(value, Markup) else Markup.escape(plain(value))
 
 
 def element(tag: str, *children: Any, **attributes: Any) -> Markup:
@@ -37,17 +63,18 @@ def element(tag: str, *children: Any, **attributes: Any) -> Markup:
     Examples
     --------
     >>> element("p", "a < b", class_="note")
-    '<p class="note">a &lt; b</p>'
+    Markup('<p class="note">a &lt; b</p>')
     """
-    said = "".join(f' {k.rstrip("_")}="{escape(v)}"' for k, v in attributes.items() if v is not None and v != "")
-    if tag in _VOID:
-        return Markup(f"<{tag}{said}>")
-    return Markup(f"<{tag}{said}>{join(children)}</{tag}>")
+    said = {k.rstrip("_"): plain(v) for k, v in attributes.items() if v is not None and v != ""}
+    inside = [plain(c) for c in children if c is not None]
+    return Markup(
+        _template(_ELEMENT).render(tag=tag, attributes=said, children=inside, void=tag in ("img", "meta", "br"))
+    )
 
 
 def join(parts: Iterable[Any], between: str = "") -> Markup:
     """Parts after each other, each escaped unless it is markup."""
-    return Markup(escape(between).join(escape(p) for p in parts if p is not None))
+    return Markup(between).join(escape(p) for p in parts if p is not None)
 
 
 def figure_text(value: Any) -> str:
@@ -74,10 +101,11 @@ def is_figure(value: Any) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a table with a class of its own."""
+    """A row of a table with a class and data of its own."""
 
     cells: Mapping[str, Any]
     class_: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 def table(
@@ -94,29 +122,23 @@ def table(
         Of the table.
     """
     names = columns if isinstance(columns, Mapping) else {c: c for c in columns}
-    head = element("tr", *(element("th", heading, scope="col") for heading in names.values()))
     body = []
     for r in rows:
         row = r if isinstance(r, Row) else Row(r)
-        cells = (row.cells.get(k) for k in names)
-        body.append(element("tr", *(_cell(v) for v in cells), class_=row.class_))
-    return element(
-        "div",
-        element("table", element("thead", head), element("tbody", join(body, "\n")), class_=class_),
-        class_="wide",
-    )
+        cells = [_cell(row.cells.get(k)) for k in names]
+        body.append({"class_": plain(row.class_), "data": row.data, "name": None, "cells": cells})
+    head = [plain(h) for h in names.values()]
+    return Markup(_template(_TABLE).render(class_=class_, head=head, rows=body))
 
 
-def _cell(value: Any) -> Markup:
-    if isinstance(value, Markup):
-        return element("td", value)
-    return element("td", figure_text(value), class_="n" if is_figure(value) else None)
+def _cell(value: Any) -> dict[str, Any]:
+    return {"text": plain(figure_text(value) if not isinstance(value, Markup) else value), "right": is_figure(value)}
 
 
 def pairs(values: Mapping[str, Any]) -> Markup:
     """Names and values, one pair a line."""
-    rows = [element("tr", element("th", k, scope="row"), _cell(v)) for k, v in values.items()]
-    return element("div", element("table", element("tbody", join(rows, "\n"))), class_="wide")
+    rows = [{"class_": "", "data": {}, "name": plain(k), "cells": [_cell(v)]} for k, v in values.items()]
+    return Markup(_template(_TABLE).render(class_="", head=[], rows=rows))
 
 
 def items(lines: Iterable[Any]) -> Markup:

@@ -20,6 +20,7 @@ import pytest
 
 import graphslam
 import graphslam.frontends
+from graphslam.app.report.report import Report
 from graphslam.app.run.run import Run
 from graphslam.app.run.without_truth import WithoutTruth
 from graphslam.app.sessions.merged_map import MergedMap
@@ -187,6 +188,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     "graphslam.app.studies.study.Study": a_study,
     "graphslam.app.sessions.merged_map.MergedMap": a_merge,
     "graphslam.app.run.run.Run": a_run,
+    "graphslam.app.report.report.Report": lambda _: Report(f"<html><body>{EVIL}</body></html>", "run", {}),
 }
 # texts of these stand in the code, not in a file: their HTML has no place for a foreign one
 OWN_WORDS = {

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
+from pathlib import Path
 
+VIEWER = Path(__file__).resolve().parents[2] / "graphslam" / "app" / "report" / "templates" / "viewer.js"
 VOID = {"img", "meta", "br"}
 
 
@@ -38,6 +41,7 @@ class Page(HTMLParser):
         self.items: dict[str, list[str]] = {}
         self.verdict: list[tuple[str, str]] = []
         self.text = ""
+        self.scripts: list[tuple[dict[str, str], str]] = []
         self.headline = ""
         self._headline = False
         self._section = ""
@@ -53,6 +57,8 @@ class Page(HTMLParser):
         self.attributes |= set(values)
         if tag not in VOID:
             self.open.append(tag)
+        if tag == "script":
+            self.scripts.append((values, ""))
         if "href" in values:
             self.links.append(values["href"])
         if "src" in values:
@@ -91,6 +97,9 @@ class Page(HTMLParser):
             self._section = ""
 
     def handle_data(self, data: str) -> None:
+        if self.open[-1:] == ["script"]:
+            self.scripts[-1] = (self.scripts[-1][0], self.scripts[-1][1] + data)
+            return
         self.text += data
         if self._headline:
             self.headline += data
@@ -109,8 +118,15 @@ class Page(HTMLParser):
         raise AssertionError(f"no table with {columns} in {section}: {[t.rows[:1] for t in self.tables]}")
 
     def check_alone(self) -> None:
-        """Nothing outside the page is asked for, and nothing in it runs."""
-        assert not self.tags & {"script", "link", "iframe", "object", "embed", "base", "form", "video", "audio"}
+        """Nothing outside the page is asked for, and nothing in it runs but the viewer of the map."""
+        assert not self.tags & {"link", "iframe", "object", "embed", "base", "form", "video", "audio"}
+        viewer = [code for values, code in self.scripts if not values]
+        assert viewer in ([], [VIEWER.read_text(encoding="utf-8")])
+        data = [code for values, code in self.scripts if values == {"type": "application/json", "id": "scene"}]
+        assert len(data) == len(viewer)
+        assert len(self.scripts) == 2 * len(viewer)
+        for code in data:
+            json.loads(code)
         assert not {a for a in self.attributes if a.startswith("on")}
         assert all(x.startswith("#") and x[1:] in self.sections for x in self.links), self.links
         assert all(x.startswith("data:image/png;base64,") for x in self.sources)

@@ -69,7 +69,7 @@ def _rank(row: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _ledger(rows: list[dict[str, Any]]) -> Markup:
-    return table([Row(r, str(r["verdict"])) for r in rows], COLUMNS, class_="loops")
+    return table([Row(r, str(r["verdict"]), {"loop": r["loop"]}) for r in rows], COLUMNS, class_="loops")
 
 
 def _history(folder: ReportFolder) -> list[Markup]:

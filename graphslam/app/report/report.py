@@ -1,17 +1,18 @@
-"""``report.html``: what a run did, decided and measured, on one page that needs no network, script or other file."""
+"""``report.html``: what a run did, decided and measured, on one page that needs no network and no other file."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.app.folders.generations import Generation, consistent, name_inside, new_generation
 from graphslam.app.report.figures import figures
 from graphslam.app.report.folder import Kind, read_folder
 from graphslam.app.report.loops import hypotheses, loops
-from graphslam.app.report.markup import note, page
+from graphslam.app.report.markup import page
 from graphslam.app.report.refinement import refinement
+from graphslam.app.report.scene import scene
 from graphslam.app.report.sections import (
     events,
     evidence,
@@ -25,7 +26,7 @@ from graphslam.app.report.sections import (
 )
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
-from graphslam.core.markup import element, join
+from graphslam.core.markup import element, plain
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +69,10 @@ class Report:
     kind: Kind
     problems: dict[str, str]
 
+    def _repr_html_(self) -> str:
+        """The page inside a notebook, apart from the notebook's own style and scripts."""
+        return element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
+
 
 def make_report(folder: str | Path) -> Report:
     """The page of a run folder or a merged folder, finished or not.
@@ -84,14 +89,15 @@ def make_report(folder: str | Path) -> Report:
 
 def _page(home: Path, root: Path) -> Report:
     found = read_folder(home, root)
-    title = f"{_TITLES[found.kind]}: {found.name}"
-    head = [element("h1", title), verdict_lines(found)]
-    links = element("nav", *(element("a", name, href=f"#{name}") for name in _PARTS))
-    made = [part(found) for part in _PARTS.values()]
-    foot = note(
-        "Written by graphslam from the files of the folder; nothing in it was measured anew but its NEES by submap."
+    said, lines = verdict_lines(found)
+    shown = scene(found)
+    html = page(
+        title=plain(f"{_TITLES[found.kind]}: {found.name}"),
+        headline=said,
+        findings=[replace(f, text=plain(f.text)) for f in lines],
+        scene=shown,
+        parts={name: part(found) for name, part in _PARTS.items()},
     )
-    html = page(title, [join(head, "\n"), links, *made, foot])
     return Report(html, found.kind, dict(found.problems))
 
 

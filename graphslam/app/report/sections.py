@@ -293,20 +293,13 @@ def figures_of(folder: ReportFolder) -> Figures:
     return Figures(folder.report, folder.values(), folder.events or [], folder.sessions)
 
 
-def verdict_lines(folder: ReportFolder) -> Markup:
-    """A headline, and lines with a colour each; the words say the same as the colours."""
+def verdict_lines(folder: ReportFolder) -> tuple[Finding, list[Finding]]:
+    """First line of the verdict, and the others."""
     if folder.kind == "interrupted":
         found = interrupted(folder)
-        said = headline(found, [stopped(folder)])
-    else:
-        found = verdict(figures_of(folder))
-        said = summary(figures_of(folder), found)
-    return join(
-        [
-            element("p", said.text, class_=f"headline {said.level}"),
-            element("ul", *(element("li", f.text, class_=f.level) for f in found), class_="verdict"),
-        ]
-    )
+        return headline(found, [stopped(folder)]), found
+    found = verdict(figures_of(folder))
+    return summary(figures_of(folder), found), found
 
 
 def interrupted(folder: ReportFolder) -> list[Finding]:
