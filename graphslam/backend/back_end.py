@@ -15,6 +15,7 @@ from graphslam.association.identity import doubtful_identities
 from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
+from graphslam.backend.fix_errors import fit_fix_errors
 from graphslam.backend.streams import FixPart, ImuPart, recentred
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
@@ -224,6 +225,8 @@ class BackEnd:
         if self.imu is not None:
             self.imu.tie(self.graph)
         recentred(self.graph, self.solver)
+        if self.graph.gps.config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
+            self.solver.solve_to_optimum()
         for _ in range(10):
             if not self.merge():
                 break

@@ -21,7 +21,7 @@ from graphslam.core.records import Gps
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.evaluate.without_truth import correlated_dof, two_sided
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
-from graphslam.graph.gps import arm_jacobian, datum_columns, lever_arm
+from graphslam.graph.gps import FixErrors, arm_jacobian, datum_columns, lever_arm
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from graphslam.graph.submap_node import SubmapNode
@@ -159,10 +159,13 @@ def gps_innovations(
     times, z = gps.times[found], gps.positions[found, :d] - graph.gps_origin
     node, arm = node[found], arm[found]
     n = len(times)
-    bias = _biases(graph, times, bias_sigma, segment_gap)
+    fitted = graph.gps.fitted
+    lasting = fitted is not None and fitted.bias_sigma > 0
+    bias = np.full(n, -1, dtype=np.int64) if lasting else _biases(graph, times, bias_sigma, segment_gap)
     own = (bias >= 0) & (bias < len(values.biases))
     predicted, by = antenna_terms(values.poses[node], values.datum, values.tilt, arm)
     predicted[own] += values.biases[bias[own]]
+    each = gps.noise[found][:, :d, :d] if sigma is None else np.tile(sigma**2 * np.eye(d), (n, 1, 1))
 
     # everything the innovations depend on: nodes, datum, tilt, biases, and what holds the points of a landmark submap's
     # path; the first base is fixed and has no column
@@ -179,11 +182,25 @@ def gps_innovations(
     needed = np.unique(np.concatenate([c for _, c, _ in parts]))
     needed = needed[needed >= 0]
     A = np.zeros((d * n, len(needed)))
+    between = np.zeros((n, d, n, d))
+    if fitted is not None and lasting:  # what is known of a bias between those of the used fixes
+        known, numbers = _used_biases(graph)
+        gain, left = _bridged(times, known, fitted)
+        U = np.linalg.cholesky(each / (0.5 * np.trace(each[:, :2, :2], axis1=1, axis2=2))[:, None, None])
+        between = np.einsum("ab,aij,bkj->aibk", left, U, U, optimize=True)
+        predicted += gain @ values.biases[numbers]
+        for k in range(n):
+            near = np.flatnonzero(np.abs(gain[k]) > 1e-9)
+            j = np.einsum("q,ij->iqj", gain[k, near], np.eye(d)).reshape(d, -1)
+            parts.append((slice(d * k, d * k + d), lay.at("bias", numbers[near]).ravel(), j))
+        needed = np.unique(np.concatenate([c for _, c, _ in parts]))
+        needed = needed[needed >= 0]
+        A = np.zeros((d * n, len(needed)))
     for rows, c, j in parts:
         free = np.flatnonzero(c >= 0)
         np.add.at(A, np.ix_(np.arange(rows.start, rows.stop), np.searchsorted(needed, c[free])), j[:, free])
     S = A @ graph.covariance().columns(needed) @ A.T
-    S = S.reshape(n, d, n, d)
+    S = S.reshape(n, d, n, d) + between
     new = (bias >= 0) & ~own
     if np.any(new):
         assert bias_sigma is not None
@@ -191,7 +208,8 @@ def gps_innovations(
         S += bias_sigma**2 * same[:, None, :, None] * np.eye(d)[None, :, None, :]
     arm_cov = arm_cov.reshape(len(found), d, len(found), d)[np.ix_(found, np.arange(d), found, np.arange(d))]
     S += np.einsum("aij,ajbk,bmk->aibm", turn, arm_cov, turn, optimize=True)
-    each = gps.noise[found][:, :d, :d] if sigma is None else np.tile(sigma**2 * np.eye(d), (n, 1, 1))
+    if fitted is not None:
+        each = fitted.white**2 * each
     S[np.arange(n), :, np.arange(n)] += each
     S = S.reshape(d * n, d * n)
     return GpsInnovations(
@@ -329,6 +347,25 @@ def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
         joint[j, :, :j] = np.einsum("ij,jkl->ikl", ad, joint[j - 1, :, :j])
         joint[:j, :, j] = joint[j, :, :j].transpose(1, 2, 0)
     return np.asarray(np.einsum("aij,ajbk,bmk->aibm", G, joint, G, optimize=True).reshape(d * q, d * q))
+
+
+def _used_biases(graph: PoseGraph) -> tuple[Array, Ints]:
+    """Times of the used fixes that have a bias, in order, and the numbers of the biases."""
+    used = sorted((r.time, r.bias) for r in graph.records.values() if isinstance(r, GpsRecord) and r.bias is not None)
+    return np.array([t for t, _ in used]), np.array([b for _, b in used], dtype=np.int64)
+
+
+def _bridged(times: Array, known: Array, errors: FixErrors) -> tuple[Array, Array]:
+    """A Gauss–Markov process at instants ``(n,)`` given its values at others ``(m,)``: gain, and covariance left."""
+
+    def alike(a: Array, b: Array) -> Array:
+        return np.asarray(errors.bias_sigma**2 * np.exp(-np.abs(a[:, None] - b) / errors.bias_time))
+
+    own = alike(known, known) + 1e-9 * errors.bias_sigma**2 * np.eye(len(known))
+    gain = np.linalg.solve(own, alike(known, times)).T
+    gain[np.abs(gain) < 1e-6] = 0.0  # only the neighbours tell
+    left = alike(times, times) - gain @ alike(known, times)
+    return np.asarray(gain), 0.5 * (left + left.T)
 
 
 def _biases(graph: PoseGraph, times: Array, bias_sigma: float | None, gap: float) -> Ints:

@@ -63,6 +63,13 @@ class JointCovariance:
         assert self._sparse is not None
         return self._sparse.inverse_block(c)
 
+    def solve(self, b: Array) -> Array:
+        """``A⁻¹ b`` of a vector ``(n,)``."""
+        if self._inverse_factor is not None:
+            return np.asarray(self._inverse_factor.T @ (self._inverse_factor @ b))
+        assert self._sparse is not None
+        return np.asarray(self._sparse.solve(b))
+
     def joint(self, names: Iterable[str]) -> Array:
         """Joint covariance of named variables in that order; the fixed ``x0`` contributes no columns."""
         return self.columns(self.layout.columns_of(names))

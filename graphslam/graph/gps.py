@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,9 @@ class GpsConfig:
         Gauss–Markov process whose σ at any time is ``bias_sigma``; a new one begins after a tenth of this time, and
         with each segment. Of fixes whose coordinates are not equally sure it has the shape of their covariance, and
         ``bias_sigma`` is its mean over east and north. Default: biases of segments know nothing of each other.
+    errors : "fitted" or "stated"
+        Fit how long the errors of the fixes last, and how large they are, to the log at the end of a run; wild fixes go
+        first (:mod:`graphslam.backend.fix_errors`). With a ``bias_sigma`` it is stated, and nothing is fitted.
     """
 
     robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
@@ -59,6 +62,7 @@ class GpsConfig:
     bias_sigma: float | None = None
     segment_gap: float = 2.0
     bias_time: float | None = None
+    errors: Literal["stated", "fitted"] = "fitted"
 
     def __post_init__(self) -> None:
         for name in ("sigma", "baseline", "bias_sigma", "segment_gap", "bias_time"):
@@ -74,6 +78,32 @@ class GpsConfig:
         return np.inf if self.bias_time is None else 0.1 * self.bias_time
 
 
+@dataclass(frozen=True, slots=True, kw_only=False)
+class FixErrors:
+    """Errors of fixes as a log tells them (:mod:`graphslam.backend.fix_errors`).
+
+    Parameters
+    ----------
+    bias_sigma : float
+        σ of the part that lasts, mean over east and north [m]; 0: none was believed.
+    bias_time : float
+        For which it lasts [s].
+    white : float
+        White part over the stated σ.
+    gain : float
+        Twice the log-likelihood over white noise.
+    wild, fixes : int
+        Fixes that were taken out as wild, of so many.
+    """
+
+    bias_sigma: float
+    bias_time: float
+    white: float
+    gain: float
+    wild: int = 0
+    fixes: int = 0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
     """A fix that has not become a factor yet."""
@@ -86,6 +116,13 @@ class Fix:
     config: GpsConfig
     uneven: Array | None = None
     """Covariance of its coordinates where they are not equally sure."""
+
+    @property
+    def alone(self) -> Array:
+        """Covariance as it is stated ``(dim, dim)``, in the GPS frame."""
+        if self.uneven is not None:
+            return self.uneven
+        return np.asarray((self.config.sigma or self.sigma) ** 2 * np.eye(len(self.lever)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,6 +252,7 @@ class GpsFixes:
         self.tied: list[TiedFix] = []  # for a datum
         self.last_time = -np.inf
         self.bias_begin = -np.inf  # of the last bias
+        self.fitted: FixErrors | None = None
 
     def add(self, gps: Gps, stream: str, config: GpsConfig | None) -> list[int]:
         """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_gps`."""
@@ -270,7 +308,7 @@ class GpsFixes:
             g.insert(
                 GpsRecord(
                     t.fix.factor_id, t.node, t.fix.time, t.arm, z, W, kernel, bias, tilt=tilt, uneven=uneven,
-                    point=t.point,
+                    point=t.point, stated=t.fix.alone,
                 )
             )  # fmt: skip
         self.tied = []
@@ -307,6 +345,7 @@ class GpsFixes:
                 g.ledger.refund(fid)
                 del g.records[fid]
             g.values.datum, g.values.biases = None, np.zeros((0, g.dim))
+            self.fitted = None
             g.revision += 1
 
     def _drop(self, dropped: Iterable[tuple[int, str]]) -> None:

@@ -183,11 +183,29 @@ def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
             f"Graduated non-convexity took out {taken.total()} factors as outliers: {counts}. Each is named in events."
         )
         out.append(Finding("look", "outliers", text))
+    out += [_fix_errors(e) for e in events if e.get("event") == "gps-errors"]
     for e in events:
         if e.get("event") == "beacon-not-placed":
             text = f"Beacon {e['beacon']} has no place after {e['distances']} distances: {e['why']}."
             out.append(Finding("look", "beacon-not-placed", text))
     return out
+
+
+def _fix_errors(e: Mapping[str, Any]) -> Finding:
+    """What the log told of the errors of its fixes, and what was made of it."""
+    text = ""
+    if e.get("wild"):
+        text = f"{e['wild']} of {e['fixes']} fixes lie wide of the map and of the others, and were taken out. "
+    if e.get("bias_sigma"):
+        text += (
+            f"Errors of the fixes last: a part of {e['bias_sigma']:.3g} m that fades over {e['bias_time']:.3g} s, and "
+            f"a white part of {e['white']:.2g} times the stated σ, are likelier than white noise by "
+            f"{e['gain'] / 2:.3g} nats. The graph has a bias for every fix (gps.errors=stated believes the receiver "
+            "instead)."
+        )
+    elif e.get("white", 1.0) > 1.0:
+        text += f"Errors of the fixes are {e['white']:.2g} times as large as stated, and are taken for so large."
+    return Finding("look", "gps-correlated" if e.get("bias_sigma") else "gps-errors", text.strip())
 
 
 def class_rows(figures: Figures) -> list[dict[str, Any]]:

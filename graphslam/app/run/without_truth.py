@@ -68,7 +68,12 @@ class WithoutTruth:
         out = of_systematic(sums([s.report for s in submaps]))
         for name, c in self.classes.items():
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
-            out += by_size(f"χ² of {name}", of, c.ratio, c.independent)
+            chi2, dof = c.chi2, c.dof
+            if name == "gps" and "gps-bias" in self.classes:  # a bias for each fix takes up what the fix says
+                b = self.classes["gps-bias"]
+                chi2, dof = chi2 + b.chi2, dof + b.dof
+            if name != "gps-bias" and dof > 0:
+                out += by_size(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
             if c.whiteness is not None and np.isfinite(c.ratio):
                 score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
                 out.append(by_score(f"residuals of {name} from one to the next", of, score))

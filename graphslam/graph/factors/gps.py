@@ -63,6 +63,8 @@ class GpsRecord:
     point : int or None
         Where the antenna was, as a point of its submap's path that the graph solves for (in the plane); residual
         ``T_gps_world point + bias - z`` and whitener are in the GPS frame then, and node and arm only say where it is.
+    stated : (dim, dim) or None
+        Covariance of the fix alone, in the GPS frame.
     """
 
     factor_id: int
@@ -77,6 +79,7 @@ class GpsRecord:
     tilt: bool = False
     uneven: bool = False
     point: int | None = None
+    stated: Array | None = None
 
     @property
     def rows(self) -> int:
