@@ -9,7 +9,7 @@ value. The word follows from all of them together:
   wrong in at most :data:`LEVEL` of the cases however many tests it has;
 - *cannot be decided from this log* where the rows could not have seen an error that matters: of motion and sightings,
   and of fixes if any were used, some row must exclude that variances are :data:`MATTERS` times as large as stated;
-- *pessimistic* if errors are too small in any of them, and none of the above;
+- *pessimistic* if errors are too small in any of them, and by as much as matters, and none of the above;
 - *consistent* else.
 
 Small residuals alone never make a map pessimistic: the first rule comes before the third.
@@ -143,7 +143,8 @@ def trust(rows: Sequence[Evidence], *, fixes: bool) -> Trust:
     missing = tuple(what for of, what in wanted.items() if not covers[of])
     if missing:
         return Trust("undecided", tuple(r for found in covers.values() for r in found), 1.0, missing)
-    small = sorted((r for r in rows if m * r.too_small < LEVEL), key=lambda r: r.too_small)
+    small = [r for r in rows if m * r.too_small < LEVEL and r.value < 1.0 / MATTERS]
+    small.sort(key=lambda r: r.too_small)
     if small:
         return Trust("pessimistic", tuple(small), min(1.0, m * small[0].too_small))
     return Trust("consistent", tuple(r for found in covers.values() for r in found), 1.0)

@@ -110,7 +110,8 @@ SMALL = by_size("fixes", "fixes", 0.13, 400.0)
         (by_size("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
         ([], False, "undecided"),
         (by_size("map", "map", 1.3, 2000.0), False, "over-confident"),
-        (by_size("map", "map", 0.7, 2000.0), False, "pessimistic"),
+        (by_size("map", "map", 0.6, 2000.0), False, "pessimistic"),
+        (by_size("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
         # small residuals, and alike from one to the next: never pessimistic
         ([*HONEST[:1], *SMALL, by_score("next", "fixes", 9.0)], True, "over-confident"),
         ([*HONEST[:1], *SMALL], True, "pessimistic"),
