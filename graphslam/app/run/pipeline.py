@@ -530,7 +530,7 @@ def _judge(
         "objective": solution.objective,
         "converged": solution.converged,
         "graph": graph_facts(back.graph, checks.classes),
-        "evidence": rows_as_json(checks.evidence(submaps)),
+        "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
     }
     if refined is not None:
         report["refine"] = refinement_facts(refined.refinement)

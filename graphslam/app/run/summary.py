@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from graphslam.app.run.verdict import Figures, Judged, judged_chi2, judged_nees, judged_trust, number
+from graphslam.app.run.verdict import Figures, Judged, judged_chi2, judged_nees, judged_trust, number, of_the_start
 from graphslam.core.errors import DataError
 from graphslam.core.findings import LEVELS, Finding, Level, worst
 from graphslam.loops.ledger import ledger_of_events
@@ -143,7 +143,8 @@ def summary(figures: Figures, findings: Sequence[Finding]) -> Finding:
     facts = [_made(figures), known or "true error not known", open_chain]
     trusted = judged_trust(figures)
     word = "" if trusted is None else trusted.word
-    return headline(findings, facts, [j for j in (chi2, worst_nees) if j], known=bool(known), word=word)
+    held = [] if chi2 is None or of_the_start(figures, chi2) else [chi2]
+    return headline(findings, facts, [*held, *([worst_nees] if worst_nees else [])], known=bool(known), word=word)
 
 
 def headline(

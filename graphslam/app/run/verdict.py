@@ -282,6 +282,11 @@ def judged_chi2(figures: Figures) -> Judged | None:
     return Judged("chi2", "χ²/dof", found[0] / found[1], found[1])
 
 
+def of_the_start(figures: Figures, chi2: Judged) -> bool:
+    """Does it say of the start of a refined path only that its noise was stated too large?"""
+    return bool(figures.part("refine")) and chi2.said == "pessimistic"
+
+
 def judged_nees(figures: Figures) -> list[Judged]:
     """NEES against the truth, where it is known, in each gauge in which it was taken."""
     m = dict(figures.metrics)
@@ -326,6 +331,11 @@ def _state(figures: Figures) -> Finding:
 
 def _chi2(figures: Figures) -> Finding:
     if j := judged_chi2(figures):
+        if of_the_start(figures, j):
+            text = (
+                f"χ²/dof of the graph at which the refined path began: {j.text}. The refined path does not rest on it."
+            )
+            return Finding("", "chi2", text)
         return Finding(j.level, "chi2", f"χ²/dof of the whole graph: {j.text}.")
     if whole_chi2(figures) is None:
         text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
@@ -368,6 +378,8 @@ def _trust(figures: Figures) -> list[Finding]:
             "Whether the covariances can be believed cannot be decided from this log: nothing in it could have seen "
             f"that errors of {' and of '.join(found.missing)} are larger than stated.{held}"
         )
+        if figures.part("refine"):
+            text += " The refined path takes its noise from its own residuals, which therefore do not judge it."
         return [Finding("", "trust", text)]
     if found.word == "pessimistic":
         text = (
@@ -403,7 +415,8 @@ def _tests(figures: Figures) -> list[Finding]:
         last = row.get("correlation_time")
         dof = float(row["dof"]) / (float(last or 1.0) if number(last) else 1.0) if number(row.get("dof")) else None
         judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
-        if row.get("verdict") == LASTING:
+        # a refined path holds fixes; the other factors of the graph were its start
+        if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
             out.append(_lasting(row))
     m = figures.metrics
     cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."

@@ -63,8 +63,20 @@ class WithoutTruth:
             rows.append(("loops", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
         return pd.DataFrame(rows, columns=columns)
 
-    def evidence(self, submaps: Sequence[Submap]) -> list[Evidence]:
-        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.trust`)."""
+    def evidence(self, submaps: Sequence[Submap], *, refined: bool = False) -> list[Evidence]:
+        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.trust`).
+
+        Parameters
+        ----------
+        submaps : sequence of Submap
+        refined : bool
+            The result is a path refined by its scans. The factors of the graph were its start only, and its own noise
+            was estimated from its own residuals, so that of all tests only those of fixes say anything of it.
+        """
+        rows = self._evidence(submaps)
+        return [r for r in rows if r.of == "fixes"] if refined else rows
+
+    def _evidence(self, submaps: Sequence[Submap]) -> list[Evidence]:
         out = of_systematic(sums([s.report for s in submaps]))
         for name, c in self.classes.items():
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"

@@ -218,6 +218,19 @@ def test_switched_off_it_leaves_nothing_of_a_refined_state(copy: Path) -> None:
     assert open_run(copy).graph_path is None
 
 
+def test_residuals_of_the_start_do_not_judge_the_refined_path(finished: Run) -> None:
+    """Its graph has residuals that are alike from one to the next, and too small: neither says anything of the path."""
+    lines = {f.code: f for f in finished.verdict}
+    assert "correlated" not in lines
+    assert lines["trust"].level == ""
+    assert "cannot be decided" in lines["trust"].text
+    assert lines["chi2"].level == ""
+    assert "does not rest on it" in lines["chi2"].text
+    assert finished.checks is not None
+    assert any(r.of == "map" for r in finished.checks.evidence(finished.submaps))
+    assert not finished.report["evidence"]
+
+
 @pytest.mark.parametrize(("denied", "kept"), [(1, "loops"), (90, "matches")])
 def test_passes_that_deny_each_other_are_given_loops(
     copy: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch, denied: int, kept: str
