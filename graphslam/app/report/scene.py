@@ -46,7 +46,8 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
         m = read_map(folder.path)
     except GraphSlamError:
         return None  # the part on figures says why
-    layers = [*_map(folder), *_references(folder, m.dim), _line("path", style.ESTIMATE, m.trajectory.positions)]
+    below, above = _references(folder, m.dim)
+    layers = [*_map(folder), *below, _line("path", style.ESTIMATE, m.trajectory.positions)]
     if m.trajectory.covariances is not None:
         at = np.unique(np.linspace(0, len(m.trajectory) - 1, ELLIPSES).astype(np.int64))
         P = position_covariances(m.trajectory.poses[at], m.trajectory.covariances[at])
@@ -55,7 +56,7 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
         layers.append(_points("landmarks", style.LANDMARK, m.landmarks, size=5.0))
         name = "95 % ellipses of landmarks"
         layers.append(_ellipses(name, style.LANDMARK, m.landmarks, m.landmark_covariances))
-    layers += _loops(folder, m)
+    layers += [*above, *_loops(folder, m)]
     return {"dim": m.dim, "layers": layers}
 
 
@@ -74,9 +75,10 @@ def _map(folder: ReportFolder) -> list[dict[str, Any]]:
     return [_points("map", style.GREY, points[::step], size=1.6)]
 
 
-def _references(folder: ReportFolder, dim: int) -> list[dict[str, Any]]:
-    """Truth, dead reckoning, the graph before the refinement, GPS."""
-    out = []
+def _references(folder: ReportFolder, dim: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Dead reckoning, the graph before the refinement and GPS, drawn below the path; truth, drawn above it."""
+    below: list[dict[str, Any]] = []
+    above: list[dict[str, Any]] = []
     for name, file, colour, on in (
         ("dead reckoning", "dead_reckoning.tum", style.DEAD_RECKONING, False),
         ("graph, before the refinement", "trajectory_graph.tum", style.GRAPH, False),
@@ -88,18 +90,19 @@ def _references(folder: ReportFolder, dim: int) -> list[dict[str, Any]]:
             except GraphSlamError as error:
                 folder.problems[file] = " ".join(str(error).replace(f"{folder.path}/", "").split())
                 continue
-            out.append(_line(name, colour, path.positions, dashed=name == "truth", on=on))
+            line = _line(name, colour, path.positions, dashed=name == "truth", on=on)
+            (above if name == "truth" else below).append(line)
     try:
         truth = read_truth(folder.path)
         scored = read_gps_residuals(folder.path / "gps_all.npz") if (folder.path / "gps_all.npz").is_file() else None
     except GraphSlamError:
-        return out
+        return below, above
     if truth is not None and len(truth.landmarks) and truth.landmarks.shape[1] == dim:
-        out.append(_points("true landmarks", style.TRUTH, truth.landmarks, size=3.0))
+        above.append(_points("true landmarks", style.TRUTH, truth.landmarks, size=3.0))
     if scored is not None:
         fixes = se2_transform(se2_inverse(scored.T_gps_map), scored.points + scored.residuals)
-        out.append(_points("GPS", style.GPS, fixes, size=3.0))
-    return out
+        below.append(_points("GPS", style.GPS, fixes, size=3.0))
+    return below, above
 
 
 def _loops(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
