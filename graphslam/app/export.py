@@ -124,9 +124,19 @@ def export(
     Path
         The file.
 
+    Raises
+    ------
+    UnknownNameError
+        There is no such format.
+    ConfigError
+        A heading is missing, or not wanted; a run without a folder and without ``out``.
+    RunFolderError, FormatError
+        Not a finished run, or a damaged one.
+
     Examples
     --------
-    >>> gs.export("runs/vp", (-33.8886, 151.1892), format="geojson")
+    >>> gs.export("runs/field", (-33.8886, 151.1892), heading=90.0, format="geojson").name
+    'map.geojson'
     """
     if format not in WRITERS:
         raise UnknownNameError("format", format, WRITERS)

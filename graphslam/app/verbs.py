@@ -126,9 +126,11 @@ def open_run(path: str | Path) -> Run:
 
     Examples
     --------
-    >>> run = gs.open_run("runs/vp")
-    >>> run.metric("nees_per_dof")
-    >>> run.solution.marginal(3)
+    >>> opened = gs.open_run("runs/field")
+    >>> opened.metric("submaps")
+    7.0
+    >>> opened.solution.marginal(3).shape
+    (3, 3)
     """
     run = read_run(path)
 
@@ -167,8 +169,9 @@ def load(source: str | Path, **options: Any) -> SensorLog:
 
     Examples
     --------
-    >>> log = gs.load("victoria-park")
-    >>> log.slice(0.0, 60.0)
+    >>> again = gs.load("logs/field")
+    >>> again.slice(0.0, 10.0).duration <= 10.0
+    True
     """
     return load_log_source(source, **options)
 
@@ -205,8 +208,10 @@ def refine_path(
 
     Examples
     --------
-    >>> found = gs.refine_path("lidar3d-hku1", steps={"period": None, "odometry_tilt_sigma": 0.005})
-    >>> found.agreement
+    >>> court = gs.simulate("court", preset="light", seed=1, progress=False)
+    >>> before, after = gs.refine_path(court).agreement
+    >>> before < after
+    True
     """
     log = source if isinstance(source, SensorLog) else load(source)
     if steps is None:
@@ -251,9 +256,18 @@ def compare(
     DataFrame
         One row a method.
 
+    Raises
+    ------
+    UnknownNameError
+        There is no such method, or no such source.
+    MissingDataError, FormatError, DataError
+        A source without submaps, or a damaged one.
+
     Examples
     --------
-    >>> gs.compare(run, ["isam2", "eif-tree", "ekf"])
+    >>> table = gs.compare(run, ["isam2", "eif-tree"])
+    >>> list(table["method"])
+    ['isam2', 'eif-tree']
     """
     s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
@@ -290,10 +304,20 @@ def join_submaps(
         Poses ``(m + 1, 3)``, landmarks ``(n, 2)`` and their joint information, in the frame of the first base; of
         submaps without landmarks a :class:`~graphslam.join.pose_estimate.PoseEstimate`.
 
+    Raises
+    ------
+    UnknownNameError
+        There is no such method.
+    SolverError, IndeterminateError
+        The submaps do not hang together.
+    MissingDataError, FormatError, DataError
+        A source without submaps, or a damaged one.
+
     Examples
     --------
     >>> joined = gs.join_submaps(run, "eif-tree")
-    >>> joined.poses[-1]
+    >>> joined.poses.shape  # the bases and the last end
+    (8, 3)
     """
     s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
@@ -307,13 +331,32 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     Parameters
     ----------
     path : path
+        g2o, TORO or iSAM, recognised by its content.
     solver : str
+        One of :func:`solvers`.
     **options
         See :func:`graphslam.app.solve_file.solve_file`.
 
+    Returns
+    -------
+    dict
+        ``solver``, ``objective`` (Σ rᵀ Ω r), ``objective_initial``, ``iterations``, ``seconds``, ``converged``,
+        ``gap``.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such solver.
+    MissingDataError, FormatError
+        No such file, or a damaged one.
+    CovarianceError
+        Information matrices of the file are not positive definite; the message names them.
+
     Examples
     --------
-    >>> gs.solve_file("sphere.g2o", "lm")["objective"]
+    >>> solved = gs.solve_file("runs/field/graph.g2o", "lm")
+    >>> solved["converged"]
+    True
     """
     from graphslam.app import solve_file as solving
 

@@ -63,6 +63,18 @@ class Imu:
     Raises
     ------
     DataError, GeometryError
+
+    Examples
+    --------
+    >>> from graphslam.core.imu import ImuNoise
+    >>> at_rest = np.tile([0.0, 0.0, 9.81], (100, 1))
+    >>> noise = ImuNoise(
+    ...     gyro=1e-3, gyro_bias=1e-3, gyro_walk=1e-5,
+    ...     accelerometer=1e-2, accelerometer_bias=1e-2, accelerometer_walk=1e-4,
+    ... )
+    >>> imu = gs.Imu(times=np.arange(100) / 100, angular_rate=np.zeros((100, 3)), specific_force=at_rest, noise=noise)
+    >>> len(imu.times)
+    100
     """
 
     times: Array

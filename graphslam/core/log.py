@@ -109,9 +109,10 @@ class SensorLog:
 
     Examples
     --------
-    >>> log = gs.simulate("landmark-field", preset="quick")
     >>> log["landmarks"].times[:3]
+    array([0.2, 0.4, 0.6])
     >>> log.slice(0.0, 10.0)
+    SensorLog('landmark-field': controls (401), landmarks (50); truth known)
     """
 
     name: str

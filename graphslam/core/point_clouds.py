@@ -137,6 +137,12 @@ class PointClouds:
         Where the beams of a scan begin, in the frame of its points [m].
     T_base_sensor : (7,)
         Frame of the points in the base.
+
+    Examples
+    --------
+    >>> clouds = gs.PointClouds.from_arrays([0.0, 0.1], np.ones((5, 3)), [0, 2, 5])  # two scans, of 2 and 3 points
+    >>> len(clouds.times)
+    2
     """
 
     times: Array

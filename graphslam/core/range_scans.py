@@ -43,6 +43,16 @@ class RangeScans:
     Raises
     ------
     DataError, GeometryError
+
+    Examples
+    --------
+    >>> ahead = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    >>> scans = gs.RangeScans(
+    ...     times=np.array([0.0]), ranges=np.array([[3.0, 4.0]]), directions=ahead, beam_times=np.zeros(2),
+    ...     max_range=30.0, sigma=0.02,
+    ... )
+    >>> scans.ranges.shape
+    (1, 2)
     """
 
     times: Array

@@ -86,6 +86,15 @@ class LaserScans:
     max_range : float
         Ranges at or above it are "no return".
     T_base_sensor : (3,)
+
+    Examples
+    --------
+    >>> scans = gs.LaserScans(
+    ...     times=np.array([0.0]), ranges=np.full((1, 181), 4.0), bearings=np.radians(np.arange(-90, 91)),
+    ...     max_range=30.0,
+    ... )
+    >>> scans.ranges.shape
+    (1, 181)
     """
 
     times: Array
@@ -145,6 +154,16 @@ class SteeringControls:
     steering : (n,)
         Steering angle [rad], positive left.
     geometry : AckermannGeometry
+
+    Examples
+    --------
+    >>> from graphslam.core.records import AckermannGeometry
+    >>> car = gs.SteeringControls(
+    ...     times=np.array([0.0, 0.1]), speed=np.array([2.0, 2.0]), steering=np.array([0.0, 0.05]),
+    ...     geometry=AckermannGeometry(wheelbase=2.8),
+    ... )
+    >>> car.speed
+    array([2., 2.])
     """
 
     times: Array
@@ -177,6 +196,12 @@ class VelocityControls:
         Along x of the base [m/s], negative backwards.
     yaw_rate : (n,)
         [rad/s], positive counter-clockwise.
+
+    Examples
+    --------
+    >>> drive = gs.VelocityControls(times=np.arange(3.0), speed=np.ones(3), yaw_rate=np.zeros(3))
+    >>> drive.take(np.array([1])).speed
+    array([1.])
     """
 
     times: Array
@@ -204,6 +229,14 @@ class Odometry:
     increments : (n, 3) or (n, 7)
     covariances : (n, d, d)
         Right tangent at the later pose. Nothing enters a graph without a covariance.
+
+    Examples
+    --------
+    >>> steps = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.1]])
+    >>> sure = np.tile(0.01 * np.eye(3), (2, 1, 1))
+    >>> wheels = gs.Odometry(times=np.array([0.0, 1.0]), increments=steps, covariances=sure)
+    >>> wheels.increments[1]
+    array([0.5, 0. , 0.1])
     """
 
     times: Array
@@ -241,6 +274,12 @@ class Gps:
     covariances : (n, c, c) or None
         Of a fix whose coordinates are not equally sure, in the frame of the positions [m²]; they stand in place of
         ``sigma``.
+
+    Examples
+    --------
+    >>> fixes = gs.Gps(times=np.arange(3.0), positions=np.zeros((3, 2)), sigma=np.full(3, 0.5), lever=np.zeros(2))
+    >>> fixes.take(np.array([0, 2])).times
+    array([0., 2.])
     """
 
     times: Array
@@ -361,6 +400,15 @@ class LandmarkObservations:
     field_of_view : (2,)
         Least and greatest bearing [rad].
     T_base_sensor : (3,)
+
+    Examples
+    --------
+    >>> seen = gs.LandmarkObservations(
+    ...     times=np.array([0.0, 0.2]), offsets=np.array([0, 2, 3]), ranges=np.array([5.0, 8.0, 7.9]),
+    ...     bearings=np.array([0.1, -0.4, -0.38]), sigmas=np.tile([0.1, 0.02], (3, 1)),
+    ... )
+    >>> seen.offsets[-1]
+    np.int64(3)
     """
 
     times: Array

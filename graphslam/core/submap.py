@@ -210,7 +210,10 @@ class Submap:
     Examples
     --------
     >>> submap = gs.local_maps(log)[0]
-    >>> submap.exit_pose, submap.landmarks.ids
+    >>> submap
+    Submap(0, [0.00, 5.60] s, 15 landmarks)
+    >>> submap.exit_pose.shape, submap.landmarks.ids.shape
+    ((3,), (15,))
     """
 
     key: int

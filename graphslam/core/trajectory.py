@@ -32,7 +32,8 @@ class Trajectory:
     Examples
     --------
     >>> path = run.map.trajectory
-    >>> path.interpolate(path.times[:1] + 0.05)
+    >>> path.interpolate(path.times[:1] + 0.05).shape
+    (1, 3)
     """
 
     times: Array

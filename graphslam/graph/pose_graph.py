@@ -67,6 +67,14 @@ class PoseGraph(GraphRecord):
     ----------
     dim : int
         2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
+
+    Examples
+    --------
+    >>> graph = gs.PoseGraph(dim=2)
+    >>> for submap in gs.local_maps(log)[:2]:
+    ...     added = graph.add_submap(submap)
+    >>> len(graph.submaps)
+    2
     """
 
     def __repr__(self) -> str:

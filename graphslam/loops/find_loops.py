@@ -91,9 +91,12 @@ def find_loops(
 
     Examples
     --------
-    >>> graph = gs.PoseGraph(3)
-    >>> found = gs.find_loops(graph, solver, submaps)
-    >>> found.ledger.table()
+    >>> from graphslam.solve.registry import make_solver
+    >>> court = gs.simulate("court", preset="light", seed=1, progress=False)
+    >>> hall = gs.run(court, frontend="scan-window", progress=False)
+    >>> found = gs.find_loops(hall.graph, make_solver("batch", hall.graph), hall.submaps)
+    >>> len(found.ledger.table()) >= 0
+    True
     """
     return LoopSearch(config).look(graph, solver, submaps, last=True, progress=progress)
 

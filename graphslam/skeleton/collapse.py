@@ -30,7 +30,7 @@ class Collapse:
 
     Examples
     --------
-    >>> collapse = Collapse(5)
+    >>> collapse = gs.Collapse(5)
     >>> collapse.add([0, 3], [2, 4])
     >>> collapse.landmarks()
     (array([0, 1, 0, 2, 2], dtype=int32), 3)

@@ -219,6 +219,11 @@ def relax_skeleton(
     progress : callable, optional
         Called after every step.
 
+    Returns
+    -------
+    Relaxation
+        Poses in the world frame, χ², how far the last step moved a pose [m], and the softest modes.
+
     Raises
     ------
     IndeterminateError

@@ -90,6 +90,11 @@ def calibrate_log(
     reader, reader_options, preset
         As for a run.
 
+    Returns
+    -------
+    Calibration
+        ``corrections`` [SI units, rad], σ of each, ``config()`` for :func:`run`, and why what was not told was not.
+
     Raises
     ------
     GraphSlamError
@@ -97,8 +102,8 @@ def calibrate_log(
 
     Examples
     --------
-    >>> found = gs.calibrate_log("plaza1")
-    >>> gs.run("plaza1", config={"calibrate": found.config()})
+    >>> found = gs.calibrate_log(log, quick=True)
+    >>> again = gs.run(log, config={"calibrate": found.config()}, progress=False)
     """
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)

@@ -49,6 +49,11 @@ def local_maps(
     progress : bool
         Show a progress bar.
 
+    Returns
+    -------
+    list of Submap
+        Each in the frame of its first pose [m, rad].
+
     Raises
     ------
     GraphSlamError
@@ -57,6 +62,8 @@ def local_maps(
     Examples
     --------
     >>> submaps = gs.local_maps(log, "rbpf-ekf", seed=1)
+    >>> submaps[0].key
+    0
     """
     log = load_log_source(source)
     made = _front_end(log, frontend, options)
@@ -82,6 +89,13 @@ def first_particles(
     source, frontend, seed, options
         As in :func:`local_maps`; slice the log to begin elsewhere.
 
+    Returns
+    -------
+    submap : Submap
+        In the frame of its first pose [m, rad].
+    particles : ParticleSet
+        Poses ``(N, 3)`` in the same frame, weights ``(N,)``, and the landmarks of each.
+
     Raises
     ------
     ConfigError
@@ -91,7 +105,9 @@ def first_particles(
 
     Examples
     --------
-    >>> submap, particles = gs.first_particles(log, options={"particles": 50})
+    >>> submap, particles = gs.first_particles(log, options={"particles": 10})
+    >>> submap.key
+    0
     """
     log = load_log_source(source)
     made = _front_end(log, frontend, options)

@@ -142,6 +142,11 @@ def run(
         Name of the source whose recommended settings are taken, ``"none"`` for defaults; by default those of the log,
         its reader, or its kind.
 
+    Returns
+    -------
+    Run
+        In the frame of the first base [m, rad].
+
     Raises
     ------
     GraphSlamError
@@ -149,8 +154,9 @@ def run(
 
     Examples
     --------
-    >>> run = gs.run("victoria-park", frontend="rbpf-ekf", out="runs/vp", config={"gps": {"use": "every-second"}})
-    >>> run.metric("gps_withheld_rmse")
+    >>> made = gs.run(log, frontend="rbpf-ekf", solver="batch", config={"frontend": {"particles": 10}}, progress=False)
+    >>> made.metric("converged")
+    1.0
     """
     # what is wrong with the call is said before anything is read (of a log in memory, a moment later)
     name = None if frontend is None else name_of(frontend)

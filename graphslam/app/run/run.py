@@ -107,9 +107,11 @@ class Run:
 
     Examples
     --------
-    >>> run = gs.open_run("runs/vp")
-    >>> run.verdict
-    >>> run.map.landmarks
+    >>> opened = gs.open_run("runs/field")
+    >>> opened
+    Run('landmark-field': 7 submaps, 40 landmarks)
+    >>> opened.verdict[0].level, opened.map.landmarks.shape
+    ('', (40, 2))
     """
 
     name: str

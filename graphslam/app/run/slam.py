@@ -82,12 +82,12 @@ class Slam:
 
     Examples
     --------
-    >>> with gs.Slam(frontend="kiss-icp", out="runs/live") as slam:
-    ...     for time, points in my_lidar():
-    ...         slam.add(gs.PointClouds.from_arrays([time], points, [0, len(points)]))
-    ...         if slam.submaps:
-    ...             print(slam.path.poses[-1])
-    ...     run = slam.finish()
+    >>> with gs.Slam("rbpf-ekf", config={"frontend": {"particles": 10}}) as slam:
+    ...     slam.add(log["controls"])
+    ...     slam.add(log["landmarks"])
+    ...     done = slam.finish()
+    >>> len(done.submaps) > 3
+    True
     """
 
     def __init__(

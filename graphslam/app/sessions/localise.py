@@ -98,6 +98,12 @@ def localise(
     progress : bool
         Show progress bars on stderr.
 
+    Returns
+    -------
+    Localisation
+        ``T_map_base`` ``(3,)`` or ``(7,)`` in the frame of the run's map, its covariance (right tangent), and ``why``
+        nothing was found.
+
     Raises
     ------
     DataError
@@ -105,8 +111,11 @@ def localise(
 
     Examples
     --------
-    >>> found = gs.localise("runs/hall", log.slice(100.0, 130.0))
-    >>> found.T_map_base if not found.why else found.why
+    >>> court = gs.simulate("court", preset="light", seed=1, progress=False)
+    >>> hall = gs.run(court, frontend="scan-window", out="runs/hall", progress=False)
+    >>> found = gs.localise("runs/hall", court.slice(10.0, 30.0))
+    >>> found.T_map_base is None or found.T_map_base.shape == (7,)  # found.why says what was missing
+    True
     """
     opened = run if isinstance(run, Run) else open_run(run)
     if not is_dense(opened):

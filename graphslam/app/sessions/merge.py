@@ -72,6 +72,11 @@ def merge(
     anew : bool
         ``out`` may hold a merged map already: then this is its new state.
 
+    Returns
+    -------
+    MergedMap or MergedSubmaps
+        In the frame of the first run's first base.
+
     Raises
     ------
     ConfigError
@@ -83,8 +88,9 @@ def merge(
 
     Examples
     --------
-    >>> merged = gs.merge(["runs/robot1", "runs/robot2"])
-    >>> merged.plot()
+    >>> merged = gs.merge(["runs/field", "runs/second"])
+    >>> merged.metrics["key"].size > 0
+    True
     """
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:

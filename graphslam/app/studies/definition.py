@@ -63,6 +63,11 @@ def find_study(name: str) -> StudyDefinition:
     ----------
     name : str
 
+    Returns
+    -------
+    StudyDefinition
+        Name, worlds, algorithms, and what one trial is.
+
     Raises
     ------
     UnknownNameError
@@ -73,6 +78,7 @@ def find_study(name: str) -> StudyDefinition:
     Examples
     --------
     >>> gs.find_study("segslam-garage").worlds(quick=False)
+    ('garage-A', 'garage-B', 'garage-C', 'garage-D')
     """
     target = STUDIES.get(name, name)
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", target):

@@ -192,8 +192,9 @@ def study(
 
     Examples
     --------
-    >>> study = gs.study("combined-slam", 50, workers=2)
-    >>> study.report()
+    >>> study = gs.study("charts", 1, quick=True, out="studies/one", progress=False)
+    >>> list(study.table.columns)
+    ['world', 'run', 'algorithm', 'submap', 'quantity', 'value']
     """
     definition = find_study(name)
     known = tuple(definition.worlds(quick))
@@ -280,6 +281,11 @@ def open_study(folder: str | Path, definition: StudyDefinition | str | None = No
         A study of your own: itself, or ``module:object``. A folder names its study, too, but a folder that somebody
         gave you must not choose what is imported: without this argument only the registered studies are opened.
 
+    Returns
+    -------
+    Study
+        Its tidy ``table`` (``world, run, algorithm, submap, quantity, value``), ``report()`` and figures.
+
     Raises
     ------
     MissingDataError, FormatError
@@ -289,7 +295,9 @@ def open_study(folder: str | Path, definition: StudyDefinition | str | None = No
 
     Examples
     --------
-    >>> study = gs.open_study("study-combined-slam")
+    >>> made = gs.study("charts", 1, quick=True, out="studies/charts", progress=False)
+    >>> gs.open_study("studies/charts")
+    Study('charts': runs strong-drift-quick: 1; 0 failed)
     """
     opened = StudyFolder(folder)
     if definition is None:
