@@ -18,6 +18,7 @@ STUDIES: dict[str, str] = {
     "smartloc": "graphslam.app.studies.smartloc:STUDY",
     "surface": "graphslam.app.studies.surface:STUDY",
     "terrain": "graphslam.app.studies.terrain:STUDY",
+    "trust": "graphslam.app.studies.trust:STUDY",
     "terrain-drives": "graphslam.app.studies.terrain_drives:STUDY",
     "withheld-fixes": "graphslam.app.studies.withheld_fixes:STUDY",
 }
