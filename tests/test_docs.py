@@ -154,7 +154,7 @@ def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_pat
         ["bash", "-c", script], cwd=clone, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
-    for made in ("demo-run/report.html", "runs/field/report.html", "runs/field/map.kml"):
+    for made in ("demo-run/report.html", "runs/field/report.html", "runs/field/path.tum"):
         assert (clone / made).is_file(), made
 
 

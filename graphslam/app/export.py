@@ -1,21 +1,32 @@
-"""A run on the globe."""
+"""A run for other programs: evaluation, globe, GIS, navigation."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from graphslam.app.folders.generations import name_inside, new_generation
 from graphslam.app.folders.lock import locked
 from graphslam.app.run.outputs import open_run
+from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
-from graphslam.core.errors import ConfigError, UnknownNameError
+from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
+from graphslam.core.extras import import_extra
 from graphslam.core.gaussian import ellipse_rings, largest_sigmas
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.plan_view import plan_pose
+from graphslam.core.se3 import se3_transform
+from graphslam.core.trajectory import Trajectory
+from graphslam.io.autoware import write_autoware
 from graphslam.io.geographic import WRITERS, GeographicMap
+from graphslam.io.tum import embed_plane, write_kitti, write_tum
+from graphslam.maps.export import save_maps
+from graphslam.maps.run_map import RunMap
 
 _RING = 36  # corners of an ellipse
 
@@ -103,57 +114,143 @@ def parse_datum(text: str) -> tuple[float, float]:
     return latitude, longitude
 
 
+PATHS: dict[str, tuple[str, Callable[[str | os.PathLike[str], Trajectory], None]]] = {
+    "tum": ("path.tum", write_tum),
+    "kitti": ("path.kitti.txt", write_kitti),
+}
+FORMATS = (*PATHS, *WRITERS, "nav2", "autoware")
+
+
 def export(
     run: Run | str | Path,
-    datum: tuple[float, float],
+    datum: tuple[float, float] | None = None,
     *,
     format: str = "kml",
     heading: float | None = None,
     confidence: float = 0.95,
     out: str | Path | None = None,
 ) -> Path:
-    """Write a run as KML or GeoJSON; see :func:`geographic_map`.
+    """Write a run for other programs.
 
     Parameters
     ----------
+    run : Run, or folder of one
+    datum : (latitude, longitude), optional
+        Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84]. KML and GeoJSON need it;
+        an Autoware map lies about it, or in its own frame without.
+    format : str
+        ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (what evo reads). ``kml``,
+        ``geojson``: path, landmarks with ellipses, fixes. ``nav2``: floor plans (map_server). ``autoware``: the map's
+        points in tiles, with ``map_projector_info.yaml``.
+    heading : float, optional
+        Of the first base's x axis, degrees clockwise from north; with a datum, for runs without GPS.
+    confidence : float
+        Of the ellipses.
     out : path, optional
-        Default: ``map.<format>`` in the run's folder.
+        Default: ``map.<format>`` or ``path.<format>`` in the run's folder; ``nav2`` and ``autoware`` write a folder,
+        which must be named.
 
     Returns
     -------
     Path
-        The file.
+        The file, or the folder.
 
     Raises
     ------
     UnknownNameError
         There is no such format.
     ConfigError
-        A heading is missing, or not wanted; a run without a folder and without ``out``.
+        A datum or a heading is missing, or not wanted; no place to write to.
+    MissingDataError
+        A run without a dense map, for ``nav2`` and ``autoware``.
     RunFolderError, FormatError
         Not a finished run, or a damaged one.
 
     Examples
     --------
+    >>> gs.export("runs/field", format="tum").name
+    'path.tum'
     >>> gs.export("runs/field", (-33.8886, 151.1892), heading=90.0, format="geojson").name
     'map.geojson'
     """
-    if format not in WRITERS:
-        raise UnknownNameError("format", format, WRITERS)
+    if format not in FORMATS:
+        raise UnknownNameError("format", format, FORMATS)
+    if format in WRITERS and datum is None:
+        raise ConfigError(
+            f"{format} needs a datum: latitude and longitude of the GPS frame's origin, or of the first base"
+        )
     opened = run if isinstance(run, Run) else open_run(run)
     home = opened.folder
+    if format in ("nav2", "autoware"):
+        if out is None:
+            raise ConfigError(f"{format} writes a folder: name it (out)")
+        return _write_dense(opened, Path(out), format, datum, heading)
     if out is None and home is None:
         raise ConfigError("a run without a folder needs a file name to be exported to")
-    name = f"map.{format}" if out is None else None if home is None else name_inside(home, out)
+
+    def write(target: Path, what: Run) -> None:
+        if format in PATHS:
+            PATHS[format][1](target, what.map.trajectory)
+        elif datum is not None:
+            WRITERS[format](target, geographic_map(what, datum, heading=heading, confidence=confidence))
+
+    default = PATHS[format][0] if format in PATHS else f"map.{format}"
+    name = default if out is None else None if home is None else name_inside(home, out)
     if home is None or name is None:
-        target = Path(out or "")
-        WRITERS[format](target, geographic_map(opened, datum, heading=heading, confidence=confidence))
-        return target
+        write(Path(out or ""), opened)
+        return Path(out or "")
     with locked(home):
         if not isinstance(run, Run):
             opened = open_run(home)  # as it is now that nobody else changes it
-        content = geographic_map(opened, datum, heading=heading, confidence=confidence)
         with new_generation(home) as new:
-            WRITERS[format](new.path / name, content)
+            write(new.path / name, opened)
             new.adopt()
     return home / name
+
+
+def _write_dense(run: Run, out: Path, format: str, datum: tuple[float, float] | None, heading: float | None) -> Path:
+    """The fused map of a run as floor plans, or as a cloud in tiles."""
+    made = _dense_map(run)
+    if format == "nav2":
+        save_maps(made.fused.grid, out, bands=made.bands)
+        return out
+    points = map_points(run)
+    if datum is not None:
+        check_geodetic(*datum)
+        T = map_to_enu(run, heading)
+        T = embed_plane(T[None])[0] if len(T) == 3 else T
+        points = se3_transform(T, points)
+    return write_autoware(out, points, datum=datum)
+
+
+def _dense_map(run: Run) -> RunMap:
+    made = run.fused if run.folder is None or run.holds("fused") else map_of_folder(run.folder)[1]
+    if made is None:
+        raise MissingDataError("the run has no dense map", where=run.name, wanted="a front end with grids or clouds")
+    return made
+
+
+def map_points(run: Run) -> Array:
+    """Points of a run's dense map ``(n, 3)`` in the frame of the first base [m]: centres of the occupied voxels.
+
+    Raises
+    ------
+    MissingDataError
+        The run has no dense map.
+    """
+    points = np.asarray(_dense_map(run).fused.grid.occupied_cloud(), dtype=np.float64)
+    return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+
+
+def to_open3d(run: Run) -> Any:
+    """The dense map of a run as an ``open3d.geometry.PointCloud`` in the frame of the first base [m].
+
+    Raises
+    ------
+    MissingExtraError
+        The extra ``open3d`` is not installed.
+    MissingDataError
+        The run has no dense map.
+    """
+    o3d = import_extra("open3d", "a cloud of Open3D")
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(map_points(run)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,9 @@ from graphslam.core.reading import usable
 from graphslam.core.records import check_times
 
 Index = npt.NDArray[np.intp]
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -63,6 +66,21 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A row an instant, indexed by ``time`` [s]: ``x, y, heading`` [m, rad], in space ``x, y, z, qx, qy, qz, qw``.
+
+        With covariances also ``sigma_…`` of each coordinate of the right tangent (rotations first in space).
+        """
+        import pandas as pd
+
+        plane = self.poses.shape[1] == 3
+        names = ["x", "y", "heading"] if plane else ["x", "y", "z", "qx", "qy", "qz", "qw"]
+        columns = dict(zip(names, self.poses.T))
+        if self.covariances is not None:
+            tangent = names if plane else ["roll", "pitch", "yaw", "x", "y", "z"]
+            columns |= {f"sigma_{n}": np.sqrt(self.covariances[:, k, k]) for k, n in enumerate(tangent)}
+        return pd.DataFrame(columns, index=pd.Index(self.times, name="time"))
 
     def __repr__(self) -> str:
         when = f", {self.times[0]:.6g} to {self.times[-1]:.6g} s" if len(self) else ""

@@ -43,6 +43,14 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
         np.savetxt(stream, rows, fmt="%.17g")
 
 
+def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write the poses of a trajectory as KITTI odometry does: the upper three rows of ``T`` a line, no stamps."""
+    poses = embed_plane(trajectory.poses) if trajectory.dim == 2 else trajectory.poses
+    T = np.concatenate([se3.quat_to_matrix(poses[:, 3:]), poses[:, :3, None]], axis=2)
+    with atomic_open(path, "w") as stream:
+        np.savetxt(stream, T.reshape(len(T), 12), fmt="%.17g")
+
+
 def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Trajectory:
     """Read a trajectory.
 

@@ -78,21 +78,30 @@ def report(
 
 def export(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
-    format: str = typer.Option("kml", help="Format of the file: kml for Google Earth, or geojson for GIS programs."),
-    datum: str = typer.Option(
-        ..., help="Origin of the GPS frame as LAT,LON in degrees (WGS 84); without GPS, of the first pose."
+    format: str = typer.Option(
+        "kml",
+        help="Path: tum or kitti. Map on the globe: kml, or geojson for GIS programs. Floor plans: nav2. "
+        "Points in tiles: autoware.",
+    ),
+    datum: str | None = typer.Option(
+        None,
+        help="Origin of the GPS frame as LAT,LON in degrees (WGS 84); without GPS, of the first pose. "
+        "For kml, geojson and autoware.",
     ),
     heading: float | None = typer.Option(
         None, help="Without GPS: heading of the first pose in degrees, clockwise from north."
     ),
     confidence: float = typer.Option(0.95, help="Confidence of the landmark ellipses, between 0 and 1."),
-    out: Path | None = typer.Option(None, help="File to write. Default: map.FORMAT in the folder of the run."),
+    out: Path | None = typer.Option(
+        None, help="File to write; folder for nav2 and autoware. Default: a file in the folder of the run."
+    ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Export path, landmarks with ellipses, and GPS fixes of a run in geographic coordinates."""
+    """Export a run for other programs: its path, its map on the globe, its floor plans, its points."""
     from graphslam.app.export import export as export_run
     from graphslam.app.export import parse_datum
 
-    file = export_run(run, parse_datum(datum), format=format, heading=heading, confidence=confidence, out=out)
+    place = None if datum is None else parse_datum(datum)
+    file = export_run(run, place, format=format, heading=heading, confidence=confidence, out=out)
     emit({"file": str(file), "format": format}, f"written to {file}", as_json=as_json)

@@ -70,7 +70,17 @@ SAME_BYTES = (
 """Files of a run folder that are the same bytes after a kill and a resume, after undoing and redoing a loop, and in two
 runs of one configuration. The others hold times (``timings.json``, and the part of ``report.html`` that shows them), or
 were drawn on the way (``figures/progress.png``)."""
-_MADE_OF_MAP = ("map.grid.npz", "map.kml", "map.geojson", "clearest*", "alternatives/*", "*.kml", "*.geojson")
+_MADE_OF_MAP = (
+    "map.grid.npz",
+    "map.kml",
+    "map.geojson",
+    "clearest*",
+    "alternatives/*",
+    "*.kml",
+    "*.geojson",
+    "path.tum",
+    "path.kitti.txt",
+)
 """What other verbs made of a map, which stays where the map does."""
 
 

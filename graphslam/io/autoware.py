@@ -1,0 +1,85 @@
+"""A map as Autoware loads it: a cloud in tiles, the list of tiles, and where on the globe it lies.
+
+A folder with ``pointcloud_map.pcd/`` (binary PCD 0.7, one file a tile), ``pointcloud_map_metadata.yaml`` (the size of a
+tile, and the lower corner of each) and ``map_projector_info.yaml`` (``LocalCartesian`` about a datum of WGS 84: x east,
+y north, z up; or ``Local``: the frame of the map).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.core.atomic import atomic_open
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+
+TILE = 20.0
+"""Side of a tile [m]."""
+
+
+def write_pcd(path: str | os.PathLike[str], points: Array) -> None:
+    """Write points ``(n, 3)`` [m] as binary PCD 0.7, float32."""
+    rows = np.ascontiguousarray(points, dtype="<f4")
+    n = len(rows)
+    head = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    )
+    head += f"COUNT 1 1 1\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
+    with atomic_open(path) as stream:
+        stream.write(head.encode() + rows.tobytes())
+
+
+def write_autoware(
+    folder: str | os.PathLike[str], points: Array, *, datum: tuple[float, float] | None = None, tile: float = TILE
+) -> Path:
+    """Write a map folder of Autoware.
+
+    Parameters
+    ----------
+    folder : path
+        Made; tiles of an earlier map in it are removed.
+    points : (n, 3)
+        [m]; with a datum x east, y north, z up from it, otherwise in the frame of the map.
+    datum : (latitude, longitude), optional
+        [deg, WGS 84]; its height is 0.
+    tile : float
+        Side of a tile [m], a whole number.
+
+    Raises
+    ------
+    DataError
+        No point, or a tile whose side is no whole number of metres.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    if not len(p):
+        raise DataError("a map without a point cannot be written", where=str(folder))
+    if not (tile >= 1 and tile == int(tile)):
+        raise DataError("impossible side of a tile", got=tile, wanted="a whole number of metres")
+    root = Path(folder)
+    tiles = root / "pointcloud_map.pcd"
+    tiles.mkdir(parents=True, exist_ok=True)
+    for old in tiles.glob("*.pcd"):
+        old.unlink()
+    corners = np.floor(p[:, :2] / tile).astype(np.int64)
+    found, which = np.unique(corners, axis=0, return_inverse=True)
+    lines = [f"x_resolution: {float(tile)}", f"y_resolution: {float(tile)}"]
+    for k, corner in enumerate(found):
+        x, y = (int(c * tile) for c in corner)
+        write_pcd(tiles / f"{x}_{y}.pcd", p[which.ravel() == k])
+        lines.append(f"{x}_{y}.pcd: [{x}, {y}]")
+    _write(root / "pointcloud_map_metadata.yaml", lines)
+    if datum is None:
+        _write(root / "map_projector_info.yaml", ["projector_type: Local"])
+    else:
+        origin = [f"  latitude: {datum[0]!r}", f"  longitude: {datum[1]!r}", "  altitude: 0.0"]
+        projector = ["projector_type: LocalCartesian", "vertical_datum: WGS84", "map_origin:", *origin]
+        _write(root / "map_projector_info.yaml", projector)
+    return root
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    with atomic_open(path, "w") as stream:
+        stream.write("\n".join(lines) + "\n")
