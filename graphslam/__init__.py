@@ -29,7 +29,7 @@ _VERBS = {
     **dict.fromkeys(("refine_path", "calibrate_log"), "graphslam.app.verbs"),
     "merge": "graphslam.app.sessions.merge",
     "localise": "graphslam.app.sessions.localise",
-    "export": "graphslam.app.export",
+    **dict.fromkeys(("export", "to_open3d"), "graphslam.app.export"),
     "find_loops": "graphslam.loops.find_loops",
     "relax_skeleton": "graphslam.skeleton.relax",
 }

@@ -243,7 +243,16 @@ def map_points(run: Run) -> Array:
 
 
 def to_open3d(run: Run) -> Any:
-    """The dense map of a run as an ``open3d.geometry.PointCloud`` in the frame of the first base [m].
+    """The dense map of a run as a cloud of Open3D.
+
+    Parameters
+    ----------
+    run : Run
+
+    Returns
+    -------
+    open3d.geometry.PointCloud
+        Centres of the occupied voxels in the frame of the first base [m].
 
     Raises
     ------
@@ -251,6 +260,13 @@ def to_open3d(run: Run) -> Any:
         The extra ``open3d`` is not installed.
     MissingDataError
         The run has no dense map.
+
+    Examples
+    --------
+    >>> court = gs.simulate("court", preset="light", seed=1, progress=False)
+    >>> hall = gs.run(court.slice(0.0, 15.0), frontend="scan-window", progress=False)
+    >>> len(gs.to_open3d(hall).points) > 100
+    True
     """
     o3d = import_extra("open3d", "a cloud of Open3D")
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(map_points(run)))

@@ -24,7 +24,7 @@ class Extra:
 
 EXTRAS = {
     "surface": Extra("surfaces as triangles (map --surface), ways planned over terrain", ("skimage", "trimesh"), 60),
-    "open3d": Extra("run.to_open3d(), Poisson surfaces to compare with", ("open3d",), 1020),
+    "open3d": Extra("gs.to_open3d(run), Poisson surfaces to compare with", ("open3d",), 1020),
     "ros": Extra("bags of ROS 1 and ROS 2, MCAP; no ROS needed", ("rosbags", "mcap"), 45),
     "las": Extra("LAS and LAZ clouds", ("laspy", "lazrs"), 2),
     "live": Extra("run --live: the Rerun viewer while a run goes on", ("rerun",), 670),

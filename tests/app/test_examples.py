@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_example_of_a_public_name_runs(name: str, folder: dict[str, Any]) -> None:
+    if name == "to_open3d" and find_spec("open3d") is None:
+        pytest.skip("the extra open3d is not installed")
     thing = getattr(gs, name)
     finder = doctest.DocTestFinder(recurse=False)
     (found,) = finder.find(thing, name, globs=dict(folder))

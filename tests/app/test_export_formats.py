@@ -89,7 +89,7 @@ def test_pandas_and_open3d(hall: Run) -> None:
     np.testing.assert_array_equal(table[["x", "y", "z"]], hall.map.trajectory.poses[:, :3])
     assert {"sigma_x", "sigma_yaw"} <= set(table.columns)
     if find_spec("open3d"):
-        np.testing.assert_allclose(np.asarray(hall.to_open3d().points), map_points(hall))
+        np.testing.assert_allclose(np.asarray(gs.to_open3d(hall).points), map_points(hall))
 
 
 def test_what_is_missing_is_said(hall: Run, tmp_path: Path) -> None:

@@ -163,20 +163,6 @@ class Run:
         """The path at full rate, a row an instant, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
         return self.map.trajectory.to_pandas()
 
-    def to_open3d(self) -> Any:
-        """The dense map as an ``open3d.geometry.PointCloud`` in the frame of the first base [m].
-
-        Raises
-        ------
-        MissingExtraError
-            The extra ``open3d`` is not installed.
-        MissingDataError
-            The run has no dense map.
-        """
-        from graphslam.app.export import to_open3d
-
-        return to_open3d(self)
-
     def plot(self, ax: Any = None) -> Any:
         """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""
         from graphslam.app.run.figures import draw_map
