@@ -47,7 +47,7 @@ def plot_local_map(
     m = submap.landmarks
     if m is not None and len(m):
         blocks = landmark_blocks(m.dense_covariance(), len(m), offset=3)
-        plot_ellipses(ax, m.positions, blocks, confidence=confidence, label=f"landmark, {confidence:.0%} ellipse")
+        plot_ellipses(ax, m.positions, blocks, confidence=confidence, label=style.ellipses("landmarks", confidence))
         ax.plot(m.positions[:, 0], m.positions[:, 1], ".", color=style.LANDMARK, ms=4, zorder=3)
     if truth is not None:
         exit_pose, _, points = true_submap(submap, truth)

@@ -157,12 +157,12 @@ def plot_map(
         _plot_landmarks(ax, landmarks, covariances, confidence)
     if trajectory is not None:
         p = positions_of(trajectory)
-        ax.plot(p[:, 0], p[:, 1], color=style.ESTIMATE, lw=1.6, label="estimated path", zorder=3)
+        ax.plot(p[:, 0], p[:, 1], color=style.ESTIMATE, lw=1.6, label="path", zorder=3)
         ax.plot(p[0, 0], p[0, 1], "o", color=style.ESTIMATE, ms=6, mec="white", mew=0.8, label="start", zorder=4)
         if pose_ellipses and isinstance(trajectory, Trajectory) and trajectory.covariances is not None:
             k = np.unique(np.linspace(0, len(trajectory) - 1, pose_ellipses).astype(int))
             P = tangent_to_vector_covariance(trajectory.poses[k], trajectory.covariances[k])[:, :2, :2]
-            label = f"path, {confidence:.0%} ellipse"
+            label = style.ellipses("path", confidence)
             plot_ellipses(ax, p[k], P, confidence=confidence, colour=style.ESTIMATE, label=label)
     style.metric_axes(ax)
     if title:
@@ -180,12 +180,12 @@ def _plot_truth(ax: Axes, truth: Truth | Path) -> None:
                 color=style.GREY,
                 ms=5,
                 mew=0.9,
-                label="true landmark",
+                label="true landmarks",
                 zorder=2.2,
             )
         truth = truth.trajectory
     p = positions_of(truth)
-    ax.plot(p[:, 0], p[:, 1], color=style.TRUTH, lw=1.0, ls="--", label="true path", zorder=3.2)
+    ax.plot(p[:, 0], p[:, 1], color=style.TRUTH, lw=1.0, ls="--", label="truth", zorder=3.2)
 
 
 def _plot_landmarks(
@@ -199,7 +199,7 @@ def _plot_landmarks(
     if covariances is not None:
         blocks = landmark_blocks(covariances, len(points))
     if blocks is not None and len(points):
-        label = f"landmark, {confidence:.0%} ellipse"
+        label = style.ellipses("landmarks", confidence)
         plot_ellipses(ax, points, blocks, confidence=confidence, colour=style.LANDMARK, label=label)
-    name: dict[str, Any] = {} if blocks is not None else {"label": "landmark"}
+    name: dict[str, Any] = {} if blocks is not None else {"label": "landmarks"}
     ax.plot(points[:, 0], points[:, 1], ".", color=style.LANDMARK, ms=3, zorder=3.4, **name)

@@ -75,7 +75,7 @@ def plot_method_maps(
         poses, ids, points, blocks = _state(one)
         a, b = match_ids(ids, truth.landmark_ids)
         ax = style.new_axes(ax)
-        ax.plot(path[:, 0], path[:, 1], color=style.TRUTH, lw=0.9, ls="--", label="true path", zorder=2)
+        ax.plot(path[:, 0], path[:, 1], color=style.TRUTH, lw=0.9, ls="--", label="truth", zorder=2)
         ax.plot(marks[b, 0], marks[b, 1], "x", color=style.TRUTH, ms=3, mew=0.7, label="true feature", zorder=3)
         plot_ellipses(ax, points[a], blocks[a], confidence=confidence, label=f"feature, {confidence:.0%} ellipse")
         lines = np.stack([points[a], marks[b]], axis=1)

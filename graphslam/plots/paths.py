@@ -16,10 +16,9 @@ from graphslam.plots.map import plot_ellipses
 
 GRAPH = "graph, before the refinement"
 _COLOURS = {
-    "dead reckoning": style.DEAD_RECKONING,
+    **style.NAMES,
     "RBPF": style.VERMILION,
     "SegSLAM": style.ESTIMATE,
-    GRAPH: style.GRAPH,
 }
 
 
@@ -55,7 +54,7 @@ def plot_paths(
     ----------
     ax : Axes or None
     paths : mapping of label to Trajectory
-        "dead reckoning", "RBPF", "SegSLAM" and :data:`GRAPH` have colours of their own.
+        Those of :data:`graphslam.plots.style.NAMES`, "RBPF" and "SegSLAM" have colours of their own.
     truth : Trajectory or (n, ≥ dim), optional
     ellipses : int
         Of each path that has covariances, spread over its length.
@@ -89,7 +88,7 @@ def plot_paths(
         along = arc_length(path.positions)
         at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ellipses + 1)[1:]).clip(0, len(p) - 1))
         P = position_covariances(path.poses[at], path.covariances[at])[:, ij][:, :, ij]
-        plot_ellipses(ax, p[at], P, confidence=confidence, colour=colour, label=f"{label}, {confidence:.0%}")
+        plot_ellipses(ax, p[at], P, confidence=confidence, colour=colour, label=style.ellipses(label, confidence))
     style.metric_axes(ax, *plane)
     if title:
         ax.set_title(title, fontsize="medium")

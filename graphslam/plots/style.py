@@ -32,6 +32,24 @@ GRAPH = SKY
 """The path of the graph, where a refinement by scans began."""
 BOUNDS = PALE
 
+# … and its name in every legend and layer
+NAMES = {
+    "map": GREY,
+    "path": ESTIMATE,
+    "landmarks": LANDMARK,
+    "truth": TRUTH,
+    "true landmarks": TRUTH,
+    "GPS": GPS,
+    "dead reckoning": DEAD_RECKONING,
+    "graph, before the refinement": GRAPH,
+}
+
+
+def ellipses(of: str, confidence: float = 0.95) -> str:
+    """Name of the ellipses of something, for legends: ``95 % ellipses of the path``."""
+    return f"{100 * confidence:.3g} % ellipses of {'the ' if of == 'path' else ''}{of}"
+
+
 # curves and bars that have no meaning of their own, in order
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 LINE_STYLES = ("-", "--", "-.", ":")

@@ -56,7 +56,7 @@ def test_ellipses_lie_across_a_path_that_is_unsure_across() -> None:
     angles = np.radians(ellipses.get_angles())
     np.testing.assert_allclose(np.abs(np.cos(angles)), 1.0)  # along x: across the path
     labels = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert labels == ["truth", "dead reckoning", "dead reckoning, 95%", "RBPF"]
+    assert labels == ["truth", "dead reckoning", "95 % ellipses of dead reckoning", "RBPF"]
     side = plot_paths(None, {"p": path}, plane="yz", ellipses=1)
     [ellipses] = [c for c in side.collections if isinstance(c, EllipseCollection)]
     np.testing.assert_allclose(ellipses.get_widths(), scale * 0.2)

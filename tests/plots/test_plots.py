@@ -73,12 +73,12 @@ def test_map_draws_path_landmarks_gps_and_truth(log, tmp_path: Path) -> None:
     rendered(ax, tmp_path)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     assert ax.get_aspect() == 1.0
-    assert np.array_equal(line(ax, "estimated path"), est.positions)
-    assert np.array_equal(line(ax, "true path"), t.positions)
+    assert np.array_equal(line(ax, "path"), est.positions)
+    assert np.array_equal(line(ax, "truth"), t.positions)
     assert np.array_equal(line(ax, "GPS"), log["gps"].positions)
-    assert np.array_equal(line(ax, "true landmark"), log.truth.landmarks)
+    assert np.array_equal(line(ax, "true landmarks"), log.truth.landmarks)
     names = legend_of(ax)
-    for name in ("estimated path", "true path", "GPS", "landmark, 95% ellipse", "dead reckoning", "path, 95% ellipse"):
+    for name in ("path", "truth", "GPS", style.ellipses("landmarks"), "dead reckoning", style.ellipses("path")):
         assert name in names
     assert len(names) == len(set(names))
 
@@ -87,7 +87,7 @@ def test_map_takes_plain_arrays_and_parts_of_it(tmp_path: Path) -> None:
     p = np.random.default_rng(0).normal(size=(10, 2))
     ax = plot_map(trajectory=p, landmarks=p, gps=p, truth=p)
     rendered(ax, tmp_path)
-    assert "landmark" in legend_of(ax)
+    assert "landmarks" in legend_of(ax)
     plot_map(landmarks=p[:0])
     with pytest.raises(GeometryError, match="wrong shape"):
         plot_map(trajectory=p[0])

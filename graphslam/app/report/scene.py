@@ -51,10 +51,10 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
     if m.trajectory.covariances is not None:
         at = np.unique(np.linspace(0, len(m.trajectory) - 1, ELLIPSES).astype(np.int64))
         P = position_covariances(m.trajectory.poses[at], m.trajectory.covariances[at])
-        layers.append(_ellipses("95 % ellipses of the path", style.ESTIMATE, m.trajectory.positions[at], P))
+        layers.append(_ellipses(style.ellipses("path"), style.ESTIMATE, m.trajectory.positions[at], P))
     if len(m.landmarks):
         layers.append(_points("landmarks", style.LANDMARK, m.landmarks, size=5.0))
-        name = "95 % ellipses of landmarks"
+        name = style.ellipses("landmarks")
         layers.append(_ellipses(name, style.LANDMARK, m.landmarks, m.landmark_covariances))
     layers += [*above, *_loops(folder, m)]
     return {"dim": m.dim, "layers": layers}

@@ -91,7 +91,7 @@ def _as_solved(run: Run) -> list[Submap]:
 
 def _draw_paths(run: Run, ax: Any, plane: str) -> Any:
     """A map in space: its path from above or from the side, with what it claims to know, truth and dead reckoning."""
-    paths = {run.name: run.map.trajectory}
+    paths = {"path": run.map.trajectory}
     if run.graph_path is not None:
         paths[GRAPH] = Trajectory(run.graph_path.times, run.graph_path.poses)  # its ellipses would hide the map's
     reckoned = _fitting(run.dead_reckoning, run.map.trajectory)
