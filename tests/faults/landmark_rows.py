@@ -175,6 +175,7 @@ ODOMETRY: list[tuple[str, inject.Inject, Outcome, str]] = [
 MILLIMETRES = ("ranges × 1000", inject.ranges(1000.0))
 KILOMETRES = ("ranges × 0.001", inject.ranges(0.001))
 HARDLY = "ranges hardly change while the robot drives"
+OF_FIXES = "chi2|consistency-test|gps-correlated|gps-errors"
 GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
     ("another time base", _gps(lambda g, _: replace(g, times=g.times + 1e6)), "reported", "gps-not-used"),
     (
@@ -185,10 +186,10 @@ GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
     ),
     ("degrees of longitude and latitude", _gps(_degrees), "reported", "gps-scale"),
     ("axes swapped", _gps(lambda g, _: replace(g, positions=g.positions[:, ::-1].copy())), "reported", "gps-mirrored"),
-    ("bursts of outliers", _gps(_bursts), "reported", "chi2|consistency-test"),
-    ("slow ramp", _gps(_ramp), "reported", "chi2|consistency-test"),
-    ("lag of 1 s", _gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", "chi2|consistency-test"),
-    ("error that lasts 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", "chi2|consistency-test"),
+    ("bursts of outliers", _gps(_bursts), "reported", OF_FIXES),
+    ("slow ramp", _gps(_ramp), "reported", OF_FIXES),
+    ("lag of 1 s", _gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", OF_FIXES),
+    ("error that lasts 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", OF_FIXES),
     ("error that lasts 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
     ("only at the start", _gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
     ("off by 1 km, constantly", _gps(lambda g, _: replace(g, positions=g.positions + [800.0, -600.0])), "handled", ""),
