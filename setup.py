@@ -3,6 +3,11 @@
 from setuptools import find_packages, setup
 
 setup(
-    packages=[*find_packages(include=["graphslam*"]), "graphslam.app.presets", "graphslam.cards"],
+    packages=[
+        *find_packages(include=["graphslam*"]),
+        "graphslam.app.presets",
+        "graphslam.app.report.templates",
+        "graphslam.cards",
+    ],
     package_dir={"graphslam.cards": "datasets"},
 )
