@@ -161,14 +161,15 @@ def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str
         again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
         dof = record.rows - 2.0 * w * h + again
         name = JUDGED_WITH.get(record.group, record.group)
-        sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w)))
+        own = float(name == record.group)  # points of a path are no fixes
+        sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w), own))
     series = _series(graph, covariance)
     out = {}
     for name, rows in sums.items():
-        n, leverage, dof, chi2, weight = np.array(rows).T
+        n, leverage, dof, chi2, weight, own_factors = np.array(rows).T
         out[name] = ClassConsistency(
             name=name,
-            factors=len(rows),
+            factors=int(own_factors.sum()),
             rows=int(n.sum()),
             leverage=float(leverage.sum()),
             dof=float(dof.sum()),

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from graphslam.core.cluster import connect, require_distributed
+from graphslam.core.cluster import connect
 from graphslam.core.errors import ConfigError, CovarianceError, IndeterminateError
+from graphslam.core.extras import import_extra
 from graphslam.core.submap import Submap
 from graphslam.join.association import Association
 from graphslam.join.joined_map import JoinedMap, JoinResult
@@ -27,7 +28,7 @@ def chain() -> list[Submap]:
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     """Two workers, two processes."""
-    with require_distributed().LocalCluster(
+    with import_extra("distributed", "a Dask cluster").LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
         yield cluster.scheduler_address

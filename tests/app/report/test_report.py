@@ -179,7 +179,12 @@ def test_graph_records_and_evidence(folder: Path, whole: Page) -> None:
     read_ = {r["stream"]: r for r in page.table("records", "stream", "used").records()}
     assert {k: int(r["records"]) for k, r in read_.items()} == report["records_read"]
     spent = {(r["stream"], r["spent by"]): r for r in page.table("evidence", "spent by").records()}
-    assert set(spent) == {("controls", "submap"), ("landmarks", "submap"), ("gps", "GPS fix")}
+    assert set(spent) == {
+        ("controls", "submap"),
+        ("landmarks", "submap"),
+        ("gps", "GPS fix"),
+        ("-", "path of submap"),
+    }
     assert spent["gps", "GPS fix"]["factors"] == rows["gps"]["factors"]
     assert read_["gps"]["used"] == f"in {rows['gps']['factors']} factors"
     assert "What the log says of itself" in page.sections["run"]

@@ -114,7 +114,7 @@ def test_simulated_log_brings_its_own_noise():
 def test_every_option_of_gps_and_imu_can_be_set_and_comes_back_from_toml():
     """One definition each: the factors' own options and those of the run are the same."""
     gps = {"use": "all", "sigma": 0.5, "baseline": 7.0, "bias_sigma": 1.5, "segment_gap": 3.0, "every": 2.0}
-    gps |= {"bias_time": 60.0}
+    gps |= {"bias_time": 60.0, "errors": "stated"}
     imu = {"use": "auto", "longest": 4.0, "pause": 0.3, "accelerometer": False, "gravity": False, "window": 2.0}
     imu |= {"acceleration": 0.1, "still": 0.02, "axes": "warn"}
     values = {

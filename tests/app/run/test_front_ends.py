@@ -45,7 +45,7 @@ def test_a_front_end_without_motion_is_not_given_any(monkeypatch: pytest.MonkeyP
     assert values == {}
     assert front_ends.make_front_end("plain", values.get("frontend", {})).config == Plain()
     with pytest.raises(UnknownNameError, match="plain"):
-        front_ends.recommended(log, "rbpf-ekf")
+        front_ends.make_front_end("rbpf-ekf", {})
 
 
 @pytest.mark.parametrize(("before", "after"), [(None, "1"), ("3", "3")])

@@ -256,6 +256,7 @@ def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], 
         patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
         patch.setattr(pipeline, "recommended", lambda *_: {})
         patch.setattr(pipeline, "load_log_source", lambda *_, **__: log_of(drives[1], "again", 1))
+        patch.setattr(pipeline, "check_name", lambda *_: None)
         arguments = ["run", "again", "--frontend", "ready", "--continue", str(runs[0].folder), "--json"]
         out = tmp_path / "again"
         done = CliRunner().invoke(app, [*arguments, "--out", str(out)], catch_exceptions=False)
