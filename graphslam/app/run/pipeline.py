@@ -367,7 +367,14 @@ def _solved(
     A graph without a loop and one with a wrong loop both show in the fused map: walls of one pass stand in what another
     one saw to be free. So the front end's matches alone are tried first, then loops that the back end looks for.
     """
-    first = _finished(taken, settings, submaps, back, dict(seconds), begin, work, effective, undo)
+
+    def made(back: BackEnd) -> Run:
+        solution = back.finish(undo)
+        spent = seconds | {"frontend": work.seconds} | {f"backend_{k}": v for k, v in back.seconds.items()}
+        spent |= {"backend": sum(back.seconds.values()), "total": time.perf_counter() - begin}
+        return _judge(taken, settings, submaps, back, solution, spent, work, effective)
+
+    first = made(back)
     before = None if first.fused is None else first.fused.passes
     if settings.backend.loops != "auto" or before is None or not before.denies:
         return first
@@ -376,34 +383,14 @@ def _solved(
     other = back_end(Feed(taken.log), looking, effective["run"]["solver"], ())
     for s in submaps:
         other.add(s)
-    second = _finished(taken, settings, submaps, other, dict(seconds), begin, work, effective, undo)
+    second = made(other)
     after = None if second.fused is None else second.fused.passes
     kept = second if after is not None and after.agrees_better(before) else first
     told = {name: None if p is None else p.facts() for name, p in (("matches", before), ("loops", after))}
-    return again_judged(kept, {**told, "kept": "loops" if kept is second else "matches"})
+    return _one_of_two(kept, {**told, "kept": "loops" if kept is second else "matches"})
 
 
-def _finished(
-    taken: Taken,
-    settings: cfg.RunConfig,
-    submaps: list[Submap],
-    back: BackEnd,
-    seconds: dict[str, float],
-    begin: float,
-    work: FrontEndWork,
-    effective: dict[str, Any],
-    undo: Sequence[int | Decision],
-) -> Run:
-    """The run of one back end."""
-    solution = back.finish(undo)
-    seconds["frontend"] = work.seconds
-    seconds |= {f"backend_{k}": v for k, v in back.seconds.items()}
-    seconds["backend"] = sum(back.seconds.values())
-    seconds["total"] = time.perf_counter() - begin
-    return _judge(taken, settings, submaps, back, solution, seconds, work, effective)
-
-
-def again_judged(run: Run, attempts: Mapping[str, Any]) -> Run:
+def _one_of_two(run: Run, attempts: Mapping[str, Any]) -> Run:
     """A run that is one of two, with what became of the other in its report and verdict."""
     report = {**run.report, "map_attempts": dict(attempts)}
     figures = Figures(report, dict(zip(run.metrics["key"], run.metrics["value"])), run.events)
