@@ -283,12 +283,8 @@ def seen_columns(T, n, ob_pose, ob_lm):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def smoothed_covariances(poses, landmarks, evidence):
-    """Laplace covariances at the optimum, Gauss-Newton Hessian.
-
-    Returns the joint covariance (3 + 2L, …) of {exit pose (right tangent), landmarks} and the marginal covariances
-    (T, 3, 3) of every pose (right tangent), by the backward recursion of the same elimination.
-    """
+def _at_optimum(poses, landmarks, evidence):
+    """The elimination ``(Ainv, B, C)`` at the optimum, and the joint covariance of {exit pose, landmarks}."""
     T, n = len(poses), 2 * len(landmarks)
     A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
     H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
@@ -298,6 +294,18 @@ def smoothed_covariances(poses, landmarks, evidence):
     _eliminate(normal, last_seen, Ainv)
     joint = np.linalg.inv(_reduced(A, C, H))
     joint = 0.5 * (joint + joint.T)
+    return Ainv, B, C, joint
+
+
+@numba.njit(cache=True, error_model="numpy")
+def smoothed_covariances(poses, landmarks, evidence):
+    """Laplace covariances at the optimum, Gauss-Newton Hessian.
+
+    Returns the joint covariance (3 + 2L, …) of {exit pose (right tangent), landmarks} and the marginal covariances
+    (T, 3, 3) of every pose (right tangent), by the backward recursion of the same elimination.
+    """
+    T = len(poses)
+    Ainv, B, C, joint = _at_optimum(poses, landmarks, evidence)
     marginal = np.empty((T, 3, 3))
     marginal[T - 1] = joint[:3, :3]
     Sl = joint[3:, 3:].copy()
@@ -335,14 +343,7 @@ def path_covariances(poses, landmarks, evidence, at, G0, G1):
     own : (2q, 2q)
     """
     T, n, q = len(poses), 2 * len(landmarks), len(at)
-    A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
-    H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
-    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
-    normal = Normal(A, B, C, H, g, gl)
-    _linearise(poses, landmarks, evidence, normal)
-    _eliminate(normal, last_seen, Ainv)
-    joint = np.linalg.inv(_reduced(A, C, H))
-    joint = 0.5 * (joint + joint.T)
+    Ainv, B, C, joint = _at_optimum(poses, landmarks, evidence)
     Sl = joint[3:, :].copy()  # landmarks with {exit, landmarks}
     Y1, S1 = joint[:3, :].copy(), joint[:3, :3].copy()  # pose k + 1 with {exit, landmarks}, and with itself
     Z1 = np.zeros((3, 2 * q))  # pose k + 1 with the points so far
