@@ -29,6 +29,8 @@ class FrontEnd(Protocol):
     """
 
     name: ClassVar[str]
+    draws: ClassVar[bool] = False
+    """Are its submaps drawn, so that another branch of the seed tree gives others?"""
     config: Any
 
     def submaps(

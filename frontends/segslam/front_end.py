@@ -54,6 +54,7 @@ class SegSlam(StepwiseFrontEnd):
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
     name: ClassVar[str] = "segslam"
+    draws: ClassVar[bool] = True
 
     def submaps(
         self,

@@ -93,6 +93,9 @@ class BackEndConfig:
     """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
     The front end's matches are decided on with them; without, each that has the support is a factor. "auto": a run
     looks for them where passes of its fused map deny each other, and keeps the map in which fewer points are denied."""
+    draws: int = 2
+    """A run whose maps are still denied makes its submaps anew of other random numbers, so many draws in all, and keeps
+    the map in which the fewest points are denied; 1 = never."""
     look_every: int = 5
     """While the run goes on, tie in IMUs and look for loops after every so many submaps, too; 0 = at the end only."""
     loop_overlap: float = 8.0

@@ -50,8 +50,17 @@ NOT_OWNED = ("figures/progress.png",)
 """Written while a run goes on, and of no generation."""
 _PARTS = ("figures", "alternatives", "inputs", "refined")
 """Folders of a state."""
-_FOLDERS = (GENERATIONS, "submaps", "trials", *_PARTS)
-_READ = (*OWNED, *NOT_OWNED, *_FOLDERS, *(f"{f}/*" for f in _FOLDERS[:3]), CURRENT, "config.toml", "study.json")
+_FOLDERS = (GENERATIONS, "submaps", "submaps-*", "trials", *_PARTS)
+_READ = (
+    *OWNED,
+    *NOT_OWNED,
+    *_FOLDERS,
+    *(f"{f}/*" for f in _FOLDERS[:4]),
+    CURRENT,
+    "config.toml",
+    "draws.json",
+    "study.json",
+)
 """Names, as shell patterns, that our readers follow and our writers write to."""
 _NUMBER = re.compile(r"\d{6,}")
 _LINK_NAMES = re.compile(r"(\.\./)*current/.+")
@@ -244,7 +253,7 @@ def sweep(folder: str | os.PathLike[str]) -> None:
     for name in _numbers(home):
         if target != f"{GENERATIONS}/{name}":
             shutil.rmtree(home / GENERATIONS / name, ignore_errors=True)
-    for part in (home, home / "submaps", *(home / p for p in _PARTS)):
+    for part in (home, *home.glob("submaps*"), *(home / p for p in _PARTS)):
         if part.is_symlink() or not part.is_dir():
             continue
         sweep_parts(part)

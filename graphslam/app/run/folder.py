@@ -8,21 +8,44 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import shutil
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.generations import check_links, is_empty, outputs, sweep
 from graphslam.app.folders.lock import locked, make_folder
-from graphslam.core.atomic import atomic_open
+from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
+from graphslam.core.reading import inside
 from graphslam.io.submap_store import GridLoader, SubmapStore
 
 logger = logging.getLogger(__name__)
-CONFIG = "config.toml"
+CONFIG, SUBMAPS, DRAWS = "config.toml", "submaps", "draws.json"
+_DRAWS_FORMAT = "graphslam.draws/1"
+_BEATEN = "submaps-beaten"
+_ANOTHER = re.compile(r"submaps-(beaten|\d)")
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """Which draw of random numbers the submaps of a folder are, where there were several.
+
+    Parameters
+    ----------
+    draw : int
+        0 of the first one.
+    attempts : list of dict
+        What was solved, in order, and what the passes of each map said.
+    """
+
+    draw: int
+    attempts: list[dict[str, Any]]
 
 
 class RunFolder:
@@ -67,6 +90,7 @@ class RunFolder:
                 folder._check_same(old, config)
             else:
                 folder.describe(config)
+            folder._undo_settling()
             sweep(folder.path)
             yield folder
 
@@ -100,9 +124,51 @@ class RunFolder:
         """Store of the finished submaps."""
         return self.submaps_with(None)
 
-    def submaps_with(self, load_grid: GridLoader | None) -> SubmapStore:
-        """Store of the finished submaps, whose grids are read too where a reader is given."""
-        return SubmapStore(self.path / "submaps", load_grid=load_grid)
+    def submaps_with(self, load_grid: GridLoader | None, draw: int | None = None) -> SubmapStore:
+        """Store of the finished submaps, whose grids are read too where a reader is given.
+
+        Those of another draw than the folder settled on, which are being made, have a store of their own.
+        """
+        return SubmapStore(self.path / (SUBMAPS if draw is None else f"{SUBMAPS}-{draw}"), load_grid=load_grid)
+
+    def settled(self) -> Settled | None:
+        """Which draw the submaps are, where several were made and one was chosen.
+
+        Raises
+        ------
+        FormatError
+        """
+        file = inside(self.path, DRAWS, str(self.path))
+        if not file.exists():
+            return None
+        said = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})
+        return Settled(said["draw"], said["attempts"])
+
+    def settle(self, draw: int, attempts: list[dict[str, Any]]) -> None:
+        """Keep the submaps of one draw as those of the run, and drop the others.
+
+        Until the file that says so is written, a folder that was left half way is put back as it was
+        (:meth:`_undo_settling`).
+        """
+        if draw:
+            (self.path / SUBMAPS).rename(self.path / _BEATEN)
+            (self.path / f"{SUBMAPS}-{draw}").rename(self.path / SUBMAPS)
+        write_json(self.path / DRAWS, {"format": _DRAWS_FORMAT, "draw": draw, "attempts": attempts})
+        self._drop_beaten()
+
+    def _drop_beaten(self) -> None:
+        for old in self.path.glob(f"{SUBMAPS}-*"):
+            if old.is_dir() and not old.is_symlink() and _ANOTHER.fullmatch(old.name):
+                shutil.rmtree(old, ignore_errors=True)
+
+    def _undo_settling(self) -> None:
+        """After a kill: what was not settled begins where it was; what was is cleared up."""
+        if (self.path / DRAWS).is_file():
+            self._drop_beaten()
+        elif (self.path / _BEATEN).is_dir():
+            if (self.path / SUBMAPS).is_dir():  # the draw that had won is made again
+                shutil.rmtree(self.path / SUBMAPS)
+            (self.path / _BEATEN).rename(self.path / SUBMAPS)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], where: str = "") -> Iterable[tuple[str, Any, Any]]:

@@ -76,14 +76,29 @@ class FrontToBack:
         Where submaps are stored; those that are there already are not made again.
     with_grids : bool
         The grids of stored submaps are needed.
+    draw : int, optional
+        Which draw of random numbers it is; by default the first one, or that which the folder settled on.
     """
 
     def __init__(
-        self, feed: Feed, front: FrontEnd, back: BackEnd, seed: SeedTree, folder: RunFolder | None, with_grids: bool
+        self,
+        feed: Feed,
+        front: FrontEnd,
+        back: BackEnd,
+        seed: SeedTree,
+        folder: RunFolder | None,
+        with_grids: bool,
+        draw: int | None = None,
     ) -> None:
-        self.front, self.back, self.feed = front, back, feed
+        self.front, self.back, self.feed, self.folder = front, back, feed, folder
+        self._seed, self._with_grids = seed, with_grids
         self.drops = DropCounter()
-        self.store = None if folder is None else folder.submaps_with(load_npz if with_grids else None)
+        self.settled = None if folder is None else folder.settled()
+        """What earlier draws of the folder came to, where that is decided."""
+        settled = 0 if self.settled is None else self.settled.draw
+        self.draw = settled if draw is None else draw
+        of = None if self.draw == settled else self.draw
+        self.store = None if folder is None else folder.submaps_with(load_npz if with_grids else None, draw=of)
         self.submaps: list[Submap] = self.store.complete_prefix() if self.store is not None else []
         if self.store is not None:
             self.store.truncate(len(self.submaps))
@@ -93,7 +108,8 @@ class FrontToBack:
         if last is not None:
             logger.info("resumed after submap %d at %.2f s", last.key, last.interval[1])
         self._resumed, self._seconds, self._since, self._cost = len(self.submaps), 0.0, 0.0, list[float]()
-        self._stream = front.follow(feed, seed=seed.child("frontend"), after=last, drops=self.drops, watch=self._watch)
+        drawn = seed.child("draw", self.draw, "frontend") if self.draw else seed.child("frontend")
+        self._stream = front.follow(feed, seed=drawn, after=last, drops=self.drops, watch=self._watch)
 
     def step(self) -> None:
         """Use what has come; at the end of the log everything is used."""
@@ -112,6 +128,11 @@ class FrontToBack:
             self.submaps.append(submap)
             self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
             self._since = 0.0
+
+    def drawn_anew(self, back: BackEnd) -> FrontToBack:
+        """The same log with the next draw of random numbers, for another back end."""
+        feed = Feed(self.feed.log)
+        return FrontToBack(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
 
     @property
     def work(self) -> FrontEndWork:

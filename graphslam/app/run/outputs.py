@@ -60,7 +60,17 @@ OF_THE_CLOCK = ("seconds", RESUMED)
 
 
 SAME_BYTES = (
-    *("config.toml", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
+    *(
+        "config.toml",
+        "draws.json",
+        "submaps/*",
+        "run.json",
+        "metrics.json",
+        "events.jsonl",
+        "ledger.csv",
+        "landmarks.csv",
+        "map.npz",
+    ),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
     *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
     *("scans.npz", "trajectory_graph.tum", "refined/*", "figures/refined.png"),

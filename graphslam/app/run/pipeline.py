@@ -6,7 +6,7 @@ import logging
 import time
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import Decision
+from graphslam.maps.contradictions import Contradictions
 from graphslam.maps.global_map import GlobalMap, make_map
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
@@ -227,7 +228,7 @@ def _run(
         tree = SeedTree(seed)
         work = FrontToBack(Feed(log), front, back, tree, folder, with_grids(settings))
         work.step()
-        return finished(log, work, settings, effective, seconds, begin, undone, noticed)
+        return finished(log, work, settings, effective, seconds, begin, undone, noticed, progress=progress)
 
     if out is None:
         return finish(None, undo or ())
@@ -253,20 +254,49 @@ def finished(
     begin: float,
     undo: Sequence[int | Decision],
     noticed: Sequence[Noticed],
+    *,
+    progress: bool,
 ) -> Run:
-    """The run of a log whose submaps are all in the graph of the back end: solved and judged."""
+    """The run of a log whose submaps are all in the graph of the back end: solved and judged.
+
+    Where the passes of its map deny each other, as they do when the particles lost their way, particles are drawn anew
+    and the better map is kept. A folder that settled on a draw before, or of which loops were taken out by hand, keeps
+    its own.
+    """
     if not work.submaps:
         raise MissingDataError("the log gave no submap", where=log.name)
     front = work.front
     steps = front.steps(log) if settings.refine.use else None
     scans = None if steps is None else Scans.of(steps)
     del steps
-    front.forget()
+    at_rest(work)
+    taken = take(log, work.drops.counts, reference_identities(log, front), noticed, scans)
+    attempts = _Attempts([] if work.settled is None else work.settled.attempts)
+
+    def solve() -> _Attempt:
+        made = work.submaps, work.back, seconds, begin, work.work, effective, undo
+        _solved(taken, settings, *made, work.draw, attempts)
+        assert attempts.best is not None
+        return attempts.best
+
+    best = solve()
+    while best.denied and front.draws and work.settled is None and not undo and work.draw + 1 < settings.backend.draws:
+        logger.warning("passes of the map still deny each other: submaps are made anew of other random numbers")
+        bars = [ProgressBar(log, progress)]
+        work = work.drawn_anew(back_end(Feed(log), settings, effective["run"]["solver"], bars))
+        work.step()
+        at_rest(work)
+        best = solve()
+    if work.folder is not None and work.settled is None and work.draw:
+        work.folder.settle(best.draw, attempts.of_others(best.draw))
+    return replace(attempts.result(), log=log)
+
+
+def at_rest(work: FrontToBack) -> None:
+    """Let go of what making the submaps took."""
+    work.front.forget()
     move([s.grid for s in work.submaps if isinstance(s.grid, EvidenceGrid)])
     give_back()
-    taken = take(log, work.drops.counts, reference_identities(log, front), noticed, scans)
-    result = _solved(taken, settings, work.submaps, work.back, seconds, begin, work.work, effective, undo)
-    return replace(result, log=log)
 
 
 def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
@@ -300,8 +330,11 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
         for s in submaps:
             back.add(s)
         work = FrontEndWork(0.0, len(submaps), np.zeros(0))
-        result = _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo)
-        return write_outputs(root, result)
+        settled = RunFolder(root).settled()
+        draw, earlier = (0, []) if settled is None else (settled.draw, settled.attempts)
+        attempts = _Attempts(earlier)
+        _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo, draw, attempts)
+        return write_outputs(root, attempts.result())
 
 
 def solve_again(folder: str | Path) -> tuple[PoseGraph, Solution]:
@@ -351,6 +384,82 @@ def with_grids(settings: cfg.RunConfig) -> bool:
     return bool(settings.backend.looks or settings.map.fuse)
 
 
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """One graph that was solved for a run.
+
+    Parameters
+    ----------
+    run : Run
+    draw : int
+        Of the random numbers its submaps were made of.
+    loops : bool
+        With loops that the back end looked for.
+    """
+
+    run: Run
+    draw: int
+    loops: bool
+
+    @property
+    def passes(self) -> Contradictions | None:
+        """What the passes of its map say of each other; None where it has no fused map."""
+        return None if self.run.fused is None else self.run.fused.passes
+
+    @property
+    def denied(self) -> bool:
+        """Do passes of its map deny each other?"""
+        return self.passes is not None and self.passes.denies
+
+    def beats(self, other: _Attempt) -> bool:
+        """Do its passes deny each other less?"""
+        known = self.passes is not None and other.passes is not None
+        return known and self.passes.agrees_better(other.passes)  # type: ignore[union-attr, arg-type]
+
+    def row(self) -> dict[str, Any]:
+        """What a report says of it, JSON-serialisable."""
+        facts = {"share": None} if self.passes is None else self.passes.facts()
+        return {"draw": self.draw, "loops": self.loops, **facts}
+
+
+class _Attempts:
+    """Graphs that were solved for a run, of which the best is kept; maps of the others take no memory.
+
+    Parameters
+    ----------
+    earlier : sequence of dict
+        Rows of draws that a folder settled on not to use.
+    """
+
+    def __init__(self, earlier: Sequence[Mapping[str, Any]] = ()) -> None:
+        self.rows = [dict(r) for r in earlier]
+        self.best: _Attempt | None = None
+
+    def add(self, attempt: _Attempt) -> None:
+        """One more."""
+        self.rows.append(attempt.row())
+        if self.best is None or attempt.beats(self.best):
+            self.best = attempt
+
+    def of_others(self, draw: int) -> list[dict[str, Any]]:
+        """Rows of all draws but one."""
+        return [r for r in self.rows if r["draw"] != draw]
+
+    def result(self) -> Run:
+        """The best run, with what became of the others in its report and verdict."""
+        best = self.best
+        assert best is not None
+        if len(self.rows) < 2:
+            return best.run
+        rows = sorted(self.rows, key=lambda r: (r["draw"], r["loops"]))
+        rows = [{**r, "kept": (r["draw"], r["loops"]) == (best.draw, best.loops)} for r in rows]
+        report = {**best.run.report, "map_attempts": rows}
+        figures = Figures(report, dict(zip(best.run.metrics["key"], best.run.metrics["value"])), best.run.events)
+        lines = verdict(figures)
+        report["verdict"] = verdict_json(summary(figures, lines), lines)
+        return replace(best.run, report=report)
+
+
 def _solved(
     taken: Taken,
     settings: cfg.RunConfig,
@@ -361,41 +470,32 @@ def _solved(
     work: FrontEndWork,
     effective: dict[str, Any],
     undo: Sequence[int | Decision],
-) -> Run:
-    """The run of a back end that has all submaps; where its passes deny each other the better of two.
+    draw: int,
+    attempts: _Attempts,
+) -> None:
+    """Try the graph of a back end that has all submaps; where its passes deny each other a second one with loops.
 
     A graph without a loop and one with a wrong loop both show in the fused map: walls of one pass stand in what another
     one saw to be free. So the front end's matches alone are tried first, then loops that the back end looks for.
     """
 
-    def made(back: BackEnd) -> Run:
+    def made(back: BackEnd) -> _Attempt:
         solution = back.finish(undo)
         spent = seconds | {"frontend": work.seconds} | {f"backend_{k}": v for k, v in back.seconds.items()}
         spent |= {"backend": sum(back.seconds.values()), "total": time.perf_counter() - begin}
-        return _judge(taken, settings, submaps, back, solution, spent, work, effective)
+        run = _judge(taken, settings, submaps, back, solution, spent, work, effective)
+        return _Attempt(run, draw, back.config.looks)
 
     first = made(back)
-    before = None if first.fused is None else first.fused.passes
-    if settings.backend.loops != "auto" or before is None or not before.denies:
-        return first
+    attempts.add(first)
+    if settings.backend.loops != "auto" or not first.denied:
+        return
     looking = replace(settings, backend=replace(settings.backend, loops=True))
     logger.warning("passes of the map deny each other: looking for loops between submaps")
     other = back_end(Feed(taken.log), looking, effective["run"]["solver"], ())
     for s in submaps:
         other.add(s)
-    second = made(other)
-    after = None if second.fused is None else second.fused.passes
-    kept = second if after is not None and after.agrees_better(before) else first
-    told = {name: None if p is None else p.facts() for name, p in (("matches", before), ("loops", after))}
-    return _one_of_two(kept, {**told, "kept": "loops" if kept is second else "matches"})
-
-
-def _one_of_two(run: Run, attempts: Mapping[str, Any]) -> Run:
-    """A run that is one of two, with what became of the other in its report and verdict."""
-    report = {**run.report, "map_attempts": dict(attempts)}
-    figures = Figures(report, dict(zip(run.metrics["key"], run.metrics["value"])), run.events)
-    lines = verdict(figures)
-    return replace(run, report={**report, "verdict": verdict_json(summary(figures, lines), lines)})
+    attempts.add(made(other))
 
 
 def gps_stream(log: SensorLog) -> Gps | None:

@@ -239,7 +239,7 @@ class Slam:
             effective = with_digest(effective, log)
             self._folder.describe(effective)
         work.step()
-        result = finished(log, work, self._settings, effective, seconds, begin, (), noticed)
+        result = finished(log, work, self._settings, effective, seconds, begin, (), noticed, progress=False)
         return result if self._folder is None else write_outputs(self._folder.path, result)
 
     def _closing_on_error(self) -> ExitStack:

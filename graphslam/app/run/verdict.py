@@ -111,7 +111,7 @@ _STATED = frozenset(
         "map-left-out",
         "map-coarser",
         "passes",
-        "passes-two-graphs",
+        "passes-attempts",
         "flagged",
         "imu-axes",
     }
@@ -494,21 +494,28 @@ def _passes(found: Mapping[str, Any]) -> list[Finding]:
     return [Finding("bad" if share > DENIED else "look", "passes", text)]
 
 
-def _attempts(found: Mapping[str, Any]) -> list[Finding]:
-    """Of two graphs of the same submaps, which one was kept, and why."""
-    shares = [p.get("share") if isinstance(p := found.get(n), Mapping) else None for n in ("matches", "loops")]
-    if not all(s is None or isinstance(s, float) for s in shares) or "kept" not in found:
+def _attempts(rows: Any) -> list[Finding]:
+    """Of several graphs that were solved, which one was kept, and why."""
+    if not (isinstance(rows, list) and len(rows) > 1 and all(isinstance(r, Mapping) for r in rows)):
         return []
-    matches, loops = ("an unknown share" if s is None else f"{s:.1%}" for s in shares)
-    took = found["kept"] == "loops"
+    draws = len({r.get("draw") for r in rows})
+    told = []
+    for r in rows:
+        share = r.get("share")
+        denied = f"{share:.1%}" if isinstance(share, float) else "an unknown share"
+        of = f" of draw {r.get('draw')}" if draws > 1 else ""
+        told.append(f"{'with loops that were looked for' if r.get('loops') else 'with matches alone'}{of} {denied}")
+    kept = next((k for k, r in enumerate(rows) if r.get("kept")), None)
+    if kept is None:
+        return []
+    what = f"of {draws} draws of the particles" if draws > 1 else "of the same submaps"
     text = (
-        "Two graphs of the same submaps were tried: with the front end's matches alone passes of the map deny "
-        f"{matches} of each other's points, with loops that were looked for {loops}. The "
-        f"{'second' if took else 'first'} is the "
-        "result" + ("; its loops are those of `graphslam loops`." if took else ".")
+        f"{len(rows)} graphs {what} were tried. Passes of their maps deny so much of each other's points: "
+        f"{', '.join(told)}. Number {kept + 1} is the result"
+        + ("; its loops are those of `graphslam loops`." if rows[kept].get("loops") else ".")
     )
-    settled = isinstance(share := shares[took], float) and share <= LOOK
-    return [Finding("" if settled else "look", "passes-two-graphs", text)]
+    settled = isinstance(share := rows[kept].get("share"), float) and share <= LOOK
+    return [Finding("" if settled else "look", "passes-attempts", text)]
 
 
 def _left_out(figures: Figures) -> list[Finding]:
@@ -517,7 +524,7 @@ def _left_out(figures: Figures) -> list[Finding]:
         out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
     if figures.report.get("map_coarser"):
         out.append(Finding("look", "map-coarser", str(figures.report["map_coarser"])))
-    out += [*_passes(figures.part("map_passes")), *_attempts(figures.part("map_attempts")), *_flagged(figures)]
+    out += [*_passes(figures.part("map_passes")), *_attempts(figures.report.get("map_attempts")), *_flagged(figures)]
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))

@@ -255,10 +255,10 @@ def test_passes_that_deny_each_other_are_given_loops(
     assert looked == [False, True]
     assert next(said, None) is None
     attempts = r.report["map_attempts"]
-    assert attempts["kept"] == kept
-    assert (attempts["matches"]["share"], attempts["loops"]["share"]) == (0.4, denied / 100)
+    assert [a["kept"] for a in attempts] == [kept == "matches", kept == "loops"]
+    assert [(a["draw"], a["loops"], a["share"]) for a in attempts] == [(0, False, 0.4), (0, True, denied / 100)]
     assert r.metric("map_denied") == (denied / 100 if kept == "loops" else 0.4)
-    line = next(f for f in r.verdict if f.code == "passes-two-graphs")
+    line = next(f for f in r.verdict if f.code == "passes-attempts")
     assert line.level == ("" if kept == "loops" else "look")
     assert open_run(copy).verdict == r.verdict
 
@@ -343,3 +343,49 @@ def test_scans_are_read_again_as_they_were(finished: Run) -> None:
     for name in ("times", "offsets", "points", "origins", "returns", "tilt"):
         np.testing.assert_array_equal(getattr(read, name), getattr(scans, name))
     assert read.lasting == scans.lasting
+
+
+@pytest.mark.parametrize(("second", "settled"), [(50, True), (0, False)])
+def test_particles_are_drawn_anew_where_passes_still_deny_each_other(
+    tmp_path: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch, second: int, settled: bool
+) -> None:
+    """The better draw is the run's, also after a kill before or after the folder settled on it."""
+
+    def told(share: int) -> Contradictions:
+        return Contradictions(np.array([[0, 2]]), np.array([1000 - 10 * share]), np.array([10 * share]))
+
+    log, folder = drive(9), tmp_path / "run"
+    options: dict[str, Any] = {"refine": {"use": False}, "backend": {"loops": "auto"}}
+    shares: list[int] = []
+
+    def say(*values: int) -> None:
+        shares[:] = values
+        monkeypatch.setattr(run_map, "contradictions", lambda *_: told(shares.pop(0)))
+
+    say(40, 40, second, *([60] if second else []))
+    r = made(log, folder, **options)
+    assert not shares
+    rows = r.report["map_attempts"]
+    assert [(a["draw"], a["loops"]) for a in rows] == [(0, False), (0, True), (1, False), (1, True)][: len(rows)]
+    assert next(a["draw"] for a in rows if a["kept"]) == (0 if second else 1)
+    assert sorted(p.name for p in folder.glob("submaps*")) == ["submaps"]
+    before = snapshot(folder, SAME_BYTES)
+    assert "draws.json" in before
+
+    # killed while it was settling, or just before its state was written
+    if not settled:
+        (folder / "draws.json").unlink()
+        if not second:
+            (folder / "submaps").rename(folder / "submaps-1")
+            say(0)
+            assert made(log, tmp_path / "first", **options | {"backend": {"draws": 1, "loops": "auto"}}).metric(
+                "submaps"
+            )
+            shutil.copytree(tmp_path / "first" / "submaps", folder / "submaps-beaten")
+    say(*([second, *([60] if second else [])] if settled else [40, 40, second, *([60] if second else [])]))
+    if settled and second:
+        say(40, 40)
+    again_made = made(log, folder, resume=True, **options)
+    assert not shares
+    assert again_made.report["map_attempts"] == rows
+    assert differing(before, snapshot(folder, SAME_BYTES)) == []
