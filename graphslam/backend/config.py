@@ -93,7 +93,7 @@ class BackEndConfig:
     """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
     The front end's matches are decided on with them; without, each that has the support is a factor. "auto": a run
     looks for them where passes of its fused map deny each other, and keeps the map in which fewer points are denied."""
-    draws: int = 2
+    draws: int = 3
     """A run whose maps are still denied makes its submaps anew of other random numbers, so many draws in all, and keeps
     the map in which the fewest points are denied; 1 = never."""
     look_every: int = 5

@@ -355,7 +355,7 @@ def test_particles_are_drawn_anew_where_passes_still_deny_each_other(
         return Contradictions(np.array([[0, 2]]), np.array([1000 - 10 * share]), np.array([10 * share]))
 
     log, folder = drive(9), tmp_path / "run"
-    options: dict[str, Any] = {"refine": {"use": False}, "backend": {"loops": "auto"}}
+    options: dict[str, Any] = {"refine": {"use": False}, "backend": {"loops": "auto", "draws": 2}}
     shares: list[int] = []
 
     def say(*values: int) -> None:
