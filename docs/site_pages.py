@@ -5,6 +5,7 @@ MkDocs calls these functions (`hooks` in mkdocs.yml). Nothing here is imported b
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import posixpath
@@ -94,6 +95,7 @@ says otherwise. What goes wrong is a `GraphSlamError`, or a [child](errors.md) o
         "reference/types.md": types + entries(gs._TYPES, members=True),
         "reference/front-ends.md": "# Front ends\n\nBy name for `gs.run(..., frontend=)`; options of each under its "
         "configuration.\n" + entries(FRONT_ENDS, members=True),
+        "reference/parts.md": parts(),
         "reference/errors.md": "# Errors\n\n::: graphslam.core.errors\n    options:\n      show_root_heading: false\n",
     }
 
@@ -110,6 +112,30 @@ FRONT_ENDS = {
     "ScanWindow": "graphslam.frontends.scan_window.front_end",
     "BackEndConfig": "graphslam.backend.config",
 }
+
+
+def parts() -> str:
+    """The faces of the rooms, and the tutorials that use each name."""
+    text = """# Parts
+
+What the verbs are made of, by room of the [house](../architecture.md): the tutorials use these names, and so may you.
+They change more often than verbs and types do. `from graphslam.plots import plot_scan`, or `gs.plots.plot_scan`.
+"""
+    uses = {p.stem: p.read_text(encoding="utf-8") for p in sorted((ROOT / "notebooks").glob("*.ipynb"))}
+    for room in sorted(p.parent.name for p in (ROOT / "graphslam").glob("*/__init__.py")):
+        module = importlib.import_module(f"graphslam.{room}")
+        face: dict[str, str] = getattr(module, "_FACE", {})
+        if face:
+            text += f"\n## graphslam.{room}\n\n{(module.__doc__ or '').strip()}\n"
+        for name, home in sorted((n, m) for m, names in face.items() for n in names.split()):
+            shown = [
+                f"[{stem[:2]}](../tutorials/{stem}.md)"
+                for stem, book in uses.items()
+                if re.search(rf"\b{name}\b", book)
+            ]
+            text += f"\n::: graphslam.{room}.{home}.{name}\n    options:\n      members: false\n"
+            text += f"\nTutorials: {', '.join(shown)}\n" if shown else ""
+    return text
 
 
 def entries(names: dict[str, str], *, members: bool) -> str:

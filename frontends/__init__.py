@@ -1,1 +1,19 @@
 """Storey 2, beside the graph: sensor data in, submaps out. Never imports gtsam."""
+
+from graphslam.core.face import face
+
+_FACE = {
+    "odometry.steps": "make_steps",
+    "detectors.trees": "TreeDetectorConfig detect_trees",
+    "grid.config": "GridFilterConfig",
+    "grid.filter": "GridFilter",
+    "grid.rbpf_grid": "run_rbpf",
+    "segslam.segslam": "run_segslam",
+    "segslam.config": "HandoverConfig",
+    "segslam.front_end": "settled",
+    "segslam.submaps": "exits_of_interval settled_chain",
+    "segslam.sampling": "grow root_of_segment",
+    "lidar_odometry.config": "LidarOdometryConfig",
+    "lidar_odometry.odometry": "LidarOdometry",
+}
+__getattr__, __dir__, __all__ = face(__name__, _FACE)

@@ -51,14 +51,17 @@ _TYPES = {
 }
 _NAMES = {**_VERBS, **_LISTS, **_TYPES}
 
+# rooms with a face of their own (graphslam.core.face): ``gs.plots.plot_scan``
+_ROOMS = ("backend", "core", "evaluate", "evidence", "frontends", "io", "join", "loops", "maps", "plots", "sim")
+
 __all__ = ["__version__", "plots", *_NAMES]
 
 
 def __getattr__(name: str) -> Any:
     if name in _NAMES:
         return getattr(importlib.import_module(_NAMES[name]), name)
-    if name == "plots":
-        return importlib.import_module("graphslam.plots")
+    if name in _ROOMS:
+        return importlib.import_module(f"graphslam.{name}")
     raise AttributeError(f"module 'graphslam' has no attribute {name!r}")
 
 

@@ -1,7 +1,9 @@
-"""Notebooks: stripped in the repository, and each one runs to its end in quick mode."""
+"""Notebooks: stripped in the repository, made of public names, and each one runs to its end in quick mode."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import os
 import re
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
+import graphslam
 from graphslam.core.errors import UnknownNameError
 from graphslam.io.notebook import NotebookStop, load_or_stop
 
@@ -20,7 +23,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 NEEDS_DATA = {"01_victoria_park"}
 USES_DATA = {"07_one_set_of_submaps"}  # runs without as well, and says what it left out
 ABSOLUTE = re.compile(r"(?<![\w./])/(?:home|root|Users|tmp|work|mnt|media|opt|usr|var|srv|data)\b|\b[A-Za-z]:\\\\")
-TIMEOUT_S = 300
+TIMEOUT_S = 900
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
@@ -49,10 +52,53 @@ def outputs(book: Any) -> list[Any]:
     return [o for c in book.cells if c.cell_type == "code" for o in c.outputs]
 
 
+ROOMS = {p.parent.name for p in Path(graphslam.__file__).parent.glob("*/__init__.py")}
+
+
+def imported(source: str) -> list[tuple[str, str]]:
+    """What a cell takes from the package: module and name, the name empty for a module taken as a whole."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [(a.name, "") for a in node.names if a.name.split(".")[0] == "graphslam"]
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "graphslam":
+            found += [(str(node.module), a.name) for a in node.names]
+    return found
+
+
+def internal(module: str, name: str) -> bool:
+    """Is this import none of ``import graphslam``, the face of a room, and the errors?"""
+    if module == "graphslam":
+        return bool(name) and name not in graphslam.__all__
+    if module == "graphslam.core.errors":
+        return False
+    room = importlib.import_module(module) if module.removeprefix("graphslam.") in ROOMS else None
+    return room is None or name not in getattr(room, "__all__", ())
+
+
 @every_notebook
-def test_a_notebook_needs_nothing_of_the_application_but_its_public_face(path: Path) -> None:
-    code = "\n".join(c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code")
-    assert "graphslam.app" not in code
+def test_a_notebook_imports_no_internal_module(path: Path) -> None:
+    code = [c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
+    assert [found for source in code for found in imported(source) if internal(*found)] == []
+
+
+def test_internal_imports_are_found() -> None:
+    for line in (
+        "from graphslam.plots.scans import plot_scan",
+        "import graphslam.app.verbs",
+        "from graphslam import io",
+    ):
+        assert any(internal(*found) for found in imported(line)), line
+    for line in ("import graphslam as gs", "from graphslam.plots import plot_scan", "from graphslam import simulate"):
+        assert not any(internal(*found) for found in imported(line)), line
+
+
+@every_notebook
+def test_a_lecture_has_a_knob_to_turn_and_exercises(path: Path) -> None:
+    cells = nbformat.read(path, as_version=4).cells
+    assert sum("gs.plots.knob(" in c.source for c in cells if c.cell_type == "code") == 1
+    assert sum("**Turn the knob.**" in c.source for c in cells if c.cell_type == "markdown") == 1
+    assert sum("## Exercises" in c.source for c in cells if c.cell_type == "markdown") == 1
 
 
 def test_there_are_notebooks() -> None:
@@ -69,6 +115,7 @@ def test_there_are_notebooks() -> None:
         "09_ten_to_the_eighth",
         "10_where_to_drive",
         "11_your_lidar",
+        "12_is_this_map_to_be_trusted",
     } <= {p.stem for p in NOTEBOOKS}
 
 
@@ -113,7 +160,9 @@ def test_notebook_runs(path: Path, tmp_path: Path, request: pytest.FixtureReques
         data["GRAPHSLAM_DATA"] = str(request.getfixturevalue("data_dir"))
     book = execute(path, tmp_path, **data)
     found = outputs(book)
-    assert sum("image/png" in o.get("data", {}) for o in found) >= 7
+    pictures = [o["data"]["image/png"] for o in found if "image/png" in o.get("data", {})]
+    assert len(pictures) >= 5
+    assert len(set(pictures)) == len(pictures), "a figure is drawn twice"
     text = "".join(o.text for o in found if o.output_type == "stream")
     assert "Warning" not in text, text
     assert "skipped" not in text, text

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.se3 import se3_inverse, se3_transform
+from graphslam.sim.mesh_worlds import MESH_WORLDS as MESH_WORLDS
+from graphslam.sim.mesh_worlds import mesh_world as mesh_world
 
 if TYPE_CHECKING:
     from graphslam.core.geometry import Array
@@ -18,42 +19,6 @@ if TYPE_CHECKING:
     from graphslam.sim.world import World
 
 
-@dataclass(frozen=True, slots=True)
-class MeshWorld:
-    """A world of triangles that a robot drives through.
-
-    Parameters
-    ----------
-    module, function : str
-        What builds it; imported when used.
-    layouts : tuple of str
-        Buildings to choose from, the default first; empty where there is one only.
-    """
-
-    module: str
-    function: str
-    layouts: tuple[str, ...] = ()
-
-    def build(self, name: str, layout: str | None, seed: int) -> World:
-        """The world; the seed moves what can be moved in it."""
-        if layout is not None and layout not in self.layouts:
-            if not self.layouts:
-                raise ConfigError(f"world {name!r} has one layout only: leave {layout!r} out")
-            raise UnknownNameError(f"layout of world {name!r}", layout, self.layouts)
-        try:
-            make = getattr(importlib.import_module(self.module), self.function)
-        except ImportError as error:
-            raise GraphSlamError(f"world {name!r} cannot be imported ({error})") from error
-        world: World = make(layout or self.layouts[0], seed=seed) if self.layouts else make(seed=seed)
-        return world
-
-
-MESH_WORLDS: dict[str, MeshWorld] = {
-    "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
-    "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
-    "building": MeshWorld("graphslam.sim.building", "building"),
-    "court": MeshWorld("graphslam.sim.court", "court"),
-}
 CAMPUS = "campus"
 """Streets and buildings, with a robot of their own (:mod:`graphslam.sim.campus`)."""
 
@@ -66,27 +31,6 @@ def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> S
 
 # name -> what simulates it from a preset, a seed and changed figures
 WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {"landmark-field": _landmark_field}
-
-
-def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
-    """A world of triangles by name.
-
-    Parameters
-    ----------
-    name : str
-        ``garage``, ``mine`` or ``building``.
-    layout : str, optional
-        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
-    seed : int
-        Of what can be moved in it.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-    """
-    if name not in MESH_WORLDS:
-        raise UnknownNameError("world of triangles", name, MESH_WORLDS)
-    return MESH_WORLDS[name].build(name, layout, seed)
 
 
 def simulate(

@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 _OPTIMUM = RelinearisationPolicy(every=1, rtol=1e-12)
 _JOINERS: dict[str, Callable[..., Any]] = {
     "eif-sequential": join_sequential,
+    "eif-sequential-classical": partial(join_sequential, classical=True),
     "ekf": join_ekf,
     "eif-online": join_online,
     "optimum": partial(join_online, policy=_OPTIMUM),
@@ -50,8 +51,9 @@ def objectives_along(submaps: Sequence[Submap], method: str, *, progress: bool =
     submaps : sequence of Submap
         In order, every landmark identified.
     method : str
-        ``eif-sequential``, ``ekf``: linearised once; ``eif-online``: afresh where the policy says so; ``isam2``: what
-        incremental updates leave; ``optimum``: at the minimum after every submap.
+        ``eif-sequential``: in the chart of the submaps; ``eif-sequential-classical``, ``ekf``: Cartesian, linearised
+        once; ``eif-online``: afresh where the policy says so; ``isam2``: what incremental updates leave; ``optimum``:
+        at the minimum after every submap.
     progress : bool
         Show a progress bar.
 
@@ -165,13 +167,15 @@ def pose_consistency_along(
     return found
 
 
-def gap_by_tree(submaps: Sequence[Submap], *, progress: bool = False) -> pd.DataFrame:
+def gap_by_tree(submaps: Sequence[Submap], *, classical: bool = False, progress: bool = False) -> pd.DataFrame:
     """Objective of every node of the join tree less that of the optimum of the submaps below it.
 
     Parameters
     ----------
     submaps : sequence of Submap
         In order, every landmark identified.
+    classical : bool
+        Cartesian and linearised once, as in the paper, instead of in the chart of the submaps.
     progress : bool
         Show a progress bar.
 
@@ -193,7 +197,7 @@ def gap_by_tree(submaps: Sequence[Submap], *, progress: bool = False) -> pd.Data
     gaps: dict[tuple[int, int], float] = {}
     for level, first, end in tqdm(spans, desc="tree", unit="join", disable=not progress):
         below = submaps[first:end]
-        joined = join_tree(below)
+        joined = join_tree(below, classical=classical)
         best = polish(below, joined).objective_polished
         assert best is not None
         gap = joined.objective - best

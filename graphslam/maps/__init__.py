@@ -1,1 +1,18 @@
 """Maps that follow the graph: pieces of submaps, fused at the solved poses and re-posed when nodes move."""
+
+from graphslam.core.face import face
+
+_FACE = {
+    "run_map": "make_run_map nodes_by_submap solved_poses",
+    "alternatives": "Alternative choose",
+    "minimum_entropy": "Candidate",
+    "terrain.lines": "lines_of_scans",
+    "terrain.plan": "CostConfig cost_map plan_way",
+    "terrain.pyramid": "Pyramid",
+    "terrain.tables": "Tables fixed_tables read_tables",
+    "terrain.vehicle": "CELLS LineSensor Vehicle",
+    "surface.layer": "SurfaceLayer",
+    "surface.mesh": "position_sigma zero_set",
+    "surface.piece": "SurfaceConfig",
+}
+__getattr__, __dir__, __all__ = face(__name__, _FACE)

@@ -1,1 +1,34 @@
 """Storey 5: data in, Axes out."""
+
+from graphslam.core.face import face
+
+_FACE = {
+    "comparison": "comparison_figure plot_comparison",
+    "consistency": "plot_consistency",
+    "evidence": "plot_heights plot_section plot_sharing",
+    "fused_map": "plot_cut plot_storey",
+    "gap": "plot_convergence plot_gap_along plot_tree_gap",
+    "gps": "plot_gps_vectors",
+    "knobs": "knob",
+    "local_map": "plot_correlation plot_local_map",
+    "map": "plot_ellipses plot_map",
+    "method_maps": "plot_method_maps",
+    "particles": "plot_ancestry plot_exit plot_exit_panels plot_handovers plot_histories plot_lineage plot_pasts",
+    "paths": "plot_paths",
+    "refined": "plot_before_after",
+    "reports": "plot_report plot_submap_chi2",
+    "scans": "plot_scan",
+    "segment_exits": "plot_exit_nees plot_segment_exit",
+    "segments": "plot_entropies plot_samples plot_scores plot_segments sample_paths",
+    "segslam_study": "plot_by_particles",
+    "solid": "plot_cloud plot_solid",
+    "study_growth": "plot_growth_panels",
+    "study_local": "plot_local_honesty",
+    "style": "NAMES use_palette",
+    "submaps": "plot_submap_chain",
+    "surface": "plot_surface",
+    "terrain": "plot_terrain",
+    "trajectory": "plot_gps_residuals",
+    "without_truth": "plot_innovations plot_loop_matrix",
+}
+__getattr__, __dir__, __all__ = face(__name__, _FACE)

@@ -164,8 +164,8 @@ def plot_sharing(
         extent = (low[0] * edge, (low[0] + shape[0]) * edge, low[1] * edge, (low[1] + shape[1]) * edge)
         ax.imshow(np.where(all_ > 0, 0.88, np.nan), cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent)
         image = ax.imshow(
-            np.where(own > 0, own, np.nan), cmap="viridis", vmin=0, origin="lower", extent=extent,
-            interpolation="nearest",
+            np.where(own > 0, own, np.nan), cmap="viridis", vmin=0, vmax=max(own.max(), 1), origin="lower",
+            extent=extent, interpolation="nearest",
         )  # fmt: skip
         if ax.figure is not None:
             ax.figure.colorbar(image, ax=ax, label="bricks of its own", shrink=0.8)

@@ -59,6 +59,19 @@ FIGURE_SIZE = (8.0, 5.5)
 DPI = 150
 
 
+def use_palette() -> None:
+    """Make the palette matplotlib's own, so that what a notebook draws by hand has the colours of all other figures.
+
+    Examples
+    --------
+    >>> gs.plots.use_palette()
+    >>> import matplotlib
+    >>> matplotlib.rcParams["axes.prop_cycle"].by_key()["color"][0]
+    '#0072B2'
+    """
+    plt.rcParams["axes.prop_cycle"] = plt.cycler(color=CYCLE)
+
+
 def colour(k: int) -> str:
     """Colour of item k of a series; repeats after the palette's length."""
     return CYCLE[k % len(CYCLE)]

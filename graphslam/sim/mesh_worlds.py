@@ -1,0 +1,68 @@
+"""Worlds of triangles by name."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+
+from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.sim.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class MeshWorld:
+    """A world of triangles that a robot drives through.
+
+    Parameters
+    ----------
+    module, function : str
+        What builds it; imported when used.
+    layouts : tuple of str
+        Buildings to choose from, the default first; empty where there is one only.
+    """
+
+    module: str
+    function: str
+    layouts: tuple[str, ...] = ()
+
+    def build(self, name: str, layout: str | None, seed: int) -> World:
+        """The world; the seed moves what can be moved in it."""
+        if layout is not None and layout not in self.layouts:
+            if not self.layouts:
+                raise ConfigError(f"world {name!r} has one layout only: leave {layout!r} out")
+            raise UnknownNameError(f"layout of world {name!r}", layout, self.layouts)
+        try:
+            make = getattr(importlib.import_module(self.module), self.function)
+        except ImportError as error:
+            raise GraphSlamError(f"world {name!r} cannot be imported ({error})") from error
+        world: World = make(layout or self.layouts[0], seed=seed) if self.layouts else make(seed=seed)
+        return world
+
+
+MESH_WORLDS: dict[str, MeshWorld] = {
+    "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
+    "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
+    "building": MeshWorld("graphslam.sim.building", "building"),
+    "court": MeshWorld("graphslam.sim.court", "court"),
+}
+
+
+def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
+    """A world of triangles by name.
+
+    Parameters
+    ----------
+    name : str
+        ``garage``, ``mine`` or ``building``.
+    layout : str, optional
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
+    seed : int
+        Of what can be moved in it.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+    """
+    if name not in MESH_WORLDS:
+        raise UnknownNameError("world of triangles", name, MESH_WORLDS)
+    return MESH_WORLDS[name].build(name, layout, seed)
