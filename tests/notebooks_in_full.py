@@ -1,6 +1,6 @@
 """Run the notebooks in full mode and keep what they show: ``python -m tests.notebooks_in_full OUT [01 04 …]``.
 
-Writes the pictures and the printed text of every notebook to ``OUT/NAME/``, to be looked at, and says how long each took.
+Writes the pictures and the printed text of every notebook to ``OUT/NAME/``, to be looked at, and how long each took.
 All together take less than half an hour on two cores that nobody else uses.
 """
 

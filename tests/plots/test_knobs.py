@@ -40,7 +40,7 @@ def test_the_slider_draws_when_it_is_moved_and_not_before(monkeypatch: pytest.Mo
     monkeypatch.setattr(IPython, "get_ipython", lambda: Shell())
     monkeypatch.setattr("IPython.display.display", lambda figure: None)
     drawn: list[Any] = []
-    slider, picture = knobs.slider_of(lambda ax, v: drawn.append(v), ["few", "many"], name="particles").children
+    slider, _ = knobs.slider_of(lambda ax, v: drawn.append(v), ["few", "many"], name="particles").children
     assert drawn == []
     slider.value = 1
     assert drawn == ["many"]
