@@ -49,7 +49,7 @@ def upright_beams(steps: Steps) -> Flags:
     near = tree.query(tree.data, NEIGHBOURS, distance_upper_bound=0.5 * _APART)[1]
     near = np.where(near < len(rows), near, -1).astype(np.int64)
     normals, spread = np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
-    fit_surfaces(points, near, NEIGHBOURS, normals, spread)
+    fit_surfaces(points, near, NEIGHBOURS, normals, spread, np.empty((len(rows), 2, 3)))
     with np.errstate(invalid="ignore", divide="ignore"):
         known = spread[:, 0] <= NEIGHBOURS * SURE**2 * spread[:, 1]
     up = vertical(steps.tilt)[step]

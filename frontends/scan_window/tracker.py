@@ -34,7 +34,7 @@ from graphslam.frontends.grid.weights import spread
 from graphslam.frontends.odometry.lasting import lasting_sigmas
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.registration.plane_kernels import Pairs, plane_blocks, plane_residuals
+from graphslam.registration.plane_kernels import Pairs, nothing_feigned, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import fit_places, rotations, thin_places
 
 Index = npt.NDArray[np.int64]
@@ -308,7 +308,7 @@ class Tracker:
         begin = np.arange(m, dtype=np.int64) * w * w
         plane_blocks(
             pairs, (self.R, self.t), (self.points, self.normals), information,
-            (begin, m * w * w + begin[pairs.j], rank), H, g,
+            (begin, m * w * w + begin[pairs.j], rank), nothing_feigned(self.group.dim), H, g,
         )  # fmt: skip
         blocks = H.reshape(2, m, w, w)
         return blocks[0, self.NOW], np.concatenate(list(blocks[1, slots]), axis=1), g[self.NOW]
@@ -368,7 +368,7 @@ class Tracker:
         own, near = self.places[c], np.concatenate(around)
         begin = len(around[0]) if c else 0
         W, O = self._world(near)
-        normals, flat = fit_places(W, O, begin + np.arange(len(own)), np.arange(len(near)), self.config.surface)
+        normals, _, flat = fit_places(W, O, begin + np.arange(len(own)), np.arange(len(near)), self.config.surface)
         self.normals[own] = np.einsum("kji,kj->ki", self.R[own // self.rows], normals)
         self.flat[c] = own[flat]
         self._plant()

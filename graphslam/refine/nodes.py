@@ -7,7 +7,7 @@ therefore the steps between which the body moved; what lies between follows the 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -83,8 +83,41 @@ def chained(steps: Scans, nodes: Index) -> tuple[Array, Array]:
     return U, P
 
 
-def path_between(steps: Scans, nodes: Index, poses: Array, covariances: Array) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True, slots=True)
+class Between:
+    """Steps along the path of the nodes, each between two of them.
+
+    Parameters
+    ----------
+    a, b : (n,)
+        Numbers of the nodes before and after.
+    by_a, by_b : (n, d, d)
+        By how much errors of the two move the step, right tangents.
+    own : (n, d, d)
+        Covariance of a step that it shares with no node.
+    """
+
+    a: Index
+    b: Index
+    by_a: Array
+    by_b: Array
+    own: Array
+
+    @classmethod
+    def at_nodes(cls, n: int, dof: int) -> Between:
+        """All steps are nodes."""
+        every = np.arange(n, dtype=np.int64)
+        none = np.zeros((n, dof, dof))
+        return cls(every, every, none + np.eye(dof), none, none)
+
+
+def path_between(
+    steps: Scans, nodes: Index, poses: Array, covariances: Array, scales: Array
+) -> tuple[Array, Array, Between]:
     """All steps along the refined path of the nodes.
+
+    The odometry from node to node is off by what the path tells; how much of that had come about at a step is told by
+    its covariance so far (a Gaussian bridge): while wheels stand, hardly anything.
 
     Parameters
     ----------
@@ -93,37 +126,47 @@ def path_between(steps: Scans, nodes: Index, poses: Array, covariances: Array) -
     poses : (m, 7|3)
         Of the nodes.
     covariances : (m, d, d)
+    scales : (d,)
+        By which the σ of the odometry was widened.
 
     Returns
     -------
     poses : (n, 7|3)
     covariances : (n, d, d)
-    own : (n, d, d)
-        What steps between nodes do not share with a node. Where wheels slipped on the way it holds the jump itself: a
+        Errors of two nodes in a row are taken to be as alike as they can be.
+    between : Between
+        What steps between nodes do not share with a node holds, where wheels slipped on the way, the jump itself: a
         step at the share s of the way lies before it with the probability 1 - s, and its mean is off by the variance
         s (1 - s) of that.
     """
     g, n = steps.group, len(steps)
-    U, _ = chained(steps, nodes)
+    wide = scales[:, None] * scales[None, :]
+    steps = replace(steps, odometry=replace(steps.odometry, covariances=steps.odometry.covariances * wide))
+    U, P = chained(steps, nodes)
     a = np.clip(np.searchsorted(nodes, np.arange(n), side="right") - 1, 0, len(nodes) - 2)
     b = a + 1
     whole = scans_at(steps, nodes).odometry
-    # what the refined path moved more than the odometry from node to node, spread by time
     left = g.log(g.between(whole.increments[b], g.between(poses[a], poses[b])))
-    t = steps.times
-    share = (t - t[nodes[a]]) / (t[nodes[b]] - t[nodes[a]])
-    out = g.compose(g.compose(poses[a], U), g.exp(share[:, None] * left))
+    on = g.adjoint(g.between(whole.increments[b], U))  # from an error at the step to one at the node after it
+    Q = whole.covariances[b]
+    by_b = np.swapaxes(np.linalg.solve(Q, on @ P), 1, 2)
+    out = g.compose(g.compose(poses[a], U), g.exp(np.einsum("kij,kj->ki", by_b, left)))
     out[nodes] = poses
-    s = share[:, None, None]
-    own = s * (1.0 - s) * whole.covariances[b]
+    own = P - by_b @ on @ P
+    s = np.clip(np.einsum("kii->k", by_b) / g.dof, 0.0, 1.0)[:, None, None]
     # wheels that slipped did so at one instant, which nothing tells: spread evenly is a guess with the jump's own size
-    inside = np.flatnonzero((share > 0.0) & (share < 1.0))
-    x = np.linalg.solve(whole.covariances[b[inside]], left[inside, :, None])[:, :, 0]
+    inside = np.setdiff1d(np.arange(n), nodes)
+    x = np.linalg.solve(Q[inside], left[inside, :, None])[:, :, 0]
     slipped = inside[np.sum(left[inside] * x, axis=1) > SLIPPED]
     own[slipped] += (s * (1.0 - s))[slipped] * left[slipped, :, None] * left[slipped, None, :]
+    own = 0.5 * (own + np.swapaxes(own, 1, 2))
     C = own.copy()
     for node, weight in ((a, 1.0 - s), (b, s)):
         A = g.adjoint(g.between(out, poses[node]))
         C += weight * (A @ covariances[node] @ np.swapaxes(A, 1, 2))
+    by_a = g.adjoint(g.between(out, poses[a])) - by_b @ g.adjoint(g.between(poses[b], poses[a]))
     C[nodes], own[nodes] = covariances, 0.0
-    return out, 0.5 * (C + np.swapaxes(C, 1, 2)), own
+    last = nodes[-1]
+    by_a[nodes], by_b[nodes] = np.eye(g.dof), 0.0
+    by_a[last], by_b[last] = 0.0, np.eye(g.dof)
+    return out, 0.5 * (C + np.swapaxes(C, 1, 2)), Between(a, b, by_a, by_b, own)

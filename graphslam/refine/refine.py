@@ -26,8 +26,8 @@ from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel, States
-from graphslam.refine.nodes import find_nodes, path_between, scans_at
-from graphslam.refine.problem import Problem, Solved, pair_noise, point_information, residuals
+from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at
+from graphslam.refine.problem import Problem, Solved, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 from graphslam.registration.plane_kernels import Pairs
@@ -138,8 +138,8 @@ class Refinement:
         The last linearisation, for joint covariances.
     nodes : (m,)
         Steps that are nodes of the problem; between them the path follows the odometry.
-    own : (n, d, d)
-        Covariance of steps between nodes that they do not share with a node.
+    between : Between
+        How the steps lie between nodes, and what they do not share with any.
     fixes : FixReport or None
         What fixes did; None: there were none, or their way is too short to say where north is.
     left : float or None
@@ -163,7 +163,7 @@ class Refinement:
     motion: float
     solved: Solved
     nodes: Index
-    own: Array
+    between: Between
     fixes: FixReport | None = None
     left: float | None = None
 
@@ -179,15 +179,17 @@ class Refinement:
 
     def joint(self, steps: npt.ArrayLike) -> Array:
         """Joint covariance of some steps ``(k·d, k·d)``."""
-        d, g = self.covariances.shape[1], group_of(self.poses)
+        d, m = self.covariances.shape[1], self.between
         k = np.asarray(steps, np.int64)
-        near = np.clip(np.searchsorted(self.nodes, k), 0, len(self.nodes) - 1)
-        rows, back = np.unique(near, return_inverse=True)
+        rows, at = np.unique(np.concatenate([m.a[k], m.b[k]]), return_inverse=True)
         P = self.solved.factor.inverse_block((rows[:, None] * d + np.arange(d)).ravel())
-        P = P.reshape(len(rows), d, len(rows), d)[back][:, :, back]
-        A = g.adjoint(g.between(self.poses[k], self.poses[self.nodes[near]]))
-        C = np.einsum("iab,ibjc,jdc->iajd", A, P, A)
-        C[np.arange(len(k)), :, np.arange(len(k))] += self.own[k]
+        J = np.zeros((len(k), d, len(rows), d))
+        every = np.arange(len(k))
+        J[every, :, at[: len(k)]] += m.by_a[k]
+        J[every, :, at[len(k) :]] += m.by_b[k]
+        rows_of = J.reshape(len(k) * d, -1)
+        C = (rows_of @ P @ rows_of.T).reshape(len(k), d, len(k), d)
+        C[every, :, every] += m.own[k]
         return np.asarray(C.reshape(len(k) * d, -1))
 
 
@@ -237,7 +239,7 @@ def refine(
     found = work.run()
     if not few:
         return found
-    poses, covariances, own = path_between(steps, nodes, found.poses, found.covariances)
+    poses, covariances, between = path_between(steps, nodes, found.poses, found.covariances, found.scales)
     return replace(
         found,
         times=steps.times,
@@ -246,7 +248,7 @@ def refine(
         start=start,
         refused=nodes[found.refused],
         nodes=nodes,
-        own=own,
+        between=between,
     )
 
 
@@ -467,8 +469,9 @@ class _Work:
     def step(self, information: Array, extra: list[Any] | None = None) -> Solved:
         """One Gauss–Newton step."""
         assert self.surfaces is not None
+        holds = held(self.found, self.cloud, self.surfaces, self.poses, information)
         solved, step = self.problem.linearise(
-            self.poses, self.states, self.found.pairs, self.surfaces, information, extra or []
+            self.poses, self.states, self.found.pairs, self.surfaces, information, extra or [], holds
         )
         self.poses, self.states = self.problem.moved(self.poses, self.states, step)
         return solved
@@ -554,6 +557,6 @@ class _Work:
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
             solved=solved,
             nodes=np.arange(n, dtype=np.int64),
-            own=np.zeros((n, w, w)),
+            between=Between.at_nodes(n, w),
             fixes=None if self.fixes is None else self.fixes.report(self.poses, self.states),
         )

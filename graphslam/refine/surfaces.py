@@ -142,11 +142,14 @@ class Surfaces:
         Is it one? Only of points that stand for themselves.
     stands : (q,) int
         Row of the point that stands for this one: of points of one chunk nearer together than the spacing the first.
+    tilts : (q, d - 1, d)
+        Axes of the surface, each as long as the σ by which noise tilts the normal towards it [rad], single precision.
     """
 
     normals: Array
     flat: Flags
     stands: Index
+    tilts: npt.NDArray[np.float32]
 
 
 def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:
@@ -159,13 +162,18 @@ def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces
     W, O = cloud.world(poses)
     q, d = W.shape
     normals, flat = np.zeros((q, d)), np.zeros(q, bool)
+    tilts = np.zeros((q, d - 1, d), np.float32)
     stands = np.arange(q)
     places = [thin_places(W, cloud.rows[c], cloud.rows[c + 1], config.spacing, stands) for c in range(cloud.chunks)]
     for c, own in enumerate(places):
         if not len(own):
             continue
-        normals[own], flat[own] = fit_places(W, O, own, np.concatenate(places[max(c - 1, 0) : c + 2]), config)
-    return Surfaces(turned(np.swapaxes(rotations(poses), 1, 2), cloud.step, normals), flat, stands)
+        near = np.concatenate(places[max(c - 1, 0) : c + 2])
+        normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config)
+    back = np.swapaxes(rotations(poses), 1, 2)
+    for a in range(d - 1):
+        tilts[:, a] = turned(back, cloud.step, tilts[:, a])
+    return Surfaces(turned(back, cloud.step, normals), flat, stands, tilts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,10 @@ class Pairs(NamedTuple):
 
 
 @nb.njit(cache=True, fastmath={"contract"})
-def fit_surfaces(points: Array, neighbours: Index, least: int, out_normal: Array, out_flat: Array) -> None:
-    """Normals and eigenvalues of the covariance of the neighbourhoods of points.
+def fit_surfaces(
+    points: Array, neighbours: Index, least: int, out_normal: Array, out_flat: Array, out_tilt: Array
+) -> None:
+    """Normals and eigenvalues of the covariance of the neighbourhoods of points, and the noise of the normals.
 
     Parameters
     ----------
@@ -44,6 +46,9 @@ def fit_surfaces(points: Array, neighbours: Index, least: int, out_normal: Array
     out_normal : (k, d)
     out_flat : (k, 3)
         Eigenvalues of the covariance, ascending, in 2-D the first one twice; all nan where there are too few.
+    out_tilt : (k, d - 1, d)
+        Axes of the surface, each as long as the σ by which the normal is tilted towards it [rad]: the slope of a plane
+        through n points of variance ``σ²`` has the variance ``σ² / (n l)``, l being their own along the axis.
     """
     d = points.shape[1]
     for k in range(len(neighbours)):
@@ -56,6 +61,7 @@ def fit_surfaces(points: Array, neighbours: Index, least: int, out_normal: Array
                     c[u] += points[a, u]
         if n < least:
             out_flat[k] = np.nan
+            out_tilt[k] = 0.0
             continue
         c /= n
         C = np.zeros((d, d))
@@ -69,6 +75,10 @@ def fit_surfaces(points: Array, neighbours: Index, least: int, out_normal: Array
                 C[v, u] = C[u, v]
         w, V = np.linalg.eigh(C / n)
         out_normal[k] = V[:, 0]
+        for u in range(1, d):
+            sigma = np.sqrt(max(w[0], 0.0) / ((n - d) * max(w[u], 1e-12)))
+            for v in range(d):
+                out_tilt[k, u - 1, v] = sigma * V[v, u]
         if d == 3:
             out_flat[k] = w
         else:
@@ -104,6 +114,113 @@ def plane_residuals(pairs: Pairs, R: Array, t: Array, points: Array, normals: Ar
         out[k] = r
 
 
+class Held(NamedTuple):
+    """What groups of pairs hold of the motion between their two sides.
+
+    Parameters
+    ----------
+    group : (k,)
+        Of each pair.
+    centre : (m, d)
+        Of each group, world [m].
+    share : (m, w, w)
+        Takes the derivative of a residual by a motion of all source points about the centre, in the axes of the world
+        and in the order of a tangent, to that part of it which the group holds.
+    """
+
+    group: Index
+    centre: Array
+    share: Array
+
+
+def nothing_feigned(dim: int) -> Held:
+    """Pairs that hold all that they say."""
+    w = 6 if dim == 3 else 3
+    return Held(np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)))
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def wrench(x: Array, n: Array, out: Array) -> None:
+    """Derivative of ``nᵀ y`` by a motion about the origin of a point that is at ``x``, in the order of a tangent."""
+    if len(x) == 3:
+        out[0] = x[1] * n[2] - x[2] * n[1]
+        out[1] = x[2] * n[0] - x[0] * n[2]
+        out[2] = x[0] * n[1] - x[1] * n[0]
+        out[3], out[4], out[5] = n[0], n[1], n[2]
+    else:
+        out[0], out[1], out[2] = n[0], n[1], x[0] * n[1] - x[1] * n[0]
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def group_information(
+    pairs: Pairs,
+    poses: tuple[Array, Array],
+    surfaces: tuple[Array, Array, npt.NDArray[np.floating]],
+    information: Array,
+    groups: tuple[Index, Array],
+    H: Array,
+    F: Array,
+) -> None:
+    """Add what pairs say of the motion between the sides of their group, and what noise of normals feigns of that.
+
+    Parameters
+    ----------
+    poses : (R, t)
+    surfaces : (points, normals, tilts)
+        ``tilts`` of :func:`fit_surfaces`, in the frame of the step.
+    information : (k,)
+    groups : (group, centre)
+        See :class:`Held`.
+    H, F : (m, w, w)
+        ``Σ L J Jᵀ`` and ``Σ L E[δJ δJᵀ]``, about the centre, world.
+    """
+    R, t = poses
+    points, normals, tilts = surfaces
+    group, centre = groups
+    d = t.shape[1]
+    w = 6 if d == 3 else 3
+    x, n, J = np.empty(d), np.empty(d), np.empty(w)
+    for k in range(len(pairs.source)):
+        L = information[k]
+        if L <= 0.0:
+            continue
+        i, j, p, q, m = pairs.i[k], pairs.j[k], pairs.source[k], pairs.target[k], group[k]
+        for u in range(d):
+            x[u] = t[i, u] - centre[m, u]
+            for v in range(d):
+                x[u] += R[i, u, v] * points[p, v]
+        for a in range(d):
+            for u in range(d):
+                n[u] = 0.0
+                for v in range(d):
+                    n[u] += R[j, u, v] * (normals[q, v] if a == 0 else tilts[q, a - 1, v])
+            wrench(x, n, J)
+            for u in range(w):
+                for v in range(w):
+                    if a == 0:
+                        H[m, u, v] += L * J[u] * J[v]
+                    else:
+                        F[m, u, v] += L * J[u] * J[v]
+
+
+@nb.njit(cache=True, fastmath={"contract"})
+def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array) -> None:
+    """A derivative by a motion about a centre, world, as one by the right tangent of a pose."""
+    d = len(t)
+    if d == 3:
+        a, b, c = t[0] - centre[0], t[1] - centre[1], t[2] - centre[2]
+        x = K[0] - (b * K[5] - c * K[4])
+        y = K[1] - (c * K[3] - a * K[5])
+        z = K[2] - (a * K[4] - b * K[3])
+        for v in range(3):
+            out[v] = sign * (R[0, v] * x + R[1, v] * y + R[2, v] * z)
+            out[3 + v] = sign * (R[0, v] * K[3] + R[1, v] * K[4] + R[2, v] * K[5])
+    else:
+        for v in range(2):
+            out[v] = sign * (R[0, v] * K[0] + R[1, v] * K[1])
+        out[2] = sign * (K[2] - ((t[0] - centre[0]) * K[1] - (t[1] - centre[1]) * K[0]))
+
+
 @nb.njit(cache=True, fastmath={"contract"})
 def plane_blocks(
     pairs: Pairs,
@@ -111,6 +228,7 @@ def plane_blocks(
     surfaces: tuple[Array, Array],
     information: Array,
     slots: tuple[Index, Index, Index],
+    held: Held,
     H: Array,
     g: Array,
 ) -> float:
@@ -125,6 +243,8 @@ def plane_blocks(
     slots : (first, offset, rank)
         ``first[n]`` is where the diagonal block of step n begins in ``H``, ``offset[k]`` where the block of the two
         steps of pair k does; its rows are those of the step with the lower ``rank``.
+    held : Held
+        Without groups pairs hold all that they say.
     H : flat
         Blocks ``(w, w)``, row-major.
     g : (n, w)
@@ -135,45 +255,45 @@ def plane_blocks(
     first, offset, rank = slots
     d = t.shape[1]
     w = 6 if d == 3 else 3
-    Ji, Jj = np.empty(w), np.empty(w)
-    y, ni = np.empty(d), np.empty(d)
+    Ji, Jj, J, K = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
+    y, ni, nw, x = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
     total = 0.0
     for k in range(len(pairs.source)):
         if information[k] <= 0.0:
             continue
         i, j, p, q = pairs.i[k], pairs.j[k], pairs.source[k], pairs.target[k]
         nj, pi = normals[q], points[p]
-        r = 0.0
         for u in range(d):
             ni[u] = 0.0
             y[u] = 0.0
         for u in range(d):
-            x = t[i, u] - t[j, u]
-            nw = 0.0
+            x[u] = t[i, u] - t[j, u]
+            nw[u] = 0.0
             for v in range(d):
-                x += R[i, u, v] * pi[v]
-                nw += R[j, u, v] * nj[v]
+                x[u] += R[i, u, v] * pi[v]
+                nw[u] += R[j, u, v] * nj[v]
             for v in range(d):
-                ni[v] += R[i, u, v] * nw
-                y[v] += R[j, u, v] * x
+                ni[v] += R[i, u, v] * nw[u]
+                y[v] += R[j, u, v] * x[u]
+        r = 0.0
         for v in range(d):
             r += nj[v] * (y[v] - points[q, v])
-        if d == 3:
-            Ji[0] = pi[1] * ni[2] - pi[2] * ni[1]
-            Ji[1] = pi[2] * ni[0] - pi[0] * ni[2]
-            Ji[2] = pi[0] * ni[1] - pi[1] * ni[0]
-            Jj[0] = -(y[1] * nj[2] - y[2] * nj[1])
-            Jj[1] = -(y[2] * nj[0] - y[0] * nj[2])
-            Jj[2] = -(y[0] * nj[1] - y[1] * nj[0])
-            for v in range(3):
-                Ji[3 + v] = ni[v]
-                Jj[3 + v] = -nj[v]
+        if len(held.group):
+            m = held.group[k]
+            for u in range(d):
+                x[u] += t[j, u] - held.centre[m, u]
+            wrench(x, nw, J)
+            for u in range(w):
+                K[u] = 0.0
+                for v in range(w):
+                    K[u] += held.share[m, u, v] * J[v]
+            _moved(K, R[i], t[i], held.centre[m], 1.0, Ji)
+            _moved(K, R[j], t[j], held.centre[m], -1.0, Jj)
         else:
-            for v in range(2):
-                Ji[v] = ni[v]
-                Jj[v] = -nj[v]
-            Ji[2] = pi[0] * ni[1] - pi[1] * ni[0]
-            Jj[2] = -(y[0] * nj[1] - y[1] * nj[0])
+            wrench(pi, ni, Ji)
+            wrench(y, nj, Jj)
+            for v in range(w):
+                Jj[v] = -Jj[v]
         L = information[k]
         total += L * r * r
         a, b, c = first[i], first[j], offset[k]

@@ -54,7 +54,7 @@ def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Inde
     return np.sort(a + first)
 
 
-def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfig) -> tuple[Array, Flags]:
+def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfig) -> tuple[Array, Array, Flags]:
     """Planes of places among their neighbours.
 
     Parameters
@@ -71,6 +71,8 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfi
     -------
     normals : (k, d)
         World, towards where the beams came from.
+    tilts : (k, d - 1, d)
+        Axes of the surfaces, world, each as long as the σ by which noise tilts the normal towards it [rad].
     flat : (k,) bool
         Is it a surface?
     """
@@ -79,11 +81,11 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfi
     _, at = cKDTree(W[near]).query(W[own], k=k, distance_upper_bound=config.radius)
     at = at.reshape(len(own), k).astype(np.int64)
     rows = np.append(near, -1)[at]
-    n, w = np.zeros((len(own), d)), np.zeros((len(own), 3))
-    fit_surfaces(W, rows, 2 * d, n, w)
+    n, w, tilts = np.zeros((len(own), d)), np.zeros((len(own), 3)), np.zeros((len(own), d - 1, d))
+    fit_surfaces(W, rows, 2 * d, n, w, tilts)
     middle = w[:, 1 if d == 3 else 2]
     with np.errstate(invalid="ignore"):
         good = (w[:, 0] <= config.thickness**2) & (middle >= config.extent**2)
         good &= w[:, 0] <= config.flatness * middle
     n[np.einsum("ki,ki->k", n, O[own] - W[own]) < 0] *= -1.0
-    return n, good
+    return n, tilts, good

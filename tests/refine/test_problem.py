@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.refine.motion import MotionModel
-from graphslam.refine.problem import Problem, pair_noise, point_information, residuals
+from graphslam.refine.problem import FEIGNED, Problem, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs
@@ -58,7 +59,8 @@ def some_problem(rng, dim, pairs=40):
     motion = MotionModel(scans, knot=1.0, bridge=cloud.bridge())
     normals = rng.standard_normal((len(cloud.points), dim))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    surfaces = Surfaces(normals, np.ones(len(normals), bool), np.arange(len(normals)))
+    tilts = rng.uniform(0.0, 0.3, (len(normals), dim - 1, dim)).astype(np.float32)
+    surfaces = Surfaces(normals, np.ones(len(normals), bool), np.arange(len(normals)), tilts)
     p, q = rng.integers(0, len(normals), (2, pairs))
     other = cloud.step[p] != cloud.step[q]
     p, q = p[other], q[other]
@@ -142,6 +144,64 @@ def test_one_step_is_that_of_the_dense_problem_and_so_is_the_covariance(rng, dim
     for k, block in enumerate(blocks):
         plain = C[k * d : (k + 1) * d, k * d : (k + 1) * d]
         np.testing.assert_allclose(block, plain, atol=1e-5 * np.abs(C).max())
+
+
+def of_group(g, poses, centre, J):
+    """Derivatives by the pose of each row as those by a motion about a centre in the axes of the world."""
+    about = np.array(g.identity)
+    about[: g.dim] = centre
+    A = g.adjoint(g.between(np.broadcast_to(about, poses.shape), poses))
+    return np.linalg.solve(np.swapaxes(A, 1, 2), J[..., None])[..., 0], A
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_noise_of_normals_feigns_is_not_held(rng, dim):
+    """Shares, and the step with them, against derivatives that are taken pair by pair to the frame of their group."""
+    problem, surfaces, pairs, poses, states = some_problem(rng, dim, pairs=90)
+    g, cloud, d = group_of(poses), problem.cloud, group_of(poses).dof
+    k = len(pairs.source)
+    found = Association(pairs, rng.integers(0, 2, k), np.zeros((k, 3)), np.zeros((k, 3)))
+    w = rng.uniform(10.0, 1000.0, k)
+    holds = held(found, cloud, surfaces, poses, w)
+
+    def derivatives(s):
+        J = differences(problem, poses, states, lambda p, _: residuals(pairs, cloud, s, p))[:, : len(poses) * d]
+        J = J.reshape(k, len(poses), d)
+        return J[np.arange(k), pairs.i], J[np.arange(k), pairs.j]
+
+    Ji, Jj = derivatives(surfaces)
+    tilted = [derivatives(replace(surfaces, normals=surfaces.tilts[:, a].astype(float)))[0] for a in range(dim - 1)]
+    H = np.zeros((len(poses) * d, len(poses) * d))
+    for m in (0, 1):
+        some = np.flatnonzero(found.whose == m)
+        at = g.transform(poses[pairs.j[some]], cloud.points[pairs.target[some]])
+        centre = at.mean(axis=0)
+        np.testing.assert_allclose(holds.centre[m], centre, atol=1e-9)
+        v, A = of_group(g, poses[pairs.i[some]], centre, Ji[some])
+        u, B = of_group(g, poses[pairs.j[some]], centre, Jj[some])
+        np.testing.assert_allclose(u, -v, atol=1e-6)
+        said = (v.T * w[some]) @ v
+        feigned = sum(
+            (x.T * w[some]) @ x for x in (of_group(g, poses[pairs.i[some]], centre, t[some])[0] for t in tilted)
+        )
+        values, V = eigh(said, feigned)
+        share = feigned @ V @ np.diag(np.sqrt(np.maximum(1.0 - FEIGNED / values, 0.0))) @ V.T
+        assert 0 < np.sum(values > FEIGNED) < d or dim == 2
+        np.testing.assert_allclose(
+            share @ said @ share.T, holds.share[m] @ said @ holds.share[m].T, rtol=1e-4, atol=1e-3
+        )
+        kept = v @ holds.share[m].T
+        Ji[some] = np.einsum("kij,ki->kj", A, kept)
+        Jj[some] = -np.einsum("kij,ki->kj", B, kept)
+    rows = np.zeros((k, len(poses), d))
+    rows[np.arange(k), pairs.i], rows[np.arange(k), pairs.j] = Ji, Jj
+    rows = rows.reshape(k, -1)
+    H = rows.T @ (w[:, None] * rows)
+    without = problem.linearise(poses, states, pairs, surfaces, np.zeros(k), [])[0]
+    solved = problem.linearise(poses, states, pairs, surfaces, w, [], holds)[0]
+    n = len(poses) * d
+    C0, C1 = (np.linalg.inv(s.factor.inverse_block(np.arange(n))) for s in (without, solved))
+    np.testing.assert_allclose(C1 - C0, H, atol=1e-4 * np.abs(H).max())
 
 
 @pytest.mark.parametrize("dim", [2, 3])
