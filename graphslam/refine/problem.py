@@ -168,19 +168,19 @@ def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> A
     return out
 
 
-FEIGNED = 10.0
-"""What pairs hold less than so many times as well as noise of the normals alone would feign is not held by them: beyond
-that, what noise of the normals pulls is less than a tenth of what surfaces hold, and by chance few groups get there."""
+FEIGNED = 1.5
+"""Of what noise of the normals feigns so many times as much is taken off: groups scatter about the average."""
 
 
 def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, information: Array) -> Held:
     """What each two chunks hold of each other, without what the noise of normals feigns.
 
     Normals of a smooth wall are tilted along it at random. Squared and added up over thousands of pairs they look as if
-    they held the way along it, and they pull it to where the pairs were found. With the variance of each normal the
-    information ``F`` that is feigned on average is known, and of each direction that the two chunks see, the share
-    ``1 - FEIGNED f / h`` is held, ``h / f`` being its information in multiples of what is feigned: in a corridor
-    nothing of the way along it, in a round room nothing of the turn, over a plain neither.
+    they held the way along it, and they pull it to where the pairs were found. With the variance of each normal both
+    the information ``F`` that is feigned on average and the pull are known. The pull is taken off the gradient; of a
+    direction whose information is h times what is feigned, the share 1 - 1/h of each derivative is held, which leaves
+    ``(h - 1)² / h``: what an estimate without that pull is worth. In a corridor this is nothing of the way along it, in
+    a round room nothing of the turn, over a plain neither.
 
     Returns
     -------
@@ -203,9 +203,9 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     size = np.einsum("mii->mi", H + F) + 1e-12
     L = np.linalg.cholesky(F + 1e-9 * np.eye(w) * size[:, None, :])
     values, U = np.linalg.eigh(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, H), 1, 2)))
-    share = np.sqrt(np.maximum(1.0 - FEIGNED / np.maximum(values, 1e-12), 0.0))
+    share = np.maximum(1.0 - FEIGNED / np.maximum(values, 1e-12), 0.0)
     back = np.swapaxes(np.linalg.solve(np.swapaxes(L, 1, 2), U), 1, 2)  # Uᵀ L⁻¹
-    return Held(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back))
+    return Held(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
 
 
 class Problem:

@@ -126,17 +126,20 @@ class Held(NamedTuple):
     share : (m, w, w)
         Takes the derivative of a residual by a motion of all source points about the centre, in the axes of the world
         and in the order of a tangent, to that part of it which the group holds.
+    tilts : (q, d - 1, d)
+        Of :func:`fit_surfaces`, in the frame of the step: what they pull on average is taken off the gradient.
     """
 
     group: Index
     centre: Array
     share: Array
+    tilts: npt.NDArray[np.float32]
 
 
 def nothing_feigned(dim: int) -> Held:
     """Pairs that hold all that they say."""
     w = 6 if dim == 3 else 3
-    return Held(np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)))
+    return Held(np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)), np.zeros((0, dim - 1, dim), np.float32))
 
 
 @nb.njit(cache=True, fastmath={"contract"})
@@ -256,6 +259,7 @@ def plane_blocks(
     d = t.shape[1]
     w = 6 if d == 3 else 3
     Ji, Jj, J, K = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
+    gi, gj, pull = np.empty(w), np.empty(w), np.empty(w)
     y, ni, nw, x = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
     total = 0.0
     for k in range(len(pairs.source)):
@@ -278,30 +282,53 @@ def plane_blocks(
         r = 0.0
         for v in range(d):
             r += nj[v] * (y[v] - points[q, v])
+        for u in range(w):
+            gi[u] = 0.0
+            gj[u] = 0.0
         if len(held.group):
             m = held.group[k]
             for u in range(d):
                 x[u] += t[j, u] - held.centre[m, u]
             wrench(x, nw, J)
             for u in range(w):
+                pull[u] = J[u] * r
+            for a in range(d - 1):
+                e = 0.0
+                for u in range(d):
+                    e += held.tilts[q, a, u] * (y[u] - points[q, u])
+                    nw[u] = 0.0
+                    for v in range(d):
+                        nw[u] += R[j, u, v] * held.tilts[q, a, v]
+                wrench(x, nw, K)
+                for u in range(w):
+                    pull[u] -= K[u] * e
+            for u in range(w):
                 K[u] = 0.0
                 for v in range(w):
                     K[u] += held.share[m, u, v] * J[v]
             _moved(K, R[i], t[i], held.centre[m], 1.0, Ji)
             _moved(K, R[j], t[j], held.centre[m], -1.0, Jj)
+            for u in range(w):
+                K[u] = 0.0
+                for v in range(w):
+                    K[u] += held.share[m, u, v] * pull[v]
+            _moved(K, R[i], t[i], held.centre[m], 1.0, gi)
+            _moved(K, R[j], t[j], held.centre[m], -1.0, gj)
         else:
             wrench(pi, ni, Ji)
             wrench(y, nj, Jj)
             for v in range(w):
                 Jj[v] = -Jj[v]
+                gi[v] = Ji[v] * r
+                gj[v] = Jj[v] * r
         L = information[k]
         total += L * r * r
         a, b, c = first[i], first[j], offset[k]
         low_is_j = rank[j] < rank[i]
         for u in range(w):
             Lu, Lv = L * Ji[u], L * Jj[u]
-            g[i, u] += Lu * r
-            g[j, u] += Lv * r
+            g[i, u] += L * gi[u]
+            g[j, u] += L * gj[u]
             for v in range(w):
                 H[a + u * w + v] += Lu * Ji[v]
                 H[b + u * w + v] += Lv * Jj[v]
