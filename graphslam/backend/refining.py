@@ -296,6 +296,12 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
         what = "the yaw bias walks" if r.walk >= r.scales.max() else "the motion is"
         text = f"Scans show that {what} {times:.1f} times as noisy as the log or the front end states; taken as seen."
         out.append(Finding("look", "refine-widened", text))
+    if r.alike > WIDENED:
+        text = (
+            "Points of one scan err alike, as those of a line of the scanner or of a slanted wall do: sums of their "
+            f"residuals vary {r.alike:.1f} times as much as independent errors would. The covariance is so much larger."
+        )
+        out.append(Finding("", "refine-alike", text))
     for name, (limit, words, unit, signs) in NAMED.items():
         if name in r.constants:
             v, sigma = r.constants[name]

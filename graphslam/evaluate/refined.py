@@ -91,6 +91,7 @@ def refinement_metrics(out: Metrics, r: Refinement) -> None:
     out.add("refine_agreement", r.agreement[1], "", "higher")
     out.add("refine_agreement_graph", r.agreement[0])
     out.add("refine_agreement_odometry", r.reckoned)
+    out.add("refine_alike", r.alike, "", "one")
     out.add("refine_left_apart", len(r.refused))
     out.add("refine_motion_chi2_per_dof", r.motion, "", "one")
     if r.fixes is not None:
@@ -113,6 +114,7 @@ def refinement_facts(r: Refinement) -> dict[str, Any]:
         "constants": {name: {"value": v, "sigma": s} for name, (v, s) in r.constants.items()},
         "yaw_bias": r.yaw_bias.tolist(),
         "motion_chi2_per_dof": r.motion,
+        "alike": r.alike,
         "left_apart": r.times[r.refused].tolist() if len(r.refused) else [],
         "fixes": None if (f := r.fixes) is None else {**asdict(f), "T_gps_world": f.T_gps_world.tolist()},
     }

@@ -160,6 +160,50 @@ def point_information(pairs: Association, residuals: Array, noise: Array, least:
     return np.asarray(w / (pairs.spent @ noise))
 
 
+ALIKE = 80
+"""Beams of a step in a row whose errors may be alike: a line of a scanner, a wall. Also tried: all of a step."""
+FEWEST_SUMS = 50
+"""Sums of residuals below which it is not told whether errors are alike."""
+
+
+def alike(found: Association, cloud: Cloud, residuals: Array, noise: Array) -> float:
+    """By how much the variance of sums of residuals is larger than if the errors of points were independent, ≥ 1.
+
+    Beams of one scan share errors: of a line of the scanner, of the material and the slant of a wall, of a sweep that
+    was unbent wrongly. A mean over them is then worse than its number promises. Residuals of points that follow each
+    other in a step, on surfaces of one chunk, are added up; as independent errors each source point brings half of the
+    variance of its residual, each target as much times the square of its pairs, and the motion within the step is
+    shared by all. What sums vary by beyond that is taken to hold for all directions alike.
+
+    Parameters
+    ----------
+    found : Association
+    cloud : Cloud
+    residuals : (k,) [m]
+    noise : (3,)
+        See :func:`pair_noise`.
+    """
+    v = found.once @ noise
+    good = np.flatnonzero(residuals**2 < 9.0 * v)
+    if not len(good):
+        return 1.0
+    p, q, i, m = found.pairs.source[good], found.pairs.target[good], found.pairs.i[good], found.whose[good]
+    z = residuals[good] / np.sqrt(v[good])
+    moved = np.sqrt(found.once[good, 2] * noise[2] / v[good])
+    order = p - np.searchsorted(cloud.step, i)
+    out = 1.0
+    for length in (ALIKE, len(cloud.points)):
+        key = (m * (int(i.max()) + 1) + i) * (int(order.max()) // length + 1) + order // length
+        key = np.unique(key, return_inverse=True)[1]
+        shared, times = np.unique(key * len(cloud.points) + q, return_counts=True)
+        own = np.bincount(key, weights=1.0 - moved**2) / np.bincount(key)
+        targets = np.bincount(shared // len(cloud.points), weights=times.astype(float) ** 2)
+        wanted = 0.5 * own * (np.bincount(key) + targets) + np.bincount(key, weights=moved) ** 2
+        if len(wanted) >= FEWEST_SUMS:
+            out = max(out, float(np.sum(np.bincount(key, weights=z) ** 2) / np.sum(wanted)))
+    return out
+
+
 def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> Array:
     """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
     out = np.empty(len(pairs.source))

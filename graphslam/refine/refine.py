@@ -27,7 +27,7 @@ from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel, States
 from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at
-from graphslam.refine.problem import Problem, Solved, held, pair_noise, point_information, residuals
+from graphslam.refine.problem import Problem, Solved, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 from graphslam.registration.plane_kernels import Pairs
@@ -142,6 +142,9 @@ class Refinement:
         How the steps lie between nodes, and what they do not share with any.
     fixes : FixReport or None
         What fixes did; None: there were none, or their way is too short to say where north is.
+    alike : float
+        By how much sums of residuals of one scan vary more than independent errors would, for which covariances are
+        larger; 1: no more.
     left : float or None
         Agreement at the refined path where that of the odometry was taken instead, since scans agree better there.
     """
@@ -165,6 +168,7 @@ class Refinement:
     nodes: Index
     between: Between
     fixes: FixReport | None = None
+    alike: float = 1.0
     left: float | None = None
 
     @property
@@ -303,6 +307,7 @@ class _Work:
         self.poses = start.copy()
         self.states = self.first_states()
         self.rounds: list[Round] = []
+        self.alike = 1.0
         self.found = NOTHING
         self.surfaces: Surfaces | None = None
         self.first: Surfaces | None = None
@@ -453,7 +458,11 @@ class _Work:
             solved = None  # a factor of a long path is the largest thing here: never two of them
             r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
-            solved = self.step(point_information(self.found, r, noise, DOUBTED * distance))
+            information = point_information(self.found, r, noise, DOUBTED * distance)
+            if sigma is None:
+                self.alike = alike(self.found, self.cloud, r, noise)
+                information /= self.alike
+            solved = self.step(information)
         if passes and distance <= self.config.distances[0] and solved is not None:
             self.motion.widen(self.poses, self.states, solved.factor)
         self.noise = noise
@@ -530,7 +539,9 @@ class _Work:
         give_back()
         before = self.agreement(self.raw, self.first, self.start, self.noise)
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
-        solved = self.step(point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1]))
+        self.alike = alike(self.found, self.cloud, r, self.noise)
+        information = point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1])
+        solved = self.step(information / self.alike)
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = self.marginals(solved)
         const = solved.factor.inverse_block(n * w + K + np.arange(self.motion.constants))
@@ -558,5 +569,6 @@ class _Work:
             solved=solved,
             nodes=np.arange(n, dtype=np.int64),
             between=Between.at_nodes(n, w),
+            alike=self.alike,
             fixes=None if self.fixes is None else self.fixes.report(self.poses, self.states),
         )

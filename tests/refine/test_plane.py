@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,21 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
         scans, start, true = started(seconds=60.0, spread=5e-3, seed=seed)
         values.append(normalised(refine(scans, start), true).mean())
     assert 0.5 < np.mean(values) < 1.1
+
+
+def test_errors_that_a_scan_has_in_common_widen_the_covariance() -> None:
+    """All ranges of a scan are off by 1 cm, as much as each by itself."""
+    values, found = [], []
+    for seed in range(3, 7):
+        scans, start, true = started(seconds=60.0, spread=5e-3, seed=seed)
+        rng = np.random.default_rng(seed)
+        off = np.repeat(1e-2 * rng.standard_normal(len(scans)), np.diff(scans.offsets))
+        ends = scans.points - scans.origins
+        ends *= 1.0 + off[:, None] / np.maximum(np.linalg.norm(ends, axis=1, keepdims=True), 0.1)
+        found.append(refine(replace(scans, points=(scans.origins + ends).astype(np.float32)), start))
+        values.append(normalised(found[-1], true).mean())
+    assert all(r.alike > 2.0 for r in found)
+    assert 0.4 < np.mean(values) < 1.6
 
 
 def test_a_step_between_nodes_is_uncertain_where_wheels_slipped() -> None:

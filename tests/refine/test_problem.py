@@ -12,7 +12,7 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.refine.motion import MotionModel
-from graphslam.refine.problem import FEIGNED, Problem, held, pair_noise, point_information, residuals
+from graphslam.refine.problem import FEIGNED, Problem, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs
@@ -269,6 +269,26 @@ def test_noise_of_ranges_and_surfaces_is_found_from_residuals(rng, rho, f):
     a, b = np.sqrt(pair_noise(found, r)[:2])
     assert a == pytest.approx(rho, abs=0.1 * rho + 0.003)
     assert b == pytest.approx(f, abs=0.15 * f + 0.004)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.01])
+def test_errors_that_points_of_a_scan_share_are_seen_in_sums_of_residuals(rng, shared):
+    """30 steps of 200 points on 500 surfaces that several use; in each step blocks of 80 err alike."""
+    steps, n, q = 30, 200, 500
+    step = np.repeat(np.arange(steps + 1), [n] * steps + [q])
+    points = np.zeros((len(step), 2))
+    cloud = Cloud(points, points, step, np.zeros(len(step)), np.zeros(steps + 1, np.int64), np.array([0, len(step)]))
+    p, target = np.arange(steps * n), steps * n + rng.integers(0, q, steps * n)
+    sigma = 0.02
+    r = sigma * (rng.standard_normal(steps * n) + rng.standard_normal(steps * n + q)[target]) / np.sqrt(2.0)
+    blocks = step[p] * 3 + (p % n) // 80
+    r += shared * rng.standard_normal(3 * steps)[blocks]
+    once = np.tile([0.0, 1.0, 0.0], (len(p), 1))
+    found = Association(Pairs(p, target, step[p], step[target]), np.zeros(len(p), np.int64), once, once)
+    variance = sigma**2 + shared**2
+    size = np.bincount(blocks)
+    wanted = 1.0 + np.sum(shared**2 * size * (size - 1.0)) / np.sum(variance * size) if shared else 1.0
+    assert alike(found, cloud, r, np.array([0.0, variance, 1.0])) == pytest.approx(wanted, rel=0.35 if shared else 0.25)
 
 
 def test_wild_pairs_have_no_information(rng):
