@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core import se3
@@ -35,7 +36,7 @@ class Sharpness:
     Parameters
     ----------
     thickness : float
-        Mean σ of points across their surfaces [m].
+        Median σ of points across their surfaces [m].
     revisited : float
         The same where they were seen at times more than ``apart`` from each other [m]; nan if nowhere.
     entropy : float
@@ -119,12 +120,14 @@ def sharpness(
     for name, f in found.items():
         lower = base - f[seen, 1]
         gain = float(lower.mean()), float(lower.std() / np.sqrt(max(seen.sum() / 10.0, 1.0)))
-        thick, twice = (float(f[some, c].mean()) if some.any() else np.nan for some, c in ((flat, 0), (again, 2)))
+        thick, twice = (float(np.median(f[some, c])) if some.any() else np.nan for some, c in ((flat, 0), (again, 2)))
         out[name] = Sharpness(thick, twice, float(f[seen, 1].mean()), gain, int(seen.sum()))
     return out
 
 
-def _neighbourhoods(path: Trajectory, P: Array, t: Array, rows: Array, radius: float, apart: float) -> Array:
+def _neighbourhoods(
+    path: Trajectory, P: Array, t: Array, rows: npt.NDArray[np.int64], radius: float, apart: float
+) -> Array:
     """Thickness, entropy, and thickness of what was seen again ``(m, 3)``; nan where there is none."""
     W = se3.se3_transform(path.interpolate(t), P)
     out = np.full((len(rows), 3), np.nan)
