@@ -413,7 +413,12 @@ class LidarOdometry:
             return predicted, None, Seen(len(points), fit.overlap, 6, state, searched)
         if fit.known < LITTLE:
             return start, None, Seen(len(points), fit.overlap, 6, state, searched)
-        pose, unheld = self._hold(points, pose, predicted, fit)
+        free, (pose, unheld) = pose, self._hold(pose, predicted, fit)
+        if unheld and len(self.missed) < 3:
+            # nobody knows yet how it moves: rest is believed where the scan fits there as well
+            points = self._unbent(raw, pose, time)[chosen]
+            if self.levels[-1].fit(points, *_split(pose), SCALE).overlap < LIKELY * fit.overlap:
+                pose = free
         if state != "new space":
             self.overlaps.append(fit.overlap)
             self.qualities.append(fit.quality)
@@ -473,11 +478,11 @@ class LidarOdometry:
                 out.append((fit.overlap, pose))
         return out
 
-    def _hold(self, points: Array, pose: Array, predicted: Array, fit: Fit) -> tuple[Array, int]:
+    def _hold(self, pose: Array, predicted: Array, fit: Fit) -> tuple[Array, int]:
         """Take the prediction along directions that no surface holds, and tell how many these are."""
         P = held(fit.H, fit.every)
         unheld = 6 - round(float(np.trace(P)))
-        if unheld and len(self.missed) >= 3:
+        if unheld:
             xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
             pose = np.asarray(se3.se3_compose(predicted, se3.se3_exp(xi)))
         return pose, unheld
