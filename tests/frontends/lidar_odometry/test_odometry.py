@@ -102,7 +102,7 @@ def test_nothing_holds_a_scan_along_an_endless_corridor():
 
 
 def test_a_lidar_that_stands_when_the_log_begins_stays_where_it_is():
-    """A garage's smooth wall ahead: along it nothing holds a scan, and one that is bent by a false motion fits as well."""
+    """Along a smooth wall nothing holds a scan, and one that is bent by a false motion fits as well."""
     log = simulate_lidar(mesh_world("garage", seed=5), 5, _lidar(5), most=1.7)
     poses, seen, _ = follow(log["clouds"])
     off = errors(poses, log.truth.trajectory.interpolate(log["clouds"].times))
