@@ -114,7 +114,7 @@ def sharpness(
         raise DataError(
             "no two scans see the same surfaces", got=f"{len(P)} points", wanted=f"{FEWEST} near each other"
         )
-    flat, again = (np.all([np.isfinite(f[:, c]) for f in found.values()], axis=0) for c in (0, 2))
+    flat, again = (np.all([np.isfinite(g[:, c]) for g in found.values()], axis=0) for c in (0, 2))
     base = next(iter(found.values()))[seen, 1]
     out = {}
     for name, f in found.items():
