@@ -7,6 +7,7 @@ as the length of a way that is never passed again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -136,7 +137,7 @@ def _neighbourhoods(
             continue
         C = np.cov(W[near].T)
         w = np.linalg.eigvalsh(C)
-        out[m, 1] = 0.5 * float(np.sum(np.log(2.0 * np.pi * np.e * np.maximum(w, 1e-12))))
+        out[m, 1] = 0.5 * float(np.sum(np.log(2.0 * math.pi * math.e * np.maximum(w, 1e-12))))
         if w[0] < FLAT * w[1]:
             out[m, 0] = np.sqrt(max(w[0], 0.0))
             if np.ptp(t[near]) > apart:
