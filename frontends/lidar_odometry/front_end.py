@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -198,6 +198,8 @@ class LidarFrontEnd(FrontEnd):
                         base = upright(base, odometry.inertial.up)
                     yield _submap((name, unit.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
+                for i in range(k - n, k):  # what is in a submap is asked for once more, by a refinement
+                    seen[i] = replace(seen[i], points=seen[i].points.astype(np.float32))
                 kept, key, way = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
         if scans and not mapped:
             c = self.config.odometry
@@ -509,7 +511,7 @@ def _steps(
     poses = np.array([f.pose for f in made])
     increments = np.concatenate([np.array([[0.0, 0, 0, 0, 0, 0, 1]]), se3.se3_between(poses[:-1], poses[1:])])
     covariances = np.array([np.zeros((6, 6)), *[f.spread for f in made[1:]]])
-    points = [f.points if f.seen.state in MAPPED else f.points[:0] for f in made]
+    points = [(f.points if f.seen.state in MAPPED else f.points[:0]).astype(np.float32, copy=False) for f in made]
     offsets = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
     ends = np.concatenate(points)
     origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)
@@ -517,8 +519,8 @@ def _steps(
         times=times,
         odometry=Odometry(times=times, increments=increments, covariances=covariances),
         offsets=offsets,
-        points=ends,
-        origins=np.tile(origin, (len(ends), 1)),
+        points=cast(Array, ends),
+        origins=cast(Array, np.broadcast_to(origin.astype(np.float32), ends.shape)),
         returns=np.ones(len(ends), np.bool_),
         max_range=config.odometry.max_range,
         range_sigma=0.03,

@@ -109,7 +109,8 @@ class Steps:
         if len(self.offsets) != n + 1:
             raise DataError("offsets and stamps differ in number", got=len(self.offsets), wanted=n + 1)
         for what in ("points", "origins"):
-            a = np.ascontiguousarray(getattr(self, what), dtype=np.float64)
+            given = np.asarray(getattr(self, what))
+            a = np.ascontiguousarray(given, dtype=np.float32 if given.dtype == np.float32 else np.float64)
             if a.shape != (q, d):
                 raise GeometryError(f"{what} have the wrong shape", where=self.name, got=a.shape, wanted=(q, d))
             if not np.all(np.isfinite(a)):

@@ -6,7 +6,6 @@ that of a submap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.points import FARTHEST
+from graphslam.core.shelf import SHELF, Slot, as_it_is, the_only
 
 Ints = npt.NDArray[np.int64]
 
@@ -25,9 +25,9 @@ class DensePayload(Protocol):
     def save(self, path: Any) -> None: ...
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CloudMap:
-    """Points on the surfaces around a submap, in the frame of its base.
+    """Points on the surfaces around a submap, in the frame of its base. A value that does not change; its points lie on
+    the shelf of the process (:mod:`graphslam.core.shelf`), so that those of a long run do not fill the memory.
 
     Parameters
     ----------
@@ -47,42 +47,52 @@ class CloudMap:
         Impossible shapes, figures that are not finite, or scans without an origin.
     """
 
-    points: Array
-    origins: Array | None = None
-    scan: Ints | None = None
-    cell: float = 0.2
+    __slots__ = ("_points", "_scan", "_shape", "cell", "origins")
 
-    def __post_init__(self) -> None:
-        put = object.__setattr__
-        points = _rows(self.points, "points of a cloud")
-        put(self, "points", points)
-        if not (np.isfinite(self.cell) and self.cell > 0):
-            raise GeometryError("impossible cell of a cloud", got=self.cell, wanted="> 0 m")
-        if (self.origins is None) != (self.scan is None):
+    def __init__(self, *, points: Any, origins: Any = None, scan: Any = None, cell: float = 0.2) -> None:
+        points = _rows(points, "points of a cloud")
+        if not (np.isfinite(cell) and cell > 0):
+            raise GeometryError("impossible cell of a cloud", got=cell, wanted="> 0 m")
+        if (origins is None) != (scan is None):
             raise GeometryError("origins and scans of a cloud go together", wanted="both, or neither")
-        if self.origins is None or self.scan is None:
-            return
-        origins, scan = _rows(self.origins, "origins of a cloud"), np.ascontiguousarray(self.scan, dtype=np.int64)
-        if origins.shape[1] != points.shape[1] or scan.shape != (len(points),):
-            raise GeometryError(
-                "origins and scans do not fit the points of a cloud",
-                got=(origins.shape, scan.shape),
-                wanted=((len(origins), points.shape[1]), (len(points),)),
-            )
-        if len(scan) and not (scan.min() >= 0 and scan.max() < len(origins)):
-            raise GeometryError(
-                "a point of a cloud names a scan that is not there", got=int(scan.max()), wanted=f"0 … {len(origins)}"
-            )
-        put(self, "origins", origins)
-        put(self, "scan", scan)
+        self.cell = cell
+        self.origins: Array | None = None
+        self._scan: Slot[Ints] | None = None
+        if origins is not None:
+            origins, scan = _rows(origins, "origins of a cloud"), np.ascontiguousarray(scan, dtype=np.int64)
+            if origins.shape[1] != points.shape[1] or scan.shape != (len(points),):
+                raise GeometryError(
+                    "origins and scans do not fit the points of a cloud",
+                    got=(origins.shape, scan.shape),
+                    wanted=((len(origins), points.shape[1]), (len(points),)),
+                )
+            if len(scan) and not (scan.min() >= 0 and scan.max() < len(origins)):
+                raise GeometryError(
+                    "a point of a cloud names a scan that is not there",
+                    got=int(scan.max()),
+                    wanted=f"0 … {len(origins)}",
+                )
+            self.origins, self._scan = origins, SHELF.put(scan, scan.nbytes, as_it_is, the_only)
+        self._shape = points.shape
+        self._points: Slot[Array] = SHELF.put(points, points.nbytes, as_it_is, the_only)
+
+    @property
+    def points(self) -> Array:
+        """``(m, dim)`` [m]."""
+        return self._points.get()
+
+    @property
+    def scan(self) -> Ints | None:
+        """Row of ``origins`` of each point ``(m,)``; None without these."""
+        return None if self._scan is None else self._scan.get()
 
     @property
     def dim(self) -> int:
         """2 or 3."""
-        return int(self.points.shape[1])
+        return int(self._shape[1])
 
     def __len__(self) -> int:
-        return len(self.points)
+        return int(self._shape[0])
 
     def __repr__(self) -> str:
         free = "free space unknown" if self.origins is None else f"seen from {len(self.origins)} places"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import GeometryError
@@ -72,15 +73,25 @@ def thin(points: Array, voxel: float) -> Array:
     """
     if not len(points):
         return points
-    cells = np.floor(points / voxel).astype(np.int64)
-    cells -= cells.min(axis=0)
-    size = cells.max(axis=0) + 1
-    if np.prod(size.astype(float)) > 2.0**62:  # too many to number
-        cells = np.stack([np.unique(c, return_inverse=True)[1] for c in cells.T], axis=1)
-        size = cells.max(axis=0) + 1
-    key = cells[:, 0]
-    for a in range(1, points.shape[1]):
-        key = key * size[a] + cells[:, a]
+    dims = range(points.shape[1])  # an axis at a time: of a long run they are many points
+
+    def cells(a: int) -> npt.NDArray[np.int64]:
+        c = np.floor(points[:, a] / voxel).astype(np.int64)
+        c -= c.min()
+        return c
+
+    size = [int(cells(a).max()) + 1 for a in dims]
+    few = float(np.prod(np.array(size, dtype=np.float64))) <= 2.0**62  # else too many to number
+
+    def numbers(a: int) -> npt.NDArray[np.int64]:
+        return cells(a) if few else np.unique(cells(a), return_inverse=True)[1].ravel().astype(np.int64)
+
+    if not few:
+        size = [int(numbers(a).max()) + 1 for a in dims]
+    key = numbers(0)
+    for a in dims[1:]:
+        key *= size[a]
+        key += numbers(a)
     _, which, count = np.unique(key, return_inverse=True, return_counts=True)
     return np.stack([np.bincount(which, x) / count for x in points.T], axis=1)
 

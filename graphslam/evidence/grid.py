@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -267,6 +268,15 @@ class EvidenceGrid:
             out = np.empty((len(ids), BRICK_VOXELS), np.int16)
             gather_bricks(np.ascontiguousarray(ids), self.pool.bricks, out)
         return out
+
+    def brick_blocks(self, size: int = 4096) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.int16]]]:
+        """Coordinates ``(m, 3)`` and values ``(m, 512)`` of the bricks, so many at a time, in their order."""
+        pool = self.pool
+        coordinates = self.brick_coordinates()
+        with pool.lock:
+            ids = self.packed_bricks()[:, 1]
+            for k in range(0, len(ids), size):
+                yield coordinates[k : k + size], pool.bricks[ids[k : k + size]]
 
     def values_at(self, points: Any) -> npt.NDArray[np.int16]:
         """Values of the voxels points lie in ``(n,)``, in units of `layout.STEP`; `layout.UNKNOWN` where nothing is

@@ -61,18 +61,19 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
     for begin in range(0, len(keys), CHUNK):
         part = keys[begin : begin + CHUNK]
         values = np.empty((len(part), BRICK_VOXELS), np.int16)
-        with source.pool.lock:
+        theirs = source.pool
+        with theirs.lock:
             known = sample_bricks(
                 part,
                 T_inverse,
                 scale,
                 grid.voxel_size,
                 pool.half,
-                source.pool.half,
+                theirs.half,
                 source.root,
-                source.pool.levels,
-                source.pool.children,
-                source.pool.bricks,
+                theirs.levels,
+                theirs.children,
+                theirs.bricks,
                 values,
             )
         if known == 0:

@@ -285,7 +285,8 @@ def _records_of(
 
 def _check_middle(grid: EvidenceGrid, states: npt.NDArray[np.int32], where: str) -> None:
     """Refuse a grid of 7 levels that holds anything outside the middle eight of its root's children."""
-    children = grid.pool.children[grid.root]
+    pool = grid.pool
+    children = pool.children[grid.root]
     inner = np.zeros((4, 4, 4), bool)
     inner[1:3, 1:3, 1:3] = True
     outer = children[(children != 0) & ~inner.ravel()]

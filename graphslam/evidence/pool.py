@@ -83,6 +83,8 @@ class GridPool:
         self.brick_free = np.zeros(64, np.int32)
         self.dead: deque[int] = deque()
         self._scratches: list[Scratch] = []
+        self.kept: RootBox | None = None
+        """A tree that lives as long as the pool (:mod:`graphslam.evidence.shelved`)."""
 
     def tree_arrays(self) -> tuple[Any, ...]:
         """``(children, node_ref, node_occupied, bricks, brick_ref, brick_lines)``; hold `lock` while they are used."""
@@ -117,6 +119,17 @@ class GridPool:
         if more_bricks > 0:
             self.bricks, self.brick_ref, self.brick_lines, self.brick_free = _grown(
                 (self.bricks, self.brick_ref, self.brick_lines, self.brick_free), int(more_bricks), c[BRICKS_USED]
+            )
+
+    def fit(self) -> None:
+        """Give back the room for what may come: for a pool that nobody will write to."""
+        with self.lock:
+            n, b = int(self.counters[NODES_USED]), int(self.counters[BRICKS_USED])
+            self.children, self.node_ref, self.node_occupied, self.node_free = (
+                _longer(a, n, n) for a in (self.children, self.node_ref, self.node_occupied, self.node_free)
+            )
+            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = (
+                _longer(a, b, b) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free)
             )
 
     @property

@@ -15,6 +15,7 @@ from graphslam.core.points import thin
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
+from graphslam.evidence.shelved import shelved
 
 
 class GridView:
@@ -102,14 +103,15 @@ class CloudView:
         c, grid = self._cloud, EvidenceGrid(self._cloud.cell, dim=self._cloud.dim)
         if c.origins is None or c.scan is None:
             _mark(grid, c.points)
-            return grid
-        order = np.argsort(c.scan, kind="stable")
-        bounds = np.searchsorted(c.scan[order], np.arange(len(c.origins) + 1))
+            return shelved(grid)
+        scan, points = c.scan, c.points
+        order = np.argsort(scan, kind="stable")
+        bounds = np.searchsorted(scan[order], np.arange(len(c.origins) + 1))
         for k, origin in enumerate(c.origins):
             rows = order[bounds[k] : bounds[k + 1]]
             if len(rows):
-                grid.insert_scan(c.points[rows], origin)
-        return grid
+                grid.insert_scan(points[rows], origin)
+        return shelved(grid)
 
 
 def view_of(submap: Submap) -> MapView:

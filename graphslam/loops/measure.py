@@ -53,8 +53,12 @@ class Loop:
     submaps: tuple[int, int] = (-1, -1)
 
 
+ROOM = 256_000_000
+"""What prepared maps may take of the memory [bytes]."""
+
+
 class LoopMeasurer:
-    """Registers candidates; maps are prepared once.
+    """Registers candidates; maps that are prepared are kept as far as there is room.
 
     Parameters
     ----------
@@ -85,9 +89,17 @@ class LoopMeasurer:
         DataError
             It has none.
         """
-        if k not in self._maps:
-            self._maps[k] = PreparedMap(view_of(self.submaps[k]), self.config)
-        return self._maps[k]
+        found = self._maps.pop(k, None)
+        self._maps[k] = found = PreparedMap(view_of(self.submaps[k]), self.config) if found is None else found
+        return found
+
+    def _let_go(self) -> None:
+        """Of the maps that take much memory, those that were used longest ago."""
+        held = sum(m.nbytes for m in self._maps.values())
+        for k in list(self._maps):
+            if held <= ROOM:
+                break
+            held -= self._maps.pop(k).nbytes
 
     def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
         """Loops of candidates, in their order; a front end's match or a tie is one already."""
@@ -106,6 +118,7 @@ class LoopMeasurer:
         g = group_of(c.T_ij)
         target_prior = g.compose(p.T_base_node[c.i], c.T_ij)
         m = match_pair(self.prepared(b), p.T_base_node[c.j], self.prepared(a), target_prior, c.covariance)
+        self._let_go()
         i = c.i
         if m.registration is not None:
             # what the place sees there was mapped from the nearest stretch of the target's path

@@ -18,6 +18,7 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
+from graphslam.evidence.shelved import shelved
 from graphslam.evidence.views import view_of
 from graphslam.maps.added_kernels import subtract_bricks
 
@@ -131,7 +132,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
             found = added(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
             share = found.shared / max(whole[target].voxel_counts().known, 1)
             if share >= best:
-                best, grids[s.key], entered[s.key] = share, found.grid, target
+                best, grids[s.key], entered[s.key] = share, shelved(found.grid), target
         before = s
     return grids, entered
 

@@ -45,7 +45,11 @@ def fused_points(
         T_world = level(T_world) if level_nodes else T_world
         made.append(_placed(cloud, s, times, local, T_world, DivisionConfig() if config is None else config))
         cells.append(cloud.cell)
-    return thin(np.concatenate(made), min(cells)) if made else None
+    if not made:
+        return None
+    points = np.concatenate(made)
+    made.clear()
+    return thin(points, min(cells))
 
 
 def _placed(cloud: CloudMap, s: Submap, times: Array, local: Array, T_world: Array, config: DivisionConfig) -> Array:

@@ -80,7 +80,12 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
     first, last = (int(np.ceil(z / grid.voxel_size - 0.5)) for z in (low, high))  # the one after the last
     if last <= first:
         raise GridError("no layer of voxels has its middle in this band", got=f"{low} … {high} m")
-    coordinates, values = grid.brick_coordinates(), grid.brick_values().reshape(-1, BRICK_EDGE, BRICK_EDGE**2)
+    coordinates, pool = grid.brick_coordinates(), grid.pool
+    bottom = BRICK_EDGE * coordinates[:, 2]
+    near = np.flatnonzero((bottom < last) & (bottom + BRICK_EDGE > first))
+    with pool.lock:
+        values = pool.bricks[grid.packed_bricks()[near, 1]].reshape(-1, BRICK_EDGE, BRICK_EDGE**2)
+    coordinates = coordinates[near]
     z = BRICK_EDGE * coordinates[:, 2, None] + np.arange(BRICK_EDGE)
     tops = np.where(((z >= first) & (z < last))[:, :, None], values, np.int16(UNKNOWN)).max(axis=1)  # unknown is least
     columns, where = np.unique(coordinates[:, :2], axis=0, return_inverse=True)

@@ -266,20 +266,25 @@ class FusedMap:
             left = set(gone)
             posed = {n: p for n, p in self._posed.items() if n not in left} | fresh
             keys = np.unique(np.concatenate([_NONE, *(p.keys for p in (*old, *fresh.values()))]))
-            written, values, empty = self._posers[0].sum(
+            work, written, empty = self._grid.copy(), [_NONE], 0  # the grid itself changes when all is done
+            for some, values, gone_empty in self._posers[0].sums(
                 keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
-            )
+            ):
+                if len(some):
+                    work.write_packed(some, values)
+                written.append(some)
+                empty += gone_empty
+            changed = np.concatenate(written)
             with deferred_interrupts():
-                if len(written):
-                    self._grid.write_packed(written, values)
+                self._grid.take(work)
                 self._posed = posed
                 for name in gone:
                     del self._pieces[name], self._wanted[name]
                 self._pieces |= add
                 self._wanted |= wanted
-                self._uncounted.append(written)
+                self._uncounted.append(changed)
         self._tidy(empty)
-        return Change(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(written))
+        return Change(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(changed))
 
     # --- inside ----------------------------------------------------------------------------------------------
 

@@ -26,6 +26,8 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.pool import GridPool
+from graphslam.evidence.shelved import shelved
 
 Mask = npt.NDArray[np.bool_]
 
@@ -113,12 +115,12 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
             continue
         assert cloud.origins is not None
         left = CloudMap(points=cloud.points[~gone], origins=cloud.origins, scan=cloud.scan[~gone], cell=cloud.cell)
-        drawn = grid.empty()
+        drawn = grid.empty(GridPool(grid.pool.levels))
         for k, origin in enumerate(cloud.origins):
             points = cloud.points[(cloud.scan == k) & ~gone]
             if len(points):
                 drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
-        out.append(replace(s, cloud=left, grid=drawn, report={**s.report, "points_moved": int(gone.sum())}))
+        out.append(replace(s, cloud=left, grid=shelved(drawn), report={**s.report, "points_moved": int(gone.sum())}))
     return out
 
 

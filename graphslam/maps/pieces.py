@@ -21,7 +21,8 @@ than another.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,10 +32,12 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import SE2, SE3
+from graphslam.core.shelf import SHELF, Arrays
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
+from graphslam.evidence.shelved import packed_values, unpacked_values
 from graphslam.evidence.views import view_of
 from graphslam.maps.piece_kernels import count_owned, deal_out, known_extents, own_voxels
 
@@ -72,9 +75,41 @@ class DivisionConfig:
             raise ConfigError(f"division of a map: retrace {self.retrace}, spacing {self.spacing}; wanted ≥ 0 m")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class _Bricks:
+    """Arrays of a piece, as they are needed."""
+
+    __slots__ = ("__weakref__", "coordinates", "extents", "lookup", "table")
+
+    def __init__(
+        self, coordinates: Ints, lookup: Steps, extents: npt.NDArray[np.int8], first: Ints, shape: tuple[int, ...]
+    ) -> None:
+        self.coordinates, self.lookup, self.extents = coordinates, lookup, extents
+        self.table = np.zeros(shape, np.int32)
+        at = coordinates - first
+        self.table[at[:, 2], at[:, 1], at[:, 0]] = np.arange(1, len(at) + 1)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return self.lookup.nbytes + self.table.nbytes + self.coordinates.nbytes
+
+    def packed(self) -> Arrays:
+        """For the shelf: values of known voxels only."""
+        return [self.coordinates.astype(np.int32), *packed_values(self.lookup[1:]), self.extents]
+
+    @classmethod
+    def unpacked(cls, first: Ints, shape: tuple[int, ...], arrays: Arrays) -> _Bricks:
+        """From the shelf."""
+        coordinates, where, known, extents = arrays
+        lookup = np.empty((len(coordinates) + 1, BRICK_VOXELS), np.int16)
+        lookup[0], lookup[1:] = UNKNOWN, unpacked_values(where, known)
+        return cls(coordinates.astype(np.int64), lookup, extents, first, shape)
+
+
 class Piece:
-    """Voxels that move with one node: a frozen value, in the lattice of the frame of its submap's base.
+    """Voxels that move with one node: a value that does not change, in the lattice of the frame of its submap's base.
+
+    Its bricks lie on the shelf of the process (:mod:`graphslam.core.shelf`): take an array of them once, and use it.
 
     Parameters
     ----------
@@ -96,30 +131,22 @@ class Piece:
         An impossible pose.
     """
 
-    voxel_size: float
-    dim: int
-    coordinates: Ints
-    values: Steps
-    T_base_node: Array = field(default_factory=lambda: np.zeros(0))
-    first: Ints = field(init=False, repr=False)
-    """Coordinates ``(3,)`` of the first brick of the box around the piece, its `MARGIN` included."""
-    table: npt.NDArray[np.int32] = field(init=False, repr=False)
-    """Rows of ``lookup`` of the bricks of that box ``(nz, ny, nx)``, 0 where there is none."""
-    lookup: Steps = field(init=False, repr=False)
-    """``values`` after a row that is all unknown ``(n + 1, 512)``."""
-    extents: npt.NDArray[np.int8] = field(init=False, repr=False)
-    """Of the known voxels of each brick: first one, and the one after the last ``(n, 6)``."""
-    corners: Array = field(init=False, repr=False)
-    """Of the box of the known voxels, in the node's frame ``(8, 3)`` or ``(4, 2)`` [m]; none of an empty piece."""
-    known: int = field(init=False)
-    """Known voxels."""
+    __slots__ = ("T_base_node", "_bricks", "corners", "dim", "first", "known", "nbytes", "voxel_size")
 
-    def __post_init__(self) -> None:
-        put = object.__setattr__
-        c = np.ascontiguousarray(self.coordinates, dtype=np.int64)
-        v = np.ascontiguousarray(self.values)
-        if self.dim not in (2, 3) or not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
-            raise GridError("impossible piece of a map", got=f"{self.dim}-D, voxels of {self.voxel_size} m")
+    first: Ints
+    """Coordinates ``(3,)`` of the first brick of the box around the piece, its `MARGIN` included."""
+    corners: Array
+    """Of the box of the known voxels, in the node's frame ``(8, 3)`` or ``(4, 2)`` [m]; none of an empty piece."""
+    known: int
+    """Known voxels."""
+    nbytes: int
+    """Memory of the bricks, while they are in it [bytes]."""
+
+    def __init__(self, voxel_size: float, dim: int, coordinates: Any, values: Any, T_base_node: Any = None) -> None:
+        c = np.ascontiguousarray(coordinates, dtype=np.int64)
+        v = np.ascontiguousarray(values)
+        if dim not in (2, 3) or not (np.isfinite(voxel_size) and voxel_size > 0):
+            raise GridError("impossible piece of a map", got=f"{dim}-D, voxels of {voxel_size} m")
         if c.ndim != 2 or c.shape[1] != 3 or v.shape != (len(c), BRICK_VOXELS) or v.dtype != np.int16:
             raise GridError(
                 "bricks of a piece have the wrong shape or type",
@@ -131,40 +158,53 @@ class Piece:
         if float(np.prod(shape.astype(np.float64))) > TABLE_LIMIT:
             raise GridError(
                 "a piece of a map is too wide: is there a stray voxel in it?",
-                got=f"{(shape * BRICK_EDGE * self.voxel_size).round().tolist()} m",
+                got=f"{(shape * BRICK_EDGE * voxel_size).round().tolist()} m",
                 wanted=f"at most {TABLE_LIMIT} bricks in the box around it",
             )
-        table = np.zeros(shape[::-1], np.int32)
-        at = c - first
-        table[at[:, 2], at[:, 1], at[:, 0]] = np.arange(1, len(c) + 1)
-        if np.count_nonzero(table) != len(c):
-            raise GridError("a brick stands twice in a piece", wanted="each brick once")
-        if self.dim == 2 and len(c) and (np.any(c[:, 2]) or np.any(v[:, 64:] != UNKNOWN)):
-            raise GridError("a 2-D piece leaves its layer", got=f"bricks {np.unique(c[:, 2]).tolist()}", wanted="k = 0")
-        group = SE3 if self.dim == 3 else SE2
-        T = checked_poses(self.T_base_node if np.size(self.T_base_node) else group.identity, self.dim)
         lookup = np.empty((len(c) + 1, BRICK_VOXELS), np.int16)
         lookup[0], lookup[1:] = UNKNOWN, v
         box, extents = np.empty(6, np.int64), np.empty((len(c), 6), np.int8)
-        known = int(known_extents(c, lookup[1:], extents, box))
-        put(self, "voxel_size", float(self.voxel_size))
-        put(self, "coordinates", c)
-        put(self, "lookup", lookup)
-        put(self, "values", lookup[1:])
-        put(self, "T_base_node", T)
-        put(self, "first", first)
-        put(self, "table", table)
-        put(self, "extents", extents)
-        put(self, "known", known)
-        ends = box.reshape(2, 3)[:, : self.dim] * self.voxel_size
-        which = np.stack(np.meshgrid(*[[0, 1]] * self.dim, indexing="ij"), axis=-1).reshape(-1, self.dim)
-        base = ends[which, np.arange(self.dim)] if known else np.zeros((0, self.dim))
-        put(self, "corners", group.transform(group.inverse(np.broadcast_to(T, (len(base), group.size))), base))
+        size = tuple(shape[::-1].tolist())
+        bricks = _Bricks(c, lookup, extents, first, size)
+        if np.count_nonzero(bricks.table) != len(c):
+            raise GridError("a brick stands twice in a piece", wanted="each brick once")
+        if dim == 2 and len(c) and (np.any(c[:, 2]) or np.any(v[:, 64:] != UNKNOWN)):
+            raise GridError("a 2-D piece leaves its layer", got=f"bricks {np.unique(c[:, 2]).tolist()}", wanted="k = 0")
+        group = SE3 if dim == 3 else SE2
+        T = checked_poses(group.identity if T_base_node is None else T_base_node, dim)
+        self.known = int(known_extents(c, lookup[1:], extents, box))
+        self.voxel_size, self.dim, self.T_base_node = float(voxel_size), dim, T
+        self.first, self.nbytes = first, bricks.nbytes
+        ends = box.reshape(2, 3)[:, :dim] * voxel_size
+        which = np.stack(np.meshgrid(*[[0, 1]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+        base = ends[which, np.arange(dim)] if self.known else np.zeros((0, dim))
+        self.corners = group.transform(group.inverse(np.broadcast_to(T, (len(base), group.size))), base)
+        self._bricks = SHELF.put(bricks, bricks.nbytes, _Bricks.packed, partial(_Bricks.unpacked, first, size))
 
     @property
-    def nbytes(self) -> int:
-        """Memory [bytes]."""
-        return self.lookup.nbytes + self.table.nbytes + self.coordinates.nbytes
+    def coordinates(self) -> Ints:
+        """Of the bricks ``(n, 3)``."""
+        return self._bricks.get().coordinates
+
+    @property
+    def values(self) -> Steps:
+        """``(n, 512)``."""
+        return self._bricks.get().lookup[1:]
+
+    @property
+    def lookup(self) -> Steps:
+        """``values`` after a row that is all unknown ``(n + 1, 512)``."""
+        return self._bricks.get().lookup
+
+    @property
+    def table(self) -> npt.NDArray[np.int32]:
+        """Rows of ``lookup`` of the bricks of the box around it ``(nz, ny, nx)``, 0 where there is none."""
+        return self._bricks.get().table
+
+    @property
+    def extents(self) -> npt.NDArray[np.int8]:
+        """Of the known voxels of each brick: first one, and the one after the last ``(n, 6)``."""
+        return self._bricks.get().extents
 
     def __repr__(self) -> str:
         return f"Piece({self.voxel_size:g} m, {self.dim}-D, {len(self.coordinates)} bricks, {self.known} known voxels)"
@@ -203,7 +243,7 @@ def whole(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
         grid.dim,
         grid.brick_coordinates(),
         grid.brick_values(),
-        np.zeros(0) if T_base_node is None else T_base_node,
+        T_base_node,
     )
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
+from graphslam.core.shelf import SHELF, Slot, as_it_is, the_only
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
 from graphslam.evidence.pool import GridPool
 from graphslam.maps.fuse_kernels import find_bricks, list_marked, meet_bricks, sample_piece, sum_bricks
@@ -19,9 +20,14 @@ Ints = npt.NDArray[np.int64]
 Entries = npt.NDArray[np.uint32]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+PART = 1 << 24
+"""Entries that are summed at once [64 MB] …"""
+PART_BRICKS = 1 << 16
+"""… and bricks [64 MB]."""
+
+
 class Posed:
-    """A piece at one pose; never changed, so that maps may share it.
+    """A piece at one pose; never changed, so that maps may share it. Its entries lie on the shelf of the process.
 
     Parameters
     ----------
@@ -34,15 +40,25 @@ class Posed:
         Known voxels: ``voxel << 16 | value`` (:mod:`fuse_kernels`).
     """
 
-    T_world_node: Array
-    keys: Ints
-    starts: Ints
-    entries: Entries
+    __slots__ = ("T_world_node", "_entries", "keys", "starts")
+
+    def __init__(self, T_world_node: Array, keys: Ints, starts: Ints, entries: Entries) -> None:
+        self.T_world_node, self.keys, self.starts = T_world_node, keys, starts
+        self._entries: Slot[Entries] = SHELF.put(entries, entries.nbytes, as_it_is, the_only)
+
+    @property
+    def entries(self) -> Entries:
+        """All of them."""
+        return self._entries.get()
+
+    def between(self, first: int, last: int) -> Entries:
+        """Those of bricks ``first … last - 1``."""
+        return self._entries.rows(int(self.starts[first]), int(self.starts[last]))
 
     @property
     def nbytes(self) -> int:
-        """Memory [bytes]."""
-        return self.keys.nbytes + self.starts.nbytes + self.entries.nbytes
+        """Memory, while the entries are in it [bytes]."""
+        return self.keys.nbytes + self.starts.nbytes + self._entries.nbytes
 
 
 class Poser:
@@ -112,6 +128,14 @@ class Poser:
         list_marked(low + half, marks, keys)
         return keys
 
+    def sums(
+        self, keys: Ints, posed: Sequence[Posed], root: int, pool: GridPool, clamp: tuple[int, int]
+    ) -> Iterator[tuple[Ints, npt.NDArray[np.int16], int]]:
+        """:meth:`sum` of a part of the keys after the other, none of which takes much memory."""
+        ends = parts_of(keys, posed)
+        for first, last in pairwise(ends):
+            yield self.sum(keys[first:last], posed, root, pool, clamp)
+
     def sum(
         self, keys: Ints, posed: Sequence[Posed], root: int, pool: GridPool, clamp: tuple[int, int]
     ) -> tuple[Ints, npt.NDArray[np.int16], int]:
@@ -123,30 +147,49 @@ class Poser:
         nothing = np.zeros(0, np.int64)
         if not len(keys):
             return nothing, self._sums[:0], 0
-        every = np.concatenate([nothing, *(p.keys for p in posed)])
-        whose = np.repeat(np.arange(len(posed)), [len(p.keys) for p in posed])
+        between = [np.searchsorted(p.keys, (keys[0], keys[-1] + 1)).tolist() for p in posed]
+        near = [(p, a, b) for p, (a, b) in zip(posed, between) if a < b]
+        every = np.concatenate([nothing, *(p.keys[a:b] for p, a, b in near)])
+        whose = np.repeat(np.arange(len(near)), [b - a for _, a, b in near])
         at = np.searchsorted(keys, every)
         hit = np.flatnonzero(keys[np.minimum(at, len(keys) - 1)] == every)
         hit = hit[np.argsort(at[hit], kind="stable")]
         starts = np.zeros(len(keys) + 1, np.int64)
         np.cumsum(np.bincount(at[hit], minlength=len(keys)), out=starts[1:])
         # entries of the pieces that touch something, in one array
-        used = np.bincount(whose[hit], minlength=len(posed)) > 0
-        sizes = np.array([len(p.entries) if u else 0 for p, u in zip(posed, used)], np.int64)
+        used = np.bincount(whose[hit], minlength=len(near)) > 0
+        sizes = np.array([p.starts[b] - p.starts[a] if u else 0 for (p, a, b), u in zip(near, used)], np.int64)
         total = int(sizes.sum())
         if len(self._sources) < total:
             self._sources = np.empty(5 * total // 4, np.uint32)
-        sources = [p.entries for p, u in zip(posed, used) if u]
-        if sources:
-            np.concatenate(sources, out=self._sources[:total])
-        offset = (np.cumsum(sizes) - sizes)[whose[hit]]
-        begins = offset + np.concatenate([nothing, *(p.starts[:-1] for p in posed)])[hit]
-        ends = offset + np.concatenate([nothing, *(p.starts[1:] for p in posed)])[hit]
+        ends = np.cumsum(sizes)
+        for (p, a, b), u, end, size in zip(near, used, ends.tolist(), sizes.tolist()):
+            if u:
+                self._sources[end - size : end] = p.between(a, b)
+        offset = np.repeat(ends - sizes - [p.starts[a] for p, a, _ in near], [b - a for _, a, b in near])[hit]
+        begins = offset + np.concatenate([nothing, *(p.starts[a:b] for p, a, b in near)])[hit]
+        after = offset + np.concatenate([nothing, *(p.starts[a + 1 : b + 1] for p, a, b in near)])[hit]
         ids = np.empty(len(keys), np.int64)
         find_bricks(root, keys, pool.levels, pool.children, ids)
         if len(self._sums) < len(keys) + 1:
             self._sums = np.empty((5 * len(keys) // 4 + 1, BRICK_VOXELS), np.int16)
         changed = np.empty(len(keys) + 1, np.int64)
-        n = sum_bricks((starts, begins, ends), self._sources, clamp, ids, pool.bricks, self._sums, changed)
+        n = sum_bricks((starts, begins, after), self._sources, clamp, ids, pool.bricks, self._sums, changed)
         empty = changed[:n] < 0
         return keys[np.where(empty, ~changed[:n], changed[:n])], self._sums[:n], int(empty.sum())
+
+
+def parts_of(keys: Ints, posed: Sequence[Posed]) -> list[int]:
+    """Where to cut ``keys`` (ascending) so that no part is too large: 0 first, the end last."""
+    entries = np.zeros(len(keys))
+    for p in posed:
+        at = np.minimum(np.searchsorted(keys, p.keys), len(keys) - 1)
+        hit = keys[at] == p.keys if len(keys) else np.zeros(0, np.bool_)
+        entries += np.bincount(at[hit], weights=np.diff(p.starts)[hit], minlength=len(keys))
+    until = np.concatenate([[0.0], np.cumsum(entries)])
+    cuts = [0]
+    while cuts[-1] < len(keys):
+        k = cuts[-1]
+        fits = int(np.searchsorted(until, until[k] + PART, side="right")) - 1
+        cuts.append(min(max(fits, k + 1), k + PART_BRICKS, len(keys)))
+    return cuts

@@ -16,6 +16,8 @@ from graphslam.core.poses import group_of, level
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.pool import GridPool
+from graphslam.evidence.shelved import shelved
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.refine import Refinement
 from graphslam.refine.scans import Scans
@@ -173,13 +175,12 @@ def _relative(refinement: Refinement, a: int, b: int) -> Array:
 
 def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> EvidenceGrid:
     """A grid of the same kind with the beams of some steps, at ``T_grid_body`` ``(k, 7|3)``."""
-    drawn = grid.empty()
+    drawn = grid.empty(GridPool(grid.pool.levels))
     for k, T in zip(steps.tolist(), poses):
         points, origins, returns = scans.scan(k)
         if len(points):
             drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
-    drawn.pool.release_scratch()
-    return drawn
+    return shelved(drawn)
 
 
 def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap | None:

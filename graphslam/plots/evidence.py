@@ -81,10 +81,6 @@ def plot_section(
     return ax
 
 
-BLOCK = 4096
-"""Bricks that are looked at together: their heights in double precision take eight times their own memory."""
-
-
 def plot_heights(
     grid: EvidenceGrid, ax: Axes | None = None, *, below: float | None = None, title: str | None = None
 ) -> Axes:
@@ -107,9 +103,8 @@ def plot_heights(
     size = grid.voxel_size
     top = np.full((shape[1], shape[0]), -np.inf)
     known = np.zeros((shape[1], shape[0]), bool)
-    every, bricks = grid.brick_coordinates(), grid.brick_values().reshape(-1, 8, 8, 8)
-    for part in range(0, len(every), BLOCK):
-        coordinates, values = every[part : part + BLOCK], bricks[part : part + BLOCK]
+    for coordinates, bricks in grid.brick_blocks():
+        values = bricks.reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE)
         occupied = (values >= grid.model.threshold_step) & (values != UNKNOWN)
         z = (BRICK_EDGE * coordinates[:, 2, None] + np.arange(BRICK_EDGE) + 0.5) * size  # (n, 8)
         if below is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain, starmap
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -102,8 +104,8 @@ def slab(grid: EvidenceGrid, axis: int, low: float, high: float) -> tuple[Array,
     start, end = voxel_bounds(grid)
     along = 1 - axis
     out = np.full((int(end[2] - start[2]), int(end[along] - start[along])), UNKNOWN, np.int16)
-    coordinates, values = grid.brick_coordinates(), grid.brick_values().reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE)
-    for c, v in zip(BRICK_EDGE * coordinates, values):  # v: z, y, x
+    blocks = ((BRICK_EDGE * c, v.reshape(-1, BRICK_EDGE, BRICK_EDGE, BRICK_EDGE)) for c, v in grid.brick_blocks())
+    for c, v in chain.from_iterable(starmap(zip, blocks)):  # v: z, y, x
         k = np.arange(c[axis], c[axis] + BRICK_EDGE)
         keep = (k >= first) & (k < last)
         if keep.any():

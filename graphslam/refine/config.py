@@ -35,6 +35,8 @@ class RefineConfig:
     """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
     most_points: int = 400_000
     """Of so many points in the log at most; more are thinned evenly."""
+    most_beams: int = 3_000_000
+    """Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
     knot: float = 30.0
     """Time between the knots of the yaw bias [s]."""
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -47,6 +49,6 @@ class RefineConfig:
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")
         if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
             raise ConfigError(f"refine: distances = {self.distances}; wanted at least one, all > 0 m")
-        for name in ("every", "most_points"):
+        for name in ("every", "most_points", "most_beams"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"refine: {name} = {getattr(self, name)}; wanted ≥ 1")

@@ -69,6 +69,22 @@ def scans_at(steps: Scans, nodes: Index) -> Scans:
     )
 
 
+def thinned(steps: Scans, most: int) -> Scans:
+    """The same steps with so many beams at most, spread evenly over all there are."""
+    q = len(steps.points)
+    if q <= most:
+        return steps
+    rows = np.arange(most, dtype=np.int64) * q // most
+    return replace(
+        steps,
+        offsets=np.searchsorted(rows, steps.offsets).astype(np.int64),
+        points=steps.points[rows],
+        origins=steps.origins[rows],
+        returns=steps.returns[rows],
+        ages=None if steps.ages is None else steps.ages[rows],
+    )
+
+
 def chained(steps: Scans, nodes: Index) -> tuple[Array, Array]:
     """Motion ``(n, 7|3)`` from the last node to each step, and its covariance ``(n, d, d)``, right tangent."""
     g, o, n = steps.group, steps.odometry, len(steps)

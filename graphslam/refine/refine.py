@@ -20,13 +20,14 @@ from graphslam.core.geometry import Array
 from graphslam.core.heap import give_back
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
+from graphslam.core.shelf import Slot
 from graphslam.frontends.odometry.recorded import chain
 from graphslam.graph.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel, States
-from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at
+from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at, thinned
 from graphslam.refine.problem import Problem, Solved, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
@@ -237,7 +238,8 @@ def refine(
     few = 3 <= len(nodes) < len(steps)
     if not few:
         nodes = np.arange(len(steps), dtype=np.int64)
-    work = _Work(scans_at(steps, nodes) if few else steps, start[nodes], config, gps, progress or (lambda _: None))
+    some = thinned(scans_at(steps, nodes) if few else steps, config.most_beams)
+    work = _Work(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
     found = work.run()
@@ -310,7 +312,7 @@ class _Work:
         self.alike = 1.0
         self.found = NOTHING
         self.surfaces: Surfaces | None = None
-        self.first: Surfaces | None = None
+        self.first: Slot[Surfaces] | None = None
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
         self.most = max(FEWEST, round(self.reach / config.chunk_length))
@@ -441,7 +443,7 @@ class _Work:
             self.surfaces = None
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
             if self.first is None:
-                self.first = self.surfaces
+                self.first = self.surfaces.put_aside()
         self.chunks = chunk_pairs(self.cloud, self.poses, self.reach, self.most, passes=passes)
         self.found = associate(
             self.cloud,
@@ -537,7 +539,7 @@ class _Work:
         assert self.surfaces is not None
         assert self.first is not None
         give_back()
-        before = self.agreement(self.raw, self.first, self.start, self.noise)
+        before = self.agreement(self.raw, self.first.get(), self.start, self.noise)
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         self.alike = alike(self.found, self.cloud, r, self.noise)
         information = point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1])

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
+from graphslam.core.shelf import SHELF, Slot
 from graphslam.refine.scans import Scans
 from graphslam.registration.plane_kernels import Pairs
 from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations, thin_places
@@ -96,6 +97,9 @@ class Cloud:
         it too far.
         """
 
+        if not np.any(self.age):  # whole scans of one instant
+            return self
+
         def moved(x: Array) -> Array:
             out = np.empty(x.shape)
             for s in blocks(len(x)):
@@ -130,7 +134,7 @@ class Cloud:
         return W, O
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class Surfaces:
     """Neighbourhoods of points as planes (in 2-D lines), each in the frame of its own step.
 
@@ -150,6 +154,12 @@ class Surfaces:
     flat: Flags
     stands: Index
     tilts: npt.NDArray[np.float32]
+
+    def put_aside(self) -> Slot[Surfaces]:
+        """On the shelf of the process: surfaces that are asked for once more at the end."""
+        parts = [self.normals, self.flat, self.stands, self.tilts]
+        size = sum(a.nbytes for a in parts)
+        return SHELF.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
 
 
 def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:
@@ -332,6 +342,7 @@ def _nearest_surfaces(
 ) -> tuple[Index, Index, Index]:
     """Rows of source points, of the surfaces that they lie on, and the numbers of their chunk pairs ``(k,)``."""
     trees: dict[int, tuple[cKDTree, Index]] = {}
+    last = dict(zip(chunks.b.tolist(), range(len(chunks.b))))  # a tree is let go of after its last use
 
     def tree(c: int) -> tuple[cKDTree, Index]:
         if c not in trees:
@@ -344,6 +355,8 @@ def _nearest_surfaces(
     passes = chunks.passes
     for m, (a, b) in enumerate(zip(chunks.a.tolist(), chunks.b.tolist())):
         t, rows = tree(b)
+        if last[b] == m:
+            del trees[b]
         p = np.arange(cloud.rows[a], cloud.rows[a + 1], every)
         p = p[surfaces.flat[surfaces.stands[p]]]
         if t is None or len(p) == 0:

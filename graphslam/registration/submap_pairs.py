@@ -64,6 +64,14 @@ class PreparedMap:
             SearchField(occupied, cell=2.0 * cell, sigma=2.0 * c.field_sigma),
         )
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of what was made so far, about [bytes]."""
+        made = self.__dict__
+        points = made["points"].nbytes if "points" in made else 0
+        fields = sum(f.nbytes for f in made["fields"]) if "fields" in made else 0
+        return fields + points * (6 if "target" in made else 1)  # the points, their tree and their shapes
+
     def around(self, T_base_place: ArrayLike) -> Array:
         """Points ``(m, dim)`` around a place, in the frame of the place [m]; thinned evenly if there are too many."""
         T = np.asarray(T_base_place, dtype=np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.evidence.formats import load_npz
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.shelved import load_shelved, shelved
 from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
@@ -98,7 +98,7 @@ class FrontToBack:
         settled = 0 if self.settled is None else self.settled.draw
         self.draw = settled if draw is None else draw
         of = None if self.draw == settled else self.draw
-        self.store = None if folder is None else folder.submaps_with(load_npz if with_grids else None, draw=of)
+        self.store = None if folder is None else folder.submaps_with(load_shelved if with_grids else None, draw=of)
         self.submaps: list[Submap] = self.store.complete_prefix() if self.store is not None else []
         if self.store is not None:
             self.store.truncate(len(self.submaps))
@@ -122,6 +122,7 @@ class FrontToBack:
                 return
             if isinstance(submap.grid, EvidenceGrid):
                 submap.grid.pool.release_scratch()
+                submap = replace(submap, grid=shelved(submap.grid))
             if self.store is not None:
                 self.store.append(submap)
             self.back.add(submap)

@@ -45,7 +45,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import FigureTable, is_time
 from graphslam.evaluate.without_truth import ClassConsistency
-from graphslam.evidence.formats import load_npz
+from graphslam.evidence.shelved import load_shelved
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
@@ -328,7 +328,7 @@ def refined_submaps_of(run: Run) -> list[Submap]:
 def _refined_of(run: Run, store: Path) -> list[Submap]:
     if not store.is_dir():
         return []
-    submaps, where = read_submaps(store, load_grid=load_npz), str(store)
+    submaps, where = read_submaps(store, load_grid=load_shelved), str(store)
     have, wanted = [s.key for s in submaps], [s.key for s in run.submaps]
     if have != wanted:
         raise FormatError("refined submaps are not those of the run", where=where, got=have[:9], wanted=wanted[:9])

@@ -74,9 +74,7 @@ from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evaluate.trust import rows_as_json
-from graphslam.evidence.compact import move
-from graphslam.evidence.formats import load_npz
-from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.shelved import load_shelved
 from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
@@ -295,7 +293,6 @@ def finished(
 def at_rest(work: FrontToBack) -> None:
     """Let go of what making the submaps took."""
     work.front.forget()
-    move([s.grid for s in work.submaps if isinstance(s.grid, EvidenceGrid)])
     give_back()
 
 
@@ -363,7 +360,7 @@ def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any]
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
     settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
     back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
-    return effective, settings, back, read_submaps(root, load_grid=load_npz if with_grids(settings) else None)
+    return effective, settings, back, read_submaps(root, load_grid=load_shelved if with_grids(settings) else None)
 
 
 def back_end(feed: Feed, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:

@@ -19,7 +19,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.formats import load_npz
+from graphslam.evidence.shelved import load_shelved
 from graphslam.evidence.views import has_view
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.io.g2o import read_g2o
@@ -45,7 +45,7 @@ def with_maps(run: Run) -> list[Submap]:
     """
     submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
-        submaps = read_submaps(run.folder, load_grid=load_npz)
+        submaps = read_submaps(run.folder, load_grid=load_shelved)
     without = [s.key for s in submaps if not has_view(s)]
     if without:
         raise DataError(f"submaps {without} have no map", where=run.name, wanted="evidence grids or clouds")
