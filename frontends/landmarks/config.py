@@ -166,6 +166,41 @@ class RbpfSlamConfig(FilterConfig):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LastingConfig:
+    """Constant errors that a graph estimates with the map: σ of what is known of each beforehand; 0: it is none.
+
+    The defaults are what a robot's data sheet and a tape measure leave open.
+    """
+
+    yaw_bias: float = float(np.deg2rad(1.0))
+    """Of the yaw rate while the robot moves [rad/s]."""
+    turn_per_metre: float = 0.0
+    """Of the heading for every metre driven [rad/m], in the place of a bias of the yaw rate."""
+    distance_scale: float = 0.05
+    """Of the logarithm of the distances."""
+    range_offset: float = 0.3
+    """Of the zero of the ranges [m]."""
+    sensor_yaw: float = float(np.deg2rad(5.0))
+    """Of the direction of the sensor [rad]."""
+    range_scale: float = 0.0
+    """Of the logarithm of the ranges, in the place of a direction: for ranges without bearings."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ConfigError(f"lasting.{name} = {getattr(self, name)}; wanted a finite σ ≥ 0")
+        for one, other in (("yaw_bias", "turn_per_metre"), ("sensor_yaw", "range_scale")):
+            if getattr(self, one) and getattr(self, other):
+                raise ConfigError(f"lasting.{one} and lasting.{other} cannot be told apart; wanted 0 for one of them")
+
+    def chosen(self) -> tuple[tuple[str, str, str, str], Array]:
+        """Name and σ of each of :data:`~graphslam.core.lasting.CONSTANTS`; what is none has no name, and a σ of 1."""
+        pairs = (("yaw_bias", "turn_per_metre"), ("distance_scale",), ("range_offset",), ("sensor_yaw", "range_scale"))
+        names = tuple(next((n for n in some if getattr(self, n) > 0.0), "") for some in pairs)
+        return names, np.array([getattr(self, n) if n else 1.0 for n in names])  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RbpfEkfConfig(FilterConfig):
     """FastSLAM local maps, summarised as one Gaussian each."""
 
@@ -184,6 +219,8 @@ class RbpfEkfConfig(FilterConfig):
     stand in the report as an alarm. Costs K times the filter's time; 0 = off."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """When a submap ends."""
+    lasting: LastingConfig | None = None
+    """Constant errors of wheels and sensor that the graph estimates with the map; None: there are none."""
 
     def __post_init__(self) -> None:
         FilterConfig.__post_init__(self)

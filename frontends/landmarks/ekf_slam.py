@@ -22,7 +22,13 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam.frontends.landmarks.ekf_filter import EkfMap
-from graphslam.frontends.landmarks.fix_points import carried_points, fix_points, fixes_awaited, fixes_inside
+from graphslam.frontends.landmarks.fix_points import (
+    carried_points,
+    fix_points,
+    fixes_awaited,
+    fixes_inside,
+    way_of_fixes,
+)
 from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
 from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.frontends.landmarks.stopping import Stopping
@@ -146,8 +152,9 @@ class _Run:
         times, points = self.data.observations.times[self.first : self.next], None
         if feed is not None and fixes_inside(feed, self.t_start, times):
             s = self._smoothed(places, rows, landmark, 0.0)
-            if np.all(s.landmark_kept):
-                points = carried_points(fix_points(feed, s, self.t_start, times), s.gaussian, mean, P)
+            way = way_of_fixes(feed, s, self.t_start, times)
+            if way is not None and np.all(s.landmark_kept):
+                points = carried_points(fix_points(s, way), s.gaussian, mean, P)
         return self._hand_over(
             key,
             Gaussian(mean, P, (2,)),
@@ -170,6 +177,7 @@ class _Run:
         used = int(s.kept.sum())
         places = s.gaussian.mean[3:].reshape(-1, 2)
         report |= {"systematic": systematic(data, self.first, self.next, rows[s.kept], index, s.poses, places)}
+        way = way_of_fixes(feed, s, self.t_start, obs.times[span])
         counts = self.report(used) | {"not_associated": self.map.observations - len(rows)}
         return self._hand_over(
             key,
@@ -188,7 +196,7 @@ class _Run:
                 "chi2_bearing": float(s.parts[2]),
                 "converged": s.converged,
             },
-            fix_points(feed, s, self.t_start, obs.times[span]),
+            None if way is None else fix_points(s, way),
         )
 
     def _hand_over(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
@@ -63,11 +66,34 @@ def carried_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, j
     )  # fmt: skip
 
 
-def fix_points(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> PathPoints | None:
-    """Points of a submap's path at the fixes inside it; None where no fix was taken or none has come yet.
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Where fixes were taken on a smoothed path: on the arc from pose ``at`` to the next (-1: from the base).
 
-    Between two scans the path is the arc from one pose to the next, and what it does besides has the variance of a
-    bridge, ``a (1 - a) Q`` at the share a of a step whose odometry has the covariance Q.
+    Parameters
+    ----------
+    times : (q,)
+    lever : (2,)
+    at : (q,)
+    share : (q,)
+        Of the arc.
+    positions : (q, 2)
+        Of the antenna.
+    by_first, by_second : (q, 2, 3)
+        Their change with the right tangents of both poses.
+    """
+
+    times: Array
+    lever: Array
+    at: npt.NDArray[np.int64]
+    share: Array
+    positions: Array
+    by_first: Array
+    by_second: Array
+
+
+def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> Way | None:
+    """Where the fixes inside a submap were taken; None where none was taken, or none has come yet.
 
     Parameters
     ----------
@@ -107,23 +133,33 @@ def fix_points(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> 
                 moved.append(antenna(*ends))
             G[end, :, :, c] = (moved[0] - moved[1]) / (2.0 * STEP)
     G[0, k == 0] = 0.0  # the base is held
+    at = (k - 1).astype(np.int64)
+    return Way(at_fixes, lever, at, share[:, 0], antenna(poses[k], poses[k + 1]), G[0], G[1])
+
+
+def fix_points(smoothed: Smoothed, way: Way) -> PathPoints:
+    """Points of a submap's path at the fixes inside it.
+
+    Between two scans the path is the arc from one pose to the next, and what it does besides has the variance of a
+    bridge, ``a (1 - a) Q`` at the share a of a step whose odometry has the covariance Q.
+    """
     cross, own = path_covariances(
-        smoothed.poses, smoothed.landmarks, smoothed.evidence, (k - 1).astype(np.int64), G[0], G[1]
+        smoothed.poses, smoothed.landmarks, smoothed.evidence, way.at, way.by_first, way.by_second
     )
     exit_turn = rotation2(smoothed.poses[-1, 2])
     cross[:, :2] = cross[:, :2] @ exit_turn.T  # right tangent of the exit -> plain vector of eq. 15
     Q = np.linalg.inv(smoothed.evidence.W)[:, :2, :2]
+    k, share = way.at + 1, way.share
     for i in range(len(k)):
-        R = rotation2(poses[k[i] + 1, 2])
+        R = rotation2(smoothed.poses[k[i], 2])
         for j in range(i, len(k)):
             if k[j] != k[i]:
                 break
-            bridge = float(share[i, 0] * (1.0 - share[j, 0])) * (R @ Q[k[i]] @ R.T)
+            bridge = float(share[i] * (1.0 - share[j])) * (R @ Q[k[i]] @ R.T)
             own[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] += bridge
             if j > i:
                 own[2 * j : 2 * j + 2, 2 * i : 2 * i + 2] += bridge
     own[np.diag_indices(len(own))] += FLOOR**2
     return PathPoints(
-        times=at_fixes, lever=lever, positions=antenna(poses[k], poses[k + 1]),
-        covariance=0.5 * (own + own.T), cross=cross,
-    )  # fmt: skip
+        times=way.times, lever=way.lever, positions=way.positions, covariance=0.5 * (own + own.T), cross=cross
+    )

@@ -20,8 +20,9 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.frontends.base import FrontEnd, Watch
 from graphslam.frontends.landmarks.config import RbpfEkfConfig
 from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.fix_points import fix_points, fixes_awaited
+from graphslam.frontends.landmarks.fix_points import fix_points, fixes_awaited, way_of_fixes
 from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
+from graphslam.frontends.landmarks.lasting import lasting_errors
 from graphslam.frontends.landmarks.prepare import Preparing, known_slots, landmark_stream
 from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from graphslam.frontends.landmarks.stopping import Stopping
@@ -206,17 +207,25 @@ class RbpfEkf(FrontEnd):
         places = smoothed.gaussian.mean[3:].reshape(-1, 2)
         used = rows[smoothed.kept]
         report["systematic"] = systematic(data, first, last, used, lm_index, smoothed.poses, places)
+        whole = c.handover == "smoothed"
+        way = way_of_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
+        lasting = None
+        if whole and c.lasting is not None:
+            seconds = np.diff(obs.times[span], prepend=t_start)
+            lasting = lasting_errors(c.lasting, smoothed, seconds, way, base=t_start < obs.times[first])
+            report["lasting"] = [n for n in lasting.names if n]
         landmarks = LandmarkMap(
             ids=ids,
             exit_pose=handed.mean[:3],
             positions=handed.mean[3:].reshape(-1, 2),
             covariance=handed.covariance,
             sightings=np.column_stack([data.original[used], lm_index]),
-            chart="group" if c.handover == "smoothed" else "cartesian",  # particles: as the paper has them
-            path=fix_points(growing.feed, smoothed, t_start, obs.times[span]) if c.handover == "smoothed" else None,
+            chart="group" if whole else "cartesian",  # particles: as the paper has them
+            path=None if way is None else fix_points(smoothed, way),
+            lasting=lasting,
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
-        if c.handover != "smoothed":  # the path's end is the Gaussian's
+        if not whole:  # the path's end is the Gaussian's
             cov = trajectory.covariances
             assert cov is not None
             cov[-1] = vector_to_tangent_covariance(handed.mean[:3], handed.covariance[:3, :3])

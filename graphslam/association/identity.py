@@ -54,12 +54,18 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
         return np.full(n, np.nan)
     start, end = graph.values.poses[record.start], graph.values.poses[record.start + 1]
     points = np.array([graph.landmark(int(i)) for i in ids])
-    r = submap_residual(start, end, points, record.z, record.chart)
-    J_start, J_end, J_point = submap_jacobians(start, end, points, record.z, record.chart, tangent=True)
+    z, _ = record.own
+    r = submap_residual(start, end, points, z, record.chart)
+    J_start, J_end, J_point = submap_jacobians(start, end, points, z, record.chart, tangent=True)
+    robot = record.robot
+    if robot >= 0:
+        r = np.concatenate([r, graph.values["wheels"][robot], graph.values["sensor"][robot]])
     variables = record.variables()
     column = {name: k for k, name in enumerate(variables[2:])}
     J = np.zeros((len(r), 6 + 2 * len(column)))
-    J[:, :3], J[:, 3:6] = J_start, J_end
+    J[: len(z), :3], J[: len(z), 3:6] = J_start, J_end
+    for k in range(len(z), len(r)):  # constant errors, which stand last
+        J[k, J.shape[1] + k - len(r)] = 1.0
     for k, i in enumerate(ids.tolist()):
         c = 6 + 2 * column[f"l{i}"]
         J[3 + 2 * k : 5 + 2 * k, c : c + 2] = J_point
@@ -67,13 +73,13 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
         J = J[:, 3:]  # the first base is fixed and has no columns
     P = graph.covariance().joint(variables)
     omega = record.whitener.T @ record.whitener
-    g = (omega @ r)[3:].reshape(n, 2)
+    g = (omega @ r)[3 : len(z)].reshape(n, 2)
     JtO = J.T @ omega
     C = omega - JtO.T @ P @ JtO  # Ω S Ω
     rows = 3 + 2 * np.arange(n)[:, None] + np.arange(2)
     blocks = C[rows[:, :, None], rows[:, None, :]]
     # a landmark that only this submap holds in place has no redundancy: its block vanishes
-    share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3:, 3:]) / n, 1e-300)
+    share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3 : len(z), 3 : len(z)]) / n, 1e-300)
     testable = ~lonely & (share > 1e-9)
     out = np.full(n, np.nan)
     if np.any(testable):

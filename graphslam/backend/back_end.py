@@ -153,7 +153,9 @@ class BackEnd:
             self.graph = PoseGraph(submap.dim)
             self.solver = make_solver(self.solver_name, self.graph)
         c = self.config
-        ids = associate(self.graph, submap, self._association) if c.associate and submap.landmarks is not None else None
+        ids = None
+        if c.associate and submap.landmarks is not None:
+            ids = associate(self.graph, self.graph.as_known(submap), self._association)
         associated = time.perf_counter()
         dense = submap.landmarks is None
         self.graph.add_submap(

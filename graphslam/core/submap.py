@@ -18,7 +18,8 @@ from graphslam.core.charts import check_chart, map_difference
 from graphslam.core.dense import CloudMap, DensePayload
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
-from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.geometry import Array, vector_to_tangent_covariance, wrap_angle
+from graphslam.core.lasting import LastingErrors
 from graphslam.core.markup import element, join, pairs
 from graphslam.core.path_points import PathPoints
 from graphslam.core.reading import usable
@@ -52,6 +53,8 @@ class LandmarkMap:
         Maps from elsewhere and those of the papers are Cartesian; our front ends make the other kind.
     path : PathPoints or None
         Points of the path where fixes were taken, jointly Gaussian with all of this (2-D only).
+    lasting : LastingErrors or None
+        What all of this is if wheels and sensor err by constants; the Gaussian is that of a robot without them.
     """
 
     ids: npt.NDArray[np.int64]
@@ -62,6 +65,7 @@ class LandmarkMap:
     sightings: npt.NDArray[np.int64] | None = None
     chart: str = "cartesian"
     path: PathPoints | None = None
+    lasting: LastingErrors | None = None
 
     def __post_init__(self) -> None:
         check_chart(self.chart)
@@ -92,6 +96,10 @@ class LandmarkMap:
             object.__setattr__(self, "information", info)
         if self.path is not None and (self.path.cross.shape[1] != n or len(self.path.lever) != dim):
             raise GeometryError("points of the path do not fit the map", got=self.path.cross.shape, wanted=f"(…, {n})")
+        if self.lasting is not None and len(self.lasting.response) != n:
+            raise GeometryError(
+                "lasting errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 4)"
+            )
         if self.sightings is not None:
             rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
             if len(rows) and (rows[:, 1].min() < 0 or rows[:, 1].max() >= len(ids)):
@@ -146,7 +154,27 @@ class LandmarkMap:
             covariance=self.dense_covariance()[np.ix_(ix, ix)],
             chart=self.chart,
             path=None if self.path is None else self.path.of_landmarks(ix),
+            lasting=None if self.lasting is None else self.lasting.of_landmarks(ix),
         )
+
+    def erring(self, mean: Array, covariance: Array) -> LandmarkMap:
+        """The same map, if the constant errors of wheels and sensor are Gaussian; itself where it knows of none.
+
+        Parameters
+        ----------
+        mean, covariance : (4,), (4, 4)
+            Of the errors, all that the map itself says of them included.
+        """
+        if self.lasting is None:
+            return self
+        S = self.lasting.response
+        off = S @ mean
+        exit_pose = self.exit_pose + off[:3]
+        exit_pose[2] = wrap_angle(exit_pose[2])
+        return LandmarkMap(
+            ids=self.ids, exit_pose=exit_pose, positions=self.positions + off[3:].reshape(-1, 2),
+            covariance=self.dense_covariance() + S @ covariance @ S.T, sightings=self.sightings, chart=self.chart,
+        )  # fmt: skip
 
     def difference(self, x: Array) -> Array:
         """What ``x`` ``(n,)``, laid out as :attr:`mean`, differs from the mean by in this map's chart (2-D only)."""

@@ -7,7 +7,7 @@ Neighbouring fixes share most of it, so their innovations are correlated and mus
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -257,6 +257,10 @@ def _inner(graph: PoseGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner
     cross = np.hstack([path.cross[ix], path.covariance[np.ix_(ix, own)]])
     gain = np.linalg.solve(joint, cross.T).T
     z = np.concatenate([inner.mean, path.positions[used].ravel()])
+    if inner.lasting is not None:  # as they are with the constant errors that the graph found
+        g = np.concatenate([values["wheels"][s.robot], values["sensor"][s.robot]])
+        z = z + np.concatenate([inner.lasting.response, inner.lasting.points[own]]) @ g
+        path = replace(path, positions=path.positions + (inner.lasting.points @ g).reshape(-1, 2))
     marks = np.array([lay.row_of[i] for i in ids.tolist()], dtype=np.int64)
     places = np.concatenate([values.landmarks[marks].reshape(-1, 2), values["point"][rows].reshape(-1, 2)])
     start, end = values.poses[s.node], values.poses[s.exit_node]

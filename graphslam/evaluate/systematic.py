@@ -31,6 +31,9 @@ AS_MUCH = 0.7
 """Errors that take away at least this part of the χ² that the best one takes away are named as other causes."""
 HALF = 0.5
 """Part of the χ² in excess that the best one must take away to be named."""
+APART = 0.05
+"""Of an error that is not told apart from those which the graph estimates by this share of its information nothing is
+said: a common scale of ranges and distances."""
 LEAST_WINDOWS = 3
 """Fewer windows do not tell their scatter."""
 
@@ -154,23 +157,48 @@ class Systematic:
         return float(stats.chi2.ppf(CERTAIN, self.dof) / self.dof)
 
 
+ESTIMATED = {
+    "range_scale": "range-scale",
+    "range_offset": "range-offset",
+    "sensor_yaw": "bearing-offset",
+    "distance_scale": "distance-scale",
+    "yaw_bias": "turn-per-metre",
+    "turn_per_metre": "turn-per-metre",
+}
+"""Constant errors that a graph may estimate with the map (:mod:`graphslam.core.lasting`), as they are called here."""
+
+
 def sums(reports: Sequence[Mapping[str, Any]]) -> Systematic | None:
-    """What the submaps' reports say together; None where none says anything."""
+    """What the submaps' reports say together; None where none says anything.
+
+    Errors that the graph estimates are left free: what they explain is no finding, and of the others counts what is not
+    explained by them.
+    """
     found = [r["systematic"] for r in reports if r.get("systematic")]
     if not found:
         return None
     total = {k: np.sum([np.asarray(f[k], dtype=np.float64) for f in found], axis=0) for k in found[0]}
+    free = {ESTIMATED[n] for r in reports for n in r.get("lasting", ())}
     s = np.maximum(np.diag(total["information"]), 1e-12)
-    error = total["score"] / s
+    alone = total["score"] / s
     windows = int(total["windows"])
-    scatter = np.zeros(len(s))
-    if windows >= LEAST_WINDOWS:
-        left = total["score2"] - 2 * error * total["score_information"] + error**2 * total["information2"]
-        scatter = left * windows / (windows - 1)
-    sigma = np.sqrt(np.maximum(s, scatter)) / s
+    left = total["score2"] - 2 * alone * total["score_information"] + alone**2 * total["information2"]
+    left *= windows / max(windows - 1, 1)
+    scatter = left if windows >= LEAST_WINDOWS else np.zeros(len(s))
     drift, dof = total["score2"] / s, s**2 / np.maximum(total["information2"], 1e-24)
-    taken = total["score"] ** 2 / s
-    return Systematic(windows, float(total["chi2"]), int(total["dof"]), error, sigma, taken, drift, dof)
+    score, own, chi2 = total["score"], s, float(total["chi2"])
+    if free:
+        drift = left / s
+        a = [k for k, name in enumerate(KINDS) if name in free]
+        S_a = total["information"][np.ix_(a, a)]
+        gain = np.linalg.lstsq(S_a, np.column_stack([total["information"][a], score[a]]), rcond=1e-9)[0]
+        chi2 -= float(score[a] @ gain[:, -1])
+        score = score - total["information"][:, a] @ gain[:, -1]
+        own = s - np.einsum("ja,aj->j", total["information"][:, a], gain[:, :-1])
+        none = np.isin(np.arange(len(s)), a) | (own < APART * s)
+        score, own = np.where(none, 0.0, score), np.where(none, s, own)
+    sigma = np.sqrt(np.maximum(s, scatter) / s / own)
+    return Systematic(windows, chi2, int(total["dof"]) - len(free), score / own, sigma, score**2 / own, drift, dof)
 
 
 def systematic_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:

@@ -190,6 +190,7 @@ class GraphRecord:
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
         self._attitude_of: dict[int, int] = {}  # node -> attitudes that it has
+        self._robots: dict[frozenset[str], int] = {}  # constant errors that submaps of the same streams share
         self._retired: set[int] = set()  # ids merged away or removed: never used again
         self._next_factor = 0
         self._next_landmark = 0

@@ -25,6 +25,7 @@ EXCLUSIVE = "measurement"
 DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
+    "lasting": "what a submap says of constant errors is the part of its likelihood that its own Gaussian leaves out",
     "levelled": "each base was levelled by the same gravity that the submap's exit holds",
     "aid": "where matches began and how scans are bent: nothing that it tells is in a covariance of the path",
     "start": "where the refinement by scans began: it enters no sum of the refined path",

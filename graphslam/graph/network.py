@@ -116,7 +116,7 @@ def to_network(graph: PoseGraph) -> PoseNetwork:
             measured.append(r.T_ij)
             information.append(r.whitener.T @ r.whitener)
         elif isinstance(r, SubmapRecord):
-            L = np.linalg.inv(r.whitener)
+            L = np.linalg.inv(r.own[1])
             P = L @ L.T
             edges.append((r.start, r.start + 1))
             measured.append(r.z[:3])

@@ -41,6 +41,8 @@ class SubmapArrays(NamedTuple):
     """… and where they begin."""
     group: npt.NDArray[np.bool_]
     """(S,): the residual is taken in the group chart."""
+    constant: int
+    """Rows of the points from this one on are pairs of constants: they have no frame, and no chart."""
 
 
 class SubmapBlocks(NamedTuple):
@@ -71,7 +73,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         Fill H as well.
     out : SubmapBlocks
     """
-    start, entry_offset, entry_row, z, z_offset, info, info_offset, group = submaps
+    start, entry_offset, entry_row, z, z_offset, info, info_offset, group, constant = submaps
     H, H_offset, g, g_offset, chi2 = out
     for s in range(start.shape[0]):
         a, b = start[s], start[s] + 1
@@ -92,7 +94,12 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         q = np.empty((n + 1, 2))
         h = np.empty((n + 1, 2))
         r = np.empty(m)
-        for i in range(n + 1):
+        places = n  # constants stand last
+        while places > 0 and entry_row[e0 + places - 1] >= constant:
+            places -= 1
+            row, k = entry_row[e0 + places], 3 + 2 * places
+            r[k], r[k + 1] = points[row, 0] - z[z0 + k], points[row, 1] - z[z0 + k + 1]
+        for i in range(places + 1):
             if i == 0:
                 dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
             else:
@@ -114,7 +121,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         for row in range(m):
             sx, sy, st = 0.0, 0.0, 0.0
             turn = L[row, 2]
-            for i in range(n + 1):
+            for i in range(places + 1):
                 k = 0 if i == 0 else 1 + 2 * i
                 lx, ly = L[row, k], L[row, k + 1]
                 turn += lx * h[i, 0] + ly * h[i, 1]
@@ -129,6 +136,8 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
                 else:  # d/dl: R_sᵀ
                     M[row, c] = lx * ca - ly * sa
                     M[row, c + 1] = lx * sa + ly * ca
+            for k in range(3 + 2 * places, m):
+                M[row, k + 3] = L[row, k]
             M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st - turn
             M[row, 5] = turn
         h0 = H_offset[s]
@@ -137,7 +146,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         for c in range(d):  # Jᵀ M, the same sparsity of J applied to rows
             sx, sy, st = 0.0, 0.0, 0.0
             turn = M[2, c]
-            for i in range(n + 1):
+            for i in range(places + 1):
                 k = 0 if i == 0 else 1 + 2 * i
                 lx, ly = M[k, c], M[k + 1, c]
                 turn += lx * h[i, 0] + ly * h[i, 1]
@@ -151,6 +160,8 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
                 else:
                     B[4 + 2 * i, c] = lx * ca - ly * sa
                     B[5 + 2 * i, c] = lx * sa + ly * ca
+            for k in range(3 + 2 * places, m):
+                B[k + 3, c] = M[k, c]
             B[0, c], B[1, c], B[2, c] = -sx, -sy, st - turn
             B[5, c] = turn
         for c in range(d):

@@ -35,6 +35,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
 from graphslam.core.imu import Imu
+from graphslam.core.lasting import LastingErrors
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.submap import Match, Submap
@@ -44,6 +45,7 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.states import ImuStates
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.lasting import SIZE, LastingRecord
 from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.graph_record import BetweenBlock, GraphRecord
@@ -161,16 +163,69 @@ class PoseGraph(GraphRecord):
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         self._start_landmarks(ids, se2_transform(self.pose(node), lm.positions))
-        record = SubmapRecord(fid, submap.key, node, ids, lm.mean, W, chart=lm.chart)
+        robot, z = -1, lm.mean
+        if lm.lasting is not None:
+            robot = self._robots.get(submap.uses, self.structure.count("wheels"))
+            z, W = np.concatenate([z, np.zeros(len(lm.lasting.sigmas))]), np.hstack([W, -W @ lm.lasting.response])
+        record = SubmapRecord(fid, submap.key, node, ids, z, W, chart=lm.chart, robot=robot)
         ends = np.stack([np.zeros(3), submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
+        if lm.lasting is not None:
+            self._robots[submap.uses] = robot
+            self._tell_lasting(lm.lasting, robot, submap.uses, covariance_scale)
         if lm.path is not None:
-            inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale)
+            inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale, lasting=lm.lasting)
             self.submaps[-1] = replace(self.submaps[-1], inner_points=inner)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         self.gps.tie(self.submaps[-1])
         self.readings.tie(self.submaps[-1])
         return fid
+
+    def _tell_lasting(self, lasting: LastingErrors, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
+        """What the last submap's own measurements say of the constant errors: it comes and goes with the submap.
+
+        All submaps of the same streams share them; the first one brings what is known of them beforehand.
+        """
+        s = self.submaps[-1]
+        if robot == self.structure.count("wheels"):
+            self.structure.append("wheels", np.zeros((1, 2)))
+            self.structure.append("sensor", np.zeros((1, 2)))
+            fid = self.next_factor()
+            self.ledger.spend(fid, "constant errors, beforehand", ["-"], s.interval, "prior")
+            self.insert(LastingRecord(fid, robot, np.diag(1.0 / lasting.sigmas), np.zeros(SIZE)))
+            self._event("lasting", factor_id=fid, names=list(lasting.names), sigmas=lasting.sigmas.tolist())
+        R, d = lasting.likelihood()
+        none = SIZE - len(d)
+        R, d = np.vstack([R, np.zeros((none, SIZE))]), np.concatenate([d, np.zeros(none)])
+        fid = self.next_factor()
+        self.ledger.spend(fid, f"submap {s.key} of constant errors", uses, s.interval, "lasting")
+        root = np.sqrt(covariance_scale)
+        self.insert(LastingRecord(fid, robot, R / root, d / root, what=f"by submap {s.key}"))
+        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid), lasting=lasting, robot=robot)
+
+    def as_known(self, submap: Submap) -> Submap:
+        """A submap as it is with what the graph knows of the constant errors of its robot, for gates and checks."""
+        if submap.landmarks is None or submap.landmarks.lasting is None:
+            return submap
+        robot = self._robots.get(submap.uses)
+        before = np.zeros(SIZE), np.diag(submap.landmarks.lasting.sigmas**2)
+        known = before if robot is None else self.lasting_errors(robot)
+        return replace(submap, landmarks=submap.landmarks.erring(*known))
+
+    def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
+        """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
+
+        In the order of :data:`~graphslam.core.lasting.CONSTANTS`; what is known beforehand is in it.
+
+        Raises
+        ------
+        DataError
+            The graph has none.
+        """
+        if not 0 <= robot < self.values.count("wheels"):
+            raise DataError(f"the graph has no constant errors of robot {robot}", wanted="submaps with lasting errors")
+        g = np.concatenate([self.values["wheels"][robot], self.values["sensor"][robot]])
+        return g, self.covariance().joint([f"wheels{robot}", f"sensor{robot}"])
 
     def _add_dense(
         self, submap: Submap, covariance_scale: float, spacing: float | None, level_sigma: float | None

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.lasting import LastingErrors
 from graphslam.core.path_points import PathPoints
 from graphslam.core.poses import Group, group_of
 from graphslam.core.trajectory import Trajectory
@@ -65,6 +66,8 @@ class InnerPoints:
         Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
     rows : mapping of int to int
         Points that are used → rows of the graph's points.
+    lasting : LastingErrors or None
+        What all of it is with constant errors.
     """
 
     path: PathPoints
@@ -73,16 +76,21 @@ class InnerPoints:
     scale: float = 1.0
     factor_id: int | None = None
     rows: Mapping[int, int] = field(default_factory=dict)
+    lasting: LastingErrors | None = None
 
     def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
         """Factor of the points that are used, beside the submap's own."""
         used = sorted(self.rows)
         gain, left = self.path.given(self.joint, used)
         W = whitener(left, what=f"path of submap {submap.submap_key} at its fixes", scale=self.scale)
+        z, parts = [self.mean, self.path.positions[used].ravel()], [-W @ gain, W]
+        if self.lasting is not None:
+            moved = self.lasting.points[self.path.scalars(used)] - gain @ self.lasting.response
+            z, parts = [*z, np.zeros(moved.shape[1])], [*parts, -W @ moved]
         return PathRecord(
             factor_id, submap.submap_key, submap.start, submap.landmark_ids,
-            np.array([self.rows[k] for k in used], dtype=np.int64),
-            np.concatenate([self.mean, self.path.positions[used].ravel()]), np.hstack([-W @ gain, W]), submap.chart,
+            np.array([self.rows[k] for k in used], dtype=np.int64), np.concatenate(z), np.hstack(parts), submap.chart,
+            robot=submap.robot,
         )  # fmt: skip
 
 
@@ -113,6 +121,10 @@ class SubmapNode:
         relative poses by itself is worth, for instance in cycles of loops and chain.
     inner_points : InnerPoints or None
         Of a landmark submap that holds points of its path.
+    lasting : LastingErrors or None
+        What a landmark submap is with constant errors of the robot's wheels and sensor, and
+    robot : int
+        their row in the graph; -1: it has none.
     factor_ids : tuple of int
         The chain from node to node, and what came with it (the attitude of a levelled exit).
     """
@@ -129,6 +141,8 @@ class SubmapNode:
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     inner_points: InnerPoints | None = None
+    lasting: LastingErrors | None = None
+    robot: int = -1
 
     @property
     def exit_node(self) -> int:

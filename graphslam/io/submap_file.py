@@ -16,6 +16,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.json_file import check_json, parse_json
+from graphslam.core.lasting import LastingErrors
 from graphslam.core.npz import check_arrays, flags, floats, ints, texts
 from graphslam.core.path_points import PathPoints
 from graphslam.core.submap import LandmarkMap, Match, Submap
@@ -60,6 +61,10 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         if landmarks.path is not None:
             for part in ("times", "lever", "positions", "covariance", "cross"):
                 arrays[f"path_{part}"] = getattr(landmarks.path, part)
+        if landmarks.lasting is not None:
+            arrays["lasting_names"] = np.array(landmarks.lasting.names, dtype=np.str_)
+            for part in _LASTING:
+                arrays[f"lasting_{part}"] = getattr(landmarks.lasting, part)
     if submap.trajectory is not None:
         arrays["trajectory_times"] = submap.trajectory.times
         arrays["trajectory_poses"] = submap.trajectory.poses
@@ -149,6 +154,13 @@ _FIELDS = {
     "path_positions": floats("f", "c", optional=True),
     "path_covariance": floats("g", "g", optional=True),
     "path_cross": floats("g", "v", optional=True),
+    "lasting_names": texts(4, optional=True),
+    "lasting_sigmas": floats(4, optional=True),
+    "lasting_response": floats("v", 4, optional=True),
+    "lasting_score": floats(4, optional=True),
+    "lasting_information": floats(4, 4, optional=True),
+    "lasting_path": floats("n", 3, 4, optional=True),
+    "lasting_points": floats("g", 4, optional=True),
     "trajectory_times": floats("n", optional=True),
     "trajectory_poses": floats("n", "p", optional=True),
     "trajectory_covariances": floats("n", "d", "d", optional=True),
@@ -197,6 +209,7 @@ def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
         sightings=a.get("sightings"),
         chart=_chart(a, where),
         path=_path(a, where),
+        lasting=_lasting(a, where),
     )
 
 
@@ -205,6 +218,16 @@ def _path(a: Arrays, where: str) -> PathPoints | None:
         return None
     parts = ("times", "lever", "positions", "covariance", "cross")
     return PathPoints(**{part: _need(a, f"path_{part}", where) for part in parts})
+
+
+_LASTING = ("sigmas", "response", "score", "information", "path", "points")
+
+
+def _lasting(a: Arrays, where: str) -> LastingErrors | None:
+    if "lasting_names" not in a:
+        return None
+    arrays = {part: _need(a, f"lasting_{part}", where) for part in _LASTING}
+    return LastingErrors(names=tuple(a["lasting_names"].tolist()), **arrays)
 
 
 def _chart(a: Arrays, where: str) -> str:

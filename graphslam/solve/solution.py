@@ -205,7 +205,8 @@ class Solution:
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
         """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory of its own.
 
-        ``x_k`` is the submap's base. Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the base
+        ``x_k`` is the submap's base; constant errors of wheels and sensor, where the graph has them, are taken out of
+        the local path. Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the base
         and the local path taken as independent. Where two submaps share an instant the later one has it: a fresh base
         is surer than a long arm.
 
@@ -225,6 +226,7 @@ class Solution:
             No submap has a trajectory.
         """
         P_nodes = self.node_covariances() if covariances else None
+        P_lasting = self._lasting_covariances() if covariances else {}
         times, poses, covs = [], [], []
         chosen = [s for s in self._submaps if keys is None or s.key in keys]
         with_path = [s for s in chosen if s.trajectory is not None and len(s.trajectory)]
@@ -247,6 +249,11 @@ class Solution:
             at = s.before(path.times[keep])
             node = np.array(s.nodes)[at]
             T, P_local = s.local_rows(keep, at)
+            if s.lasting is not None:
+                S = s.lasting.path[keep]
+                T = group.compose(T, group.exp(S @ self._lasting(s.robot)))
+                if P_local is not None and P_nodes is not None:
+                    P_local = P_local + S @ P_lasting[s.robot] @ np.swapaxes(S, 1, 2)
             poses.append(group.compose(self.values.poses[node], T))
             if P_nodes is not None:
                 ad = group.adjoint(group.inverse(T))
@@ -257,6 +264,15 @@ class Solution:
             np.concatenate(poses[::-1]),
             np.concatenate(covs[::-1]) if covariances else None,
         )
+
+    def _lasting(self, robot: int) -> Array:
+        """Constant errors ``(4,)`` of a robot."""
+        return np.concatenate([self.values["wheels"][robot], self.values["sensor"][robot]])
+
+    def _lasting_covariances(self) -> dict[int, Array]:
+        """Of each robot ``(4, 4)``."""
+        robots = range(self.values.count("wheels"))
+        return {k: self.covariance.joint([f"wheels{k}", f"sensor{k}"]) for k in robots}
 
     def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
         """Poses and covariances of a path between the nodes of its submap, given both neighbours of each instant."""

@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import calibrate_streams
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibrated
-from graphslam.calibrate.estimate import Calibration, in_words
+from graphslam.calibrate.estimate import NAMES, SURE, Calibration, in_words
 from graphslam.calibrate.sighted import FULL, QUICK, Effort, calibrate_sightings
 from graphslam.calibrate.windows import Seen
 from graphslam.core.config import merge
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
-from graphslam.core.records import LandmarkObservations
+from graphslam.core.records import LandmarkObservations, SteeringControls
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.frontends.base import FrontEnd
+from graphslam.frontends.landmarks.config import LastingConfig, RbpfEkfConfig
+from graphslam.frontends.landmarks.prepare import landmark_stream
+from graphslam.frontends.odometry.motion import motion_stream
+from graphslam.graph.pose_graph import PoseGraph
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
 """Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
+STEERING = float(np.deg2rad(1.0))
+"""σ of what a steered vehicle turns too much beside its calibration [rad/m]: a degree of the wheel at 1 m wheelbase."""
+TYRES, SCALE = 0.01, 0.05
+"""σ of the logarithm of the distances by wheels whose metre is taken, and of ranges measured by radio."""
 CERTAIN, DISAGREE = 0.999, 1.5
 """Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
 OWN = "Noise and lasting errors are those of the settings made for this very set; nothing was estimated from the log."
@@ -156,18 +166,41 @@ def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 
     return calibrate_streams(log, kind, effort, front.config, seed=seed)
 
 
-def suited(front: FrontEnd, found: Calibration | None, options: Mapping[str, Any]) -> FrontEnd:
+def suited(
+    front: FrontEnd, log: SensorLog, given: Corrections | None, found: Calibration | None, options: Mapping[str, Any]
+) -> FrontEnd:
     """The front end with settings that go with noise which was estimated, where the user has not set them.
+
+    What a calibration leaves of constant errors, or took out wrongly, the graph estimates with the map.
 
     The walks of a grid filter stand for errors of poor odometry that last. In space they would shake odometry by
     lidar and IMU, which is better than they are; what scans say of it at several distances holds what lasts.
     """
+    contradicted = found is not None and bool(found.contradictions())
+    config: Any = front.config
+    if given is not None and not contradicted and isinstance(config, RbpfEkfConfig):
+        unset = config.lasting is None and "lasting" not in options.get("frontend", {})
+        return type(front)(config=replace(config, lasting=lasting_config(log, config))) if unset else front  # type: ignore[call-arg]
     if found is None or found.kind != "clouds" or found.corrections.along_metre is None:
         return front
     own = options.get("frontend", {})
     if "filter" not in typing.get_type_hints(type(front.config)) or "walk_scale" in own.get("filter", {}):
         return front
     return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
+
+
+def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
+    """Which constant errors a log of landmarks may have.
+
+    A vehicle that steers turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
+    without bearings have no direction, but may have a scale; the metre is then the wheels', to what load and pressure
+    of tyres leave open.
+    """
+    steers = isinstance(motion_stream(log)[1], SteeringControls)
+    turn = {"yaw_bias": 0.0, "turn_per_metre": STEERING} if steers else {}
+    blind = not np.any(landmark_stream(log, config.detector)[1].has_bearing)
+    ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0} if blind else {}
+    return LastingConfig(**turn, **ranges)
 
 
 def named_causes(
@@ -201,6 +234,50 @@ def named_causes(
             text += "To do: --set calibrate.use=always, or `graphslam calibrate`; a scale on covariances is no cure."
             out.append(Finding("bad", "calibration", text))
     return out
+
+
+def lasting_facts(graph: PoseGraph) -> list[dict[str, Any]]:
+    """Constant errors that were estimated with the map: name, value, σ, and σ beforehand, a row each."""
+    out = []
+    for robot, event in enumerate(e for e in graph.events if e["event"] == "lasting"):
+        g, P = graph.lasting_errors(robot)
+        rows = zip(event["names"], g.tolist(), np.sqrt(np.diag(P)).tolist(), event["sigmas"])
+        out += [{"name": n, "value": v, "sigma": s, "beforehand": b, "robot": robot} for n, v, s, b in rows if n]
+    return out
+
+
+def lasting_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """What a verdict says of constant errors that were estimated with the map."""
+    sure = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
+    wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
+    if not facts:
+        return []
+    said = [in_words(r["name"], r["value"], r["sigma"]) for r in sure]
+    rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
+    text = (
+        "Constant errors of wheels and sensor were estimated with the map, and its covariances hold what is not told "
+    )
+    text += "of them"
+    if said:
+        text += f": {'; '.join(said)}"
+    text += f". Not told from zero: {', '.join(rest)}." if rest else "."
+    out = [Finding("", "lasting", text)]
+    if wild:
+        text = f"{'; '.join(in_words(r['name'], r['value'], r['sigma']) for r in wild)}: far more than a sensor that "
+        text += "works errs. To do: check its unit, its sign and its mounting; `graphslam data check`."
+        out.append(Finding("bad", "lasting", text))
+    return out
+
+
+def _sigma_in_words(row: Mapping[str, Any]) -> str:
+    s, name = row["sigma"], row["name"]
+    if name == "yaw_bias":
+        return f"{np.rad2deg(s):.3f} deg/s of the yaw rate"
+    if name == "turn_per_metre":
+        return f"{np.rad2deg(s):.3f} deg/m of the turns"
+    if name == "sensor_yaw":
+        return f"{np.rad2deg(s):.2f} deg of the sensor's direction"
+    return f"{s:.3f} m of the ranges" if name == "range_offset" else f"{100 * s:.2f} % of {NAMES[name]}"
 
 
 def chosen(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:

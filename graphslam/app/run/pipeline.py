@@ -17,7 +17,15 @@ from graphslam.app.folders.lock import locked
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
-from graphslam.app.run.calibration import named_causes, own_noise, prepared, suited, without_noise
+from graphslam.app.run.calibration import (
+    lasting_facts,
+    lasting_findings,
+    named_causes,
+    own_noise,
+    prepared,
+    suited,
+    without_noise,
+)
 from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, undone_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
@@ -215,7 +223,7 @@ def _run(
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
     log, applied, said, found = prepared(log, front, settings.calibrate, config, own=own, seed=seed)
-    front = suited(front, found, config)
+    front = suited(front, log, applied.given, found, config)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]
@@ -622,6 +630,9 @@ def _judge(
         "graph": graph_facts(back.graph, checks.classes),
         "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
     }
+    lasting = lasting_facts(back.graph)
+    if lasting:
+        report["lasting"] = lasting
     if refined is not None:
         report["refine"] = refinement_facts(refined.refinement)
     if why_not:
@@ -639,6 +650,7 @@ def _judge(
     join = figures.metrics.get("join_chi2_per_dof"), figures.metrics.get("join_dof", 0.0)
     corrected = "noise" in effective.get("frontend", {})
     causes = named_causes(log, settings.calibrate, *join, ranges_corrected=corrected)
+    causes = [*causes, *lasting_findings(lasting)]
     seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
     lines = [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
     report["verdict"] = verdict_json(summary(figures, lines), lines)

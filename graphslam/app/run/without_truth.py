@@ -24,7 +24,7 @@ from graphslam.evaluate.trust import Evidence, Of, by_score, by_size, of_systema
 from graphslam.evaluate.without_truth import ClassConsistency, class_consistency
 from graphslam.graph.pose_graph import PoseGraph
 
-OF_THE_MAP = ("submap", "dense-submap", "match", "loop", "tie")
+OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop", "tie")
 """Classes of factors whose χ² covers motion and sightings."""
 MOST_FORETOLD = {2: 1000, 3: 300}
 """Withheld fixes whose prediction is looked at, spread evenly over the run, by dimension of the graph."""
@@ -146,7 +146,8 @@ def check_without_truth(
     if graph.dim == 3:  # no landmarks to compare loops by
         return WithoutTruth(classes, innovations, None)
     try:
-        found = find_loops(submaps, poses, covariance_scale=settings.backend.covariance_scale)
+        known = [graph.as_known(s) for s in submaps]
+        found = find_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)
     except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
         return WithoutTruth(classes, innovations, None)

@@ -26,8 +26,9 @@ from graphslam.graph.variables import Layout, Values, gtsam_key
 _TWO_PI = 2.0 * math.pi
 
 
-def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64]) -> list[str]:
-    return [*(f"l{i}" for i in landmark_ids.tolist()), *(f"point{k}" for k in points.tolist())]
+def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64], robot: int) -> list[str]:
+    marks = [*(f"l{i}" for i in landmark_ids.tolist()), *(f"point{k}" for k in points.tolist())]
+    return marks if robot < 0 else [*marks, f"wheels{robot}", f"sensor{robot}"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,13 +41,15 @@ class SubmapRecord:
     landmark_ids : (n,) int64
         Graph landmark of every entry; an id may stand twice.
     z : (3 + 2n,)
-        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame.
+        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame; with constant errors four zeros behind them.
     whitener : (3 + 2n, 3 + 2n)
-        ``W`` with ``Wᵀ W`` = information.
+        ``W`` with ``Wᵀ W`` = information; with constant errors four columns ``-W S`` more, of what they move.
     information : ((3 + 2n)²,)
         Row major; made here.
     chart : str
         In which the residual is taken (:mod:`graphslam.core.charts`).
+    robot : int
+        Row of its constant errors (:mod:`graphslam.core.lasting`); -1: it has none.
     """
 
     factor_id: int
@@ -57,6 +60,7 @@ class SubmapRecord:
     whitener: Array
     group: str = "submap"
     chart: str = "cartesian"
+    robot: int = -1
     information: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -72,9 +76,15 @@ class SubmapRecord:
         """Dimension of the residual."""
         return len(self.whitener)
 
+    @property
+    def own(self) -> tuple[Array, Array]:
+        """Measurement and whitener of exit and landmarks alone, as if there were no constant errors."""
+        m = 3 + 2 * len(self.landmark_ids)
+        return self.z[:m], self.whitener[:, :m]
+
     def entries(self) -> list[str]:
         """Names of what stands behind the two poses, in the order of z."""
-        return _entries(self.landmark_ids, self.points)
+        return _entries(self.landmark_ids, self.points, self.robot)
 
     def variables(self) -> list[str]:
         """Names of the free and fixed variables, each once."""
@@ -95,7 +105,7 @@ class PathRecord:
 
     Parameters
     ----------
-    factor_id, submap_key, start, landmark_ids, chart
+    factor_id, submap_key, start, landmark_ids, chart, robot
         See :class:`SubmapRecord`.
     points : (p,) int64
         Rows of the points among the graph's.
@@ -114,6 +124,7 @@ class PathRecord:
     whitener: Array
     chart: str = "cartesian"
     group: str = "path"
+    robot: int = -1
     information: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -126,7 +137,7 @@ class PathRecord:
 
     def entries(self) -> list[str]:
         """Names of what stands behind the two poses, in the order of z."""
-        return _entries(self.landmark_ids, self.points)
+        return _entries(self.landmark_ids, self.points, self.robot)
 
     def variables(self) -> list[str]:
         """Names of the free and fixed variables, each once."""
@@ -144,11 +155,16 @@ class SubmapBatch(FactorBatch):
 
     def __init__(self, records: Sequence[SubmapRecord | PathRecord], layout: Layout) -> None:
         super().__init__(records, layout)
-        row, marks = layout.row_of, layout.count("l")
+        row, marks, robots = layout.row_of, layout.count("l"), layout.count("wheels")
         self._start = np.array([r.start for r in records], dtype=np.int64)
-        self._entry_offset = offsets([len(r.landmark_ids) + len(r.points) for r in records])
-        # points stand behind the landmarks
+        self._constant = marks + layout.count("point")
+        # points stand behind the landmarks, and constant errors behind the points
         rows = [[*(row[i] for i in r.landmark_ids.tolist()), *(marks + r.points).tolist()] for r in records]
+        rows = [
+            x if r.robot < 0 else [*x, self._constant + r.robot, self._constant + robots + r.robot]
+            for x, r in zip(rows, records)
+        ]
+        self._entry_offset = offsets([len(x) for x in rows])
         self._entry_row = np.array([i for some in rows for i in some], dtype=np.int64)
         self._z = np.concatenate([np.zeros(0), *(r.z for r in records)])
         self._z_offset = offsets([len(r.z) for r in records])
@@ -160,9 +176,11 @@ class SubmapBatch(FactorBatch):
         # every submap: two poses, then its entries
         heads = np.repeat(self._entry_offset[:-1], 2)
         poses = layout.first("x", np.stack([self._start, self._start + 1], axis=1)).ravel()
-        own = np.where(self._entry_row < marks, self._entry_row, -1)
-        points = np.where(self._entry_row < marks, -1, self._entry_row - marks)
-        columns = np.where(own < 0, layout.first("point", points), layout.first("l", own))
+        columns = np.full(len(self._entry_row), -1, dtype=np.int64)
+        kinds = (("l", 0), ("point", marks), ("wheels", self._constant), ("sensor", self._constant + robots))
+        for word, before in kinds:
+            mine = (self._entry_row >= before) & (self._entry_row < before + layout.count(word))
+            columns[mine] = layout.first(word, self._entry_row[mine] - before)
         self.first = np.insert(columns, heads, poses)
         self.width = np.insert(np.full(len(self._entry_row), 2), heads, 3)
 
@@ -184,9 +202,10 @@ class SubmapBatch(FactorBatch):
             return chi2
         submaps = SubmapArrays(
             self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
-            self._bent,
+            self._bent, self._constant,
         )  # fmt: skip
-        places = np.concatenate([values.landmarks, values["point"]]) if values.count("point") else values.landmarks
+        others = [values[w] for w in ("point", "wheels", "sensor") if values.count(w)]
+        places = np.concatenate([values.landmarks, *others]) if others else values.landmarks
         submap_blocks(
             np.ascontiguousarray(values.poses), np.ascontiguousarray(places), submaps, hessian,
             SubmapBlocks(H, H_offset, g, g_offset, chi2),
@@ -224,10 +243,15 @@ def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.Cus
 def _terms(
     keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array
 ) -> Callable[..., Array]:
-    z, W, group = record.z, record.whitener, record.chart == "group"
-    rows, m = W.shape
-    first_landmark = len(keys) - (len(np.unique(entry_of)) if len(entry_of) else 0)
-    landmark_keys = keys[first_landmark:]
+    constants = 2 if record.robot >= 0 else 0  # keys that stand last
+    whole = record.whitener
+    m = whole.shape[1] - 2 * constants
+    z, W, group = record.z[:m], whole[:, :m], record.chart == "group"
+    rows, last = len(W), len(keys) - constants
+    W_constants = np.asfortranarray(whole[:, m:])
+    entry_of = entry_of[: len(entry_of) - constants]
+    first_landmark = last - (len(np.unique(entry_of)) if len(entry_of) else 0)
+    landmark_keys, constant_keys = keys[first_landmark:last], keys[last:]
     u = len(landmark_keys)
     repeated = u != len(entry_of)
     W = np.ascontiguousarray(W)
@@ -277,7 +301,10 @@ def _terms(
             r[2] = heading
         if H is not None:
             _fill(H, q[0], qe, dt, R, Vi, bent)
-        return np.asarray(W @ r)
+        out = np.asarray(W @ r)
+        for i, k in enumerate(constant_keys):
+            out += W_constants[:, 2 * i : 2 * i + 2] @ values.atVector(k)
+        return out
 
     def _rows(points: Array) -> Array:
         """Points of the end and of all entries in the layout of the residual; the heading is left open."""
@@ -313,5 +340,7 @@ def _terms(
             J_points = (W_unique @ turned).reshape(rows, u, 2)  # R_sᵀ in each landmark's own rows
             for i in range(u):
                 H[first_landmark + i] = J_points[:, i]
+        for i in range(constants):
+            H[last + i] = W_constants[:, 2 * i : 2 * i + 2]
 
     return terms

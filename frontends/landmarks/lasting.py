@@ -1,0 +1,73 @@
+"""Constant errors of wheels and sensor beside a smoothed submap, for a graph to estimate
+(:mod:`graphslam.core.lasting`).
+
+What is measured is taken to be: turns ``b`` too large for each second in motion, or each metre driven; distances too
+long by the factor ``e^s``; ranges too long by ``o``; the sensor turned to the left by ``y``, or ranges that have no
+bearing too long by the factor ``e^y``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.geometry import Array, rotation2, se2_between, se2_compose
+from graphslam.core.lasting import CONSTANTS, LastingErrors
+from graphslam.frontends.landmarks.config import LastingConfig
+from graphslam.frontends.landmarks.fix_points import Way
+from graphslam.frontends.landmarks.smoothing_kernels import responses
+from graphslam.frontends.landmarks.summarise import Smoothed
+
+MOVING = 1e-6
+"""An increment of the odometry that is shorter and turns less is rest [m, rad]."""
+
+
+def lasting_errors(
+    config: LastingConfig, smoothed: Smoothed, seconds: Array, way: Way | None, *, base: bool
+) -> LastingErrors:
+    """What a smoothed submap is with constant errors, and what it says of them.
+
+    Parameters
+    ----------
+    config : LastingConfig
+    smoothed : Smoothed
+    seconds : (T,)
+        Of each increment of the odometry.
+    way : Way or None
+        Points of the path at fixes.
+    base : bool
+        The trajectory begins with the base, which does not move.
+    """
+    names, sigmas = config.chosen()
+    evidence, T = smoothed.evidence, len(smoothed.poses)
+    ob, x = evidence.ob, smoothed.poses
+    # errors are shares of the motion and the ranges as smoothed: noise of what was measured would feign a scale
+    u = se2_between(np.concatenate([np.zeros((1, 3)), x[:-1]]), x)
+    still = np.hypot(evidence.u[:, 0], evidence.u[:, 1]) + np.abs(evidence.u[:, 2]) < MOVING
+    sensors = se2_compose(x[evidence.ob_pose], np.broadcast_to(evidence.sensor, (len(ob), 3)))
+    ranges = np.linalg.norm(smoothed.landmarks[evidence.ob_lm] - sensors[:, :2], axis=1)
+    metres = np.hypot(u[:, 0], u[:, 1])
+    R_end = rotation2(u[:, 2])
+    along, seen = np.zeros((T, 3, len(CONSTANTS))), np.zeros((len(ob), 2, len(CONSTANTS)))
+    if names[0]:
+        weight = metres if names[0] == "turn_per_metre" else seconds * ~still
+        half = 0.5 * np.stack([-u[:, 1], u[:, 0]], -1)  # the heading errs by half of it on the way
+        along[:, :2, 0] = weight[:, None] * np.einsum("kji,kj->ki", R_end, half)
+        along[:, 2, 0] = weight
+    if names[1]:
+        along[:, :2, 1] = np.einsum("kji,kj->ki", R_end, u[:, :2])
+    if names[2]:
+        seen[:, 0, 2] = -1.0
+    if names[3] == "range_scale":
+        seen[:, 0, 3] = -ranges
+    elif names[3]:
+        seen[:, 1, 3] = 1.0
+    moved, shifted, score, information = responses(smoothed.poses, smoothed.landmarks, evidence, along, seen)
+    exit_moved = moved[-1].copy()
+    exit_moved[:2] = rotation2(smoothed.poses[-1, 2]) @ exit_moved[:2]  # right tangent → plain vector of eq. 15
+    points, before = np.zeros((0, len(CONSTANTS))), np.concatenate([np.zeros((1, 3, len(CONSTANTS))), moved])
+    if way is not None:
+        points = (way.by_first @ before[way.at + 1] + way.by_second @ before[way.at + 2]).reshape(-1, len(CONSTANTS))
+    return LastingErrors(
+        names=names, sigmas=sigmas, response=np.concatenate([exit_moved, shifted]), score=score,
+        information=information, path=before if base else moved, points=points,
+    )  # fmt: skip
