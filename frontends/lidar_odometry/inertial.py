@@ -252,8 +252,11 @@ class Inertial:
         return np.concatenate([x[:, 3:], se3.so3_exp(x[:, :3])], axis=1)
 
     def unsure(self, age: float) -> tuple[float, float]:
-        """Variance by axis of what is unsure of the motion within a scan of mean age ``age`` does to its pose."""
-        n = self.readings.noise
+        """Variance by axis of what is unsure of the motion within a scan of mean age ``age`` does to its pose.
+
+        A scan may be stamped when it begins: its points are then measured later, and their ages are negative.
+        """
+        n, age = self.readings.noise, abs(age)
         turn2 = n.gyro**2 * 2.0 * age / 3.0 + self.bias_var * age**2
         return float(turn2), float(self.cov[1, 1] * age**2)
 

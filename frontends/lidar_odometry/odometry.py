@@ -302,7 +302,7 @@ class LidarOdometry:
         """
         if raw.ages is None or not len(raw.ages):
             return
-        span = 2.0 * float(raw.ages.max()) - 1e-6
+        span = 2.0 * float(np.abs(raw.ages).max()) - 1e-6
         while len(self.recent) > 1 and time - self.recent[1][0] >= span:
             self.recent.popleft()
 

@@ -316,3 +316,34 @@ def test_a_run_has_its_map_upright_and_its_graph_counts_the_readings(logs):
 
 def log_up(poses):
     return se3.quat_to_matrix(poses[:, 3:])[:, 2]
+
+
+class Begun:
+    """Clouds that are stamped when their scans begin, as many drivers do."""
+
+    def __init__(self, source, late):
+        self.source, self.late, self.counts = source, late, source.counts
+
+    def cloud(self, k):
+        return self.source.cloud(k)
+
+    def ages(self, k):
+        return self.source.ages(k) - self.late[k]
+
+    def packed(self):
+        return self.source.packed()
+
+
+def test_scans_may_be_stamped_when_they_begin(paths):
+    log, _, odometry = paths[0]
+    assert odometry.inertial.unsure(-0.05) == odometry.inertial.unsure(0.05)
+    clouds = log["clouds"]
+    late = np.array([clouds.source.ages(k).max() for k in range(len(clouds.source.counts))])
+    begun = replace(clouds, times=clouds.times - late[clouds.index], source=Begun(clouds.source, late))
+    some = np.arange(len(clouds.times)) < 60
+    short = replace(log, streams={**log.streams, "clouds": begun.take(some)}, truth=None)
+    made = list(LidarFrontEnd().submaps(short, seed=SeedTree(0)))
+    assert made
+    assert all(s.report["scans_lost"] == 0 for s in made)
+    for s in made:
+        assert np.linalg.eigvalsh(s.trajectory.covariances[1:]).min() > 0
