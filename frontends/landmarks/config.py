@@ -184,6 +184,8 @@ class LastingConfig:
     """Of the direction of the sensor [rad]."""
     range_scale: float = 0.0
     """Of the logarithm of the ranges, in the place of a direction: for ranges without bearings."""
+    mount: float = 0.05
+    """Of where the sensor stands on the robot, ahead and to the left [m]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -193,11 +195,13 @@ class LastingConfig:
             if getattr(self, one) and getattr(self, other):
                 raise ConfigError(f"lasting.{one} and lasting.{other} cannot be told apart; wanted 0 for one of them")
 
-    def chosen(self) -> tuple[tuple[str, str, str, str], Array]:
+    def chosen(self) -> tuple[tuple[str, ...], Array]:
         """Name and σ of each of :data:`~graphslam.core.lasting.CONSTANTS`; what is none has no name, and a σ of 1."""
         pairs = (("yaw_bias", "turn_per_metre"), ("distance_scale",), ("range_offset",), ("sensor_yaw", "range_scale"))
         names = tuple(next((n for n in some if getattr(self, n) > 0.0), "") for some in pairs)
-        return names, np.array([getattr(self, n) if n else 1.0 for n in names])  # type: ignore[return-value]
+        sigmas = [getattr(self, n) if n else 1.0 for n in names]
+        places = ("mount_x", "mount_y") if self.mount > 0.0 else ("", "")
+        return (*names, *places), np.array([*sigmas, *2 * [self.mount or 1.0]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

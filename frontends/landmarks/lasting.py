@@ -3,14 +3,14 @@
 
 What is measured is taken to be: turns ``b`` too large for each second in motion, or each metre driven; distances too
 long by the factor ``e^s``; ranges too long by ``o``; the sensor turned to the left by ``y``, or ranges that have no
-bearing too long by the factor ``e^y``.
+bearing too long by the factor ``e^y``; the sensor stands ``x`` further ahead, and ``y`` further to the left.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.geometry import Array, rotation2, se2_between, se2_compose
+from graphslam.core.geometry import Array, rotation2, se2_between
 from graphslam.core.lasting import CONSTANTS, LastingErrors
 from graphslam.frontends.landmarks.config import LastingConfig
 from graphslam.frontends.landmarks.fix_points import Way
@@ -43,8 +43,10 @@ def lasting_errors(
     # errors are shares of the motion and the ranges as smoothed: noise of what was measured would feign a scale
     u = se2_between(np.concatenate([np.zeros((1, 3)), x[:-1]]), x)
     still = np.hypot(evidence.u[:, 0], evidence.u[:, 1]) + np.abs(evidence.u[:, 2]) < MOVING
-    sensors = se2_compose(x[evidence.ob_pose], np.broadcast_to(evidence.sensor, (len(ob), 3)))
-    ranges = np.linalg.norm(smoothed.landmarks[evidence.ob_lm] - sensors[:, :2], axis=1)
+    at = x[evidence.ob_pose]
+    off = np.einsum("kji,kj->ki", rotation2(at[:, 2]), smoothed.landmarks[evidence.ob_lm] - at[:, :2])
+    off -= evidence.sensor[:2]  # from the sensor, in the axes of the body
+    ranges = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
     metres = np.hypot(u[:, 0], u[:, 1])
     R_end = rotation2(u[:, 2])
     along, seen = np.zeros((T, 3, len(CONSTANTS))), np.zeros((len(ob), 2, len(CONSTANTS)))
@@ -61,6 +63,10 @@ def lasting_errors(
         seen[:, 0, 3] = -ranges
     elif names[3]:
         seen[:, 1, 3] = 1.0
+    if names[4]:  # a bearing by its own inverse range has no bound: nearer than its σ a range tells no place
+        ahead, near = off / ranges[:, None], np.maximum(ranges, np.sqrt(ob[:, 2]))
+        seen[:, 0, 4], seen[:, 0, 5] = ahead[:, 0], ahead[:, 1]
+        seen[:, 1, 4], seen[:, 1, 5] = -ahead[:, 1] / near, ahead[:, 0] / near
     moved, shifted, score, information = responses(smoothed.poses, smoothed.landmarks, evidence, along, seen)
     exit_moved = moved[-1].copy()
     exit_moved[:2] = rotation2(smoothed.poses[-1, 2]) @ exit_moved[:2]  # right tangent → plain vector of eq. 15

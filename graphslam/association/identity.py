@@ -19,6 +19,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.lasting import errors_at
 from graphslam.graph.graph_record import GraphRecord
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 
@@ -59,7 +60,7 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
     J_start, J_end, J_point = submap_jacobians(start, end, points, z, record.chart, tangent=True)
     robot = record.robot
     if robot >= 0:
-        r = np.concatenate([r, graph.values["wheels"][robot], graph.values["sensor"][robot]])
+        r = np.concatenate([r, errors_at(graph.values, robot)])
     variables = record.variables()
     column = {name: k for k, name in enumerate(variables[2:])}
     J = np.zeros((len(r), 6 + 2 * len(column)))

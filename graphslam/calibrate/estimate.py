@@ -234,6 +234,8 @@ NAMES = {
     "range_offset": "the zero of the ranges",
     "sensor_yaw": "the sensor's direction",
     "clock": "the clocks",
+    "mount_x": "the sensor's place",
+    "mount_y": "the sensor's place",
 }
 MENDED = {
     "yaw_bias": "subtracted",
@@ -264,6 +266,10 @@ def in_words(name: str, value: float, sigma: float) -> str:
         return f"ranges {abs(value):.3f} ± {sigma:.3f} m too {_long(value)}"
     if name == "sensor_yaw":
         return f"sensor turned {deg(abs(value)):.2f} ± {deg(sigma):.2f} deg further to the {_left(value)} than stated"
+    if name == "mount_x":
+        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further {'ahead' if value > 0 else 'back'} than stated"
+    if name == "mount_y":
+        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further to the {_left(value)} than stated"
     if name == "clock":
         return f"stamps of the motion {abs(value):.3f} ± {sigma:.3f} s too {'late' if value > 0 else 'early'}"
     return f"{name} {value:.4g} ± {sigma:.2g}"

@@ -18,9 +18,10 @@ from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import usable
 
-CONSTANTS = ("turn", "distance", "range", "bearing")
+CONSTANTS = ("turn", "distance", "range", "bearing", "ahead", "left")
 """Two of the wheels: their turns (by the second or by the metre), and the logarithm of their distances; and two of the
-sensor: the zero of its ranges, and its direction (of ranges without bearings the logarithm of their scale)."""
+sensor: the zero of its ranges, and its direction (of ranges without bearings the logarithm of their scale); and where
+it stands on the robot, ahead and to the left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,21 +30,21 @@ class LastingErrors:
 
     Parameters
     ----------
-    names : (4,) str
+    names : (6,) str
         What the constants are, in the order of :data:`CONSTANTS`; empty where one is not looked for.
-    sigmas : (4,)
+    sigmas : (6,)
         What is known of them beforehand, about zero.
-    response : (3 + 2n, 4)
+    response : (3 + 2n, 6)
         Change of exit and landmarks with each, in the plain vector of the landmark map.
-    score, information : (4,), (4, 4)
+    score, information : (6,), (6, 6)
         ``score = Λ ĝ`` and ``Λ`` of what the submap's own motion and sightings say, exit and landmarks left free.
-    path : (T, 3, 4)
+    path : (T, 3, 6)
         Change of the poses of the submap's trajectory, right tangents.
-    points : (2p, 4)
+    points : (2p, 6)
         Change of the points of the path (:mod:`graphslam.core.path_points`) in the base frame.
     """
 
-    names: tuple[str, str, str, str]
+    names: tuple[str, ...]
     sigmas: Array
     response: Array
     score: Array
@@ -72,7 +73,7 @@ class LastingErrors:
         return replace(self, response=self.response[keep])
 
     def likelihood(self) -> tuple[Array, Array]:
-        """The submap's own word as rows ``R g - d`` of unit variance: ``(r, 4)``, ``(r,)``.
+        """The submap's own word as rows ``R g - d`` of unit variance: ``(r, 6)``, ``(r,)``.
 
         Directions of which it says less than a millionth of what is known beforehand have no row.
         """

@@ -98,7 +98,7 @@ class LandmarkMap:
             raise GeometryError("points of the path do not fit the map", got=self.path.cross.shape, wanted=f"(…, {n})")
         if self.lasting is not None and len(self.lasting.response) != n:
             raise GeometryError(
-                "lasting errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 4)"
+                "lasting errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 6)"
             )
         if self.sightings is not None:
             rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
@@ -162,7 +162,7 @@ class LandmarkMap:
 
         Parameters
         ----------
-        mean, covariance : (4,), (4, 4)
+        mean, covariance : (6,), (6, 6)
             Of the errors, all that the map itself says of them included.
         """
         if self.lasting is None:

@@ -164,6 +164,8 @@ ESTIMATED = {
     "distance_scale": "distance-scale",
     "yaw_bias": "turn-per-metre",
     "turn_per_metre": "turn-per-metre",
+    "mount_x": "mount-x",
+    "mount_y": "mount-y",
 }
 """Constant errors that a graph may estimate with the map (:mod:`graphslam.core.lasting`), as they are called here."""
 

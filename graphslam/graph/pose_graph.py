@@ -44,8 +44,8 @@ from graphslam.graph.factors.batch import Record
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.states import ImuStates
-from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.lasting import SIZE, LastingRecord
+from graphslam.graph.factors.landmark_submap import CONSTANT, SubmapRecord
+from graphslam.graph.factors.lasting import SIZE, LastingRecord, errors_at, names_of
 from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.graph_record import BetweenBlock, GraphRecord
@@ -188,8 +188,8 @@ class PoseGraph(GraphRecord):
         """
         s = self.submaps[-1]
         if robot == self.structure.count("wheels"):
-            self.structure.append("wheels", np.zeros((1, 2)))
-            self.structure.append("sensor", np.zeros((1, 2)))
+            for word in CONSTANT:
+                self.structure.append(word, np.zeros((1, 2)))
             fid = self.next_factor()
             self.ledger.spend(fid, "constant errors, beforehand", ["-"], s.interval, "prior")
             self.insert(LastingRecord(fid, robot, np.diag(1.0 / lasting.sigmas), np.zeros(SIZE)))
@@ -224,8 +224,7 @@ class PoseGraph(GraphRecord):
         """
         if not 0 <= robot < self.values.count("wheels"):
             raise DataError(f"the graph has no constant errors of robot {robot}", wanted="submaps with lasting errors")
-        g = np.concatenate([self.values["wheels"][robot], self.values["sensor"][robot]])
-        return g, self.covariance().joint([f"wheels{robot}", f"sensor{robot}"])
+        return errors_at(self.values, robot), self.covariance().joint(names_of(robot))
 
     def _add_dense(
         self, submap: Submap, covariance_scale: float, spacing: float | None, level_sigma: float | None

@@ -7,7 +7,7 @@ Variables are named by short strings that also stand in messages: ``x3`` (pose o
 ``point3`` (where the antenna was at a fix inside a landmark submap), ``datum`` (``T_gps_world``), ``bias2`` (position
 bias of GPS segment 2), ``tilt`` (where up is in the frame of the first base, in space only), ``velocity4`` and
 ``imubias4`` (of an IMU, in the order in which its nodes were tied), ``compass0`` (zero and deviation of a compass),
-``beacon7`` (position of beacon 7), ``wheels0`` and ``sensor0`` (constant errors of a robot).
+``beacon7`` (position of beacon 7), ``wheels0``, ``sensor0`` and ``mount0`` (constant errors of a robot).
 The first base ``x0`` is fixed at the origin and is no variable at all: no prior has
 to hold it, and nothing is lost to a badly scaled one.
 
@@ -96,7 +96,8 @@ for _kind in (
         "point", "y", {2: "mm"}, classes=("path",),
         remedy="a point of a submap's path hangs on no submap: remove the fixes that hang on it.",
     ),
-    # Constant errors of a robot (graphslam.core.lasting): turn and log distance of its wheels; ranges and bearings.
+    # Constant errors of a robot (graphslam.core.lasting): turn and log distance of its wheels; ranges and bearings of
+    # its sensor, and where that stands.
     VariableKind(
         "wheels", "w", {2: "rr"}, classes=("lasting",),
         remedy="constant errors of the wheels need what is known of them beforehand.",
@@ -104,6 +105,10 @@ for _kind in (
     VariableKind(
         "sensor", "e", {2: "mr"}, classes=("lasting",),
         remedy="constant errors of the sensor need what is known of them beforehand.",
+    ),
+    VariableKind(
+        "mount", "m", {2: "mm"}, classes=("lasting",),
+        remedy="where the sensor stands needs what is known of it beforehand.",
     ),
     # In space the datum's heading stands last and it moves by addition.
     VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps",)),

@@ -19,6 +19,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.lasting import errors_at, names_of
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.network import network_of
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
@@ -251,7 +252,7 @@ class Solution:
             T, P_local = s.local_rows(keep, at)
             if s.lasting is not None:
                 S = s.lasting.path[keep]
-                T = group.compose(T, group.exp(S @ self._lasting(s.robot)))
+                T = group.compose(T, group.exp(S @ errors_at(self.values, s.robot)))
                 if P_local is not None and P_nodes is not None:
                     P_local = P_local + S @ P_lasting[s.robot] @ np.swapaxes(S, 1, 2)
             poses.append(group.compose(self.values.poses[node], T))
@@ -265,14 +266,10 @@ class Solution:
             np.concatenate(covs[::-1]) if covariances else None,
         )
 
-    def _lasting(self, robot: int) -> Array:
-        """Constant errors ``(4,)`` of a robot."""
-        return np.concatenate([self.values["wheels"][robot], self.values["sensor"][robot]])
-
     def _lasting_covariances(self) -> dict[int, Array]:
-        """Of each robot ``(4, 4)``."""
+        """Of the constant errors of each robot ``(6, 6)``."""
         robots = range(self.values.count("wheels"))
-        return {k: self.covariance.joint([f"wheels{k}", f"sensor{k}"]) for k in robots}
+        return {k: self.covariance.joint(names_of(k)) for k in robots}
 
     def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
         """Poses and covariances of a path between the nodes of its submap, given both neighbours of each instant."""

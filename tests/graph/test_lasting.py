@@ -22,14 +22,14 @@ from graphslam.solve.registry import make_solver
 from tests.reference.graph_chain import make_chain, make_gps
 from tests.reference.hat_matrix import numeric_jacobian, whitened_residual
 
-NAMES = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+NAMES = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw", "mount_x", "mount_y")
 
 
 def with_errors(rng, s: Submap, *, points: int = 0) -> Submap:
     """A submap with made-up responses, and points of its path."""
     lm = s.landmarks
     n = 3 + 2 * len(lm)
-    B = rng.standard_normal((6, 4))
+    B = rng.standard_normal((8, 6))
     t0, t1 = s.interval
     path = None
     if points:
@@ -40,9 +40,9 @@ def with_errors(rng, s: Submap, *, points: int = 0) -> Submap:
         poses = s.trajectory.interpolate(times)
         path = PathPoints(times=times, lever=np.zeros(2), positions=poses[:, :2], covariance=own, cross=gain @ P)
     lasting = LastingErrors(
-        names=NAMES, sigmas=np.array([0.02, 0.05, 0.3, 0.1]), response=0.05 * rng.standard_normal((n, 4)),
-        score=B.T @ rng.standard_normal(6), information=B.T @ B,
-        path=0.1 * rng.standard_normal((len(s.trajectory), 3, 4)), points=0.05 * rng.standard_normal((2 * points, 4)),
+        names=NAMES, sigmas=np.array([0.02, 0.05, 0.3, 0.1, 0.2, 0.2]), response=0.05 * rng.standard_normal((n, 6)),
+        score=B.T @ rng.standard_normal(8), information=B.T @ B,
+        path=0.1 * rng.standard_normal((len(s.trajectory), 3, 6)), points=0.05 * rng.standard_normal((2 * points, 6)),
     )  # fmt: skip
     return replace(s, landmarks=replace(lm, lasting=lasting, path=path, chart="group"))
 
@@ -81,8 +81,8 @@ def test_kernel_equals_the_slow_twin_and_finite_differences(graph, rng):
     made = flat.evaluate(values)
     np.testing.assert_allclose(made.g, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
     J = np.vstack([numeric_jacobian(lambda v, r=r: whitened_residual(r, v), values) for r in records])
-    lasting = flat.layout.columns_of(["wheels0", "sensor0"])
-    assert np.linalg.matrix_rank(J[:, lasting]) == 4
+    lasting = flat.layout.columns_of(["wheels0", "sensor0", "mount0"])
+    assert np.linalg.matrix_rank(J[:, lasting]) == 6
 
 
 @pytest.mark.parametrize("group", ["submap", "path", "lasting"])
@@ -163,13 +163,13 @@ def test_a_submap_that_is_removed_takes_its_word_along(rng):
 def test_what_is_known_of_the_errors_moves_and_widens_a_map(rng):
     chain = make_chain(rng, m=2, landmarks=6)
     s = with_errors(rng, chain.submaps[0])
-    g = np.array([0.01, 0.02, -0.1, 0.03])
-    moved = s.landmarks.erring(g, np.eye(4))
+    g = np.array([0.01, 0.02, -0.1, 0.03, 0.1, -0.1])
+    moved = s.landmarks.erring(g, np.eye(6))
     S = s.landmarks.lasting.response
     np.testing.assert_allclose(moved.mean, s.landmarks.mean + S @ g)
     np.testing.assert_allclose(moved.covariance, s.landmarks.dense_covariance() + S @ S.T)
     plain = chain.submaps[1]
-    assert plain.landmarks.erring(g, np.eye(4)) is plain.landmarks
+    assert plain.landmarks.erring(g, np.eye(6)) is plain.landmarks
 
 
 def test_a_store_keeps_them(rng, tmp_path):

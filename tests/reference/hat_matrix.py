@@ -8,7 +8,7 @@ from graphslam.core.geometry import se2_between, se2_log
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.lasting import LastingRecord
+from graphslam.graph.factors.lasting import LastingRecord, errors_at
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_residual
@@ -24,12 +24,10 @@ def whitened_residual(record: object, values: Values) -> np.ndarray:
         r = W @ submap_residual(values.poses[record.start], values.poses[record.start + 1], points, z, record.chart)
         if record.robot < 0:
             return r
-        g = np.concatenate([values["wheels"][record.robot], values["sensor"][record.robot]])
+        g = errors_at(values, record.robot)
         return r + record.whitener[:, len(z) :] @ g
     if isinstance(record, LastingRecord):
-        return (
-            record.root @ np.concatenate([values["wheels"][record.robot], values["sensor"][record.robot]]) - record.told
-        )
+        return record.root @ errors_at(values, record.robot) - record.told
     if isinstance(record, BetweenRecord):
         h = se2_between(values.poses[record.i], values.poses[record.j])
         return record.whitener @ se2_log(se2_between(record.T_ij, h))

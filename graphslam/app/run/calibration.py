@@ -36,6 +36,8 @@ STEERING = float(np.deg2rad(1.0))
 """σ of what a steered vehicle turns too much beside its calibration [rad/m]: a degree of the wheel at 1 m wheelbase."""
 TYRES, SCALE = 0.01, 0.05
 """σ of the logarithm of the distances by wheels whose metre is taken, and of ranges measured by radio."""
+UNSAID = 0.3
+"""σ of where a sensor stands whose place nobody stated [m]."""
 CERTAIN, DISAGREE = 0.999, 1.5
 """Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
 OWN = "Noise and lasting errors are those of the settings made for this very set; nothing was estimated from the log."
@@ -198,9 +200,11 @@ def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
     """
     steers = isinstance(motion_stream(log)[1], SteeringControls)
     turn = {"yaw_bias": 0.0, "turn_per_metre": STEERING} if steers else {}
-    blind = not np.any(landmark_stream(log, config.detector)[1].has_bearing)
-    ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0} if blind else {}
-    return LastingConfig(**turn, **ranges)
+    seen = landmark_stream(log, config.detector)[1]
+    blind = not np.any(seen.has_bearing)
+    ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0, "mount": 0.0} if blind else {}
+    place = {} if blind or np.any(seen.T_base_sensor[:2] != 0.0) else {"mount": UNSAID}
+    return LastingConfig(**turn, **ranges, **place)
 
 
 def named_causes(
@@ -277,6 +281,8 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
         return f"{np.rad2deg(s):.3f} deg/m of the turns"
     if name == "sensor_yaw":
         return f"{np.rad2deg(s):.2f} deg of the sensor's direction"
+    if name.startswith("mount"):
+        return f"{s:.3f} m of where the sensor stands, {'ahead' if name == 'mount_x' else 'to the left'}"
     return f"{s:.3f} m of the ranges" if name == "range_offset" else f"{100 * s:.2f} % of {NAMES[name]}"
 
 

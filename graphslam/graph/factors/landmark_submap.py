@@ -24,11 +24,13 @@ from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_fact
 from graphslam.graph.variables import Layout, Values, gtsam_key
 
 _TWO_PI = 2.0 * math.pi
+CONSTANT = ("wheels", "sensor", "mount")
+"""Kinds of variables that hold the constant errors of a robot, a pair each."""
 
 
 def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64], robot: int) -> list[str]:
     marks = [*(f"l{i}" for i in landmark_ids.tolist()), *(f"point{k}" for k in points.tolist())]
-    return marks if robot < 0 else [*marks, f"wheels{robot}", f"sensor{robot}"]
+    return marks if robot < 0 else [*marks, *(f"{word}{robot}" for word in CONSTANT)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,9 +43,9 @@ class SubmapRecord:
     landmark_ids : (n,) int64
         Graph landmark of every entry; an id may stand twice.
     z : (3 + 2n,)
-        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame; with constant errors four zeros behind them.
+        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame; with constant errors six zeros behind them.
     whitener : (3 + 2n, 3 + 2n)
-        ``W`` with ``Wᵀ W`` = information; with constant errors four columns ``-W S`` more, of what they move.
+        ``W`` with ``Wᵀ W`` = information; with constant errors six columns ``-W S`` more, of what they move.
     information : ((3 + 2n)²,)
         Row major; made here.
     chart : str
@@ -161,7 +163,7 @@ class SubmapBatch(FactorBatch):
         # points stand behind the landmarks, and constant errors behind the points
         rows = [[*(row[i] for i in r.landmark_ids.tolist()), *(marks + r.points).tolist()] for r in records]
         rows = [
-            x if r.robot < 0 else [*x, self._constant + r.robot, self._constant + robots + r.robot]
+            x if r.robot < 0 else [*x, *(self._constant + k * robots + r.robot for k in range(len(CONSTANT)))]
             for x, r in zip(rows, records)
         ]
         self._entry_offset = offsets([len(x) for x in rows])
@@ -177,7 +179,8 @@ class SubmapBatch(FactorBatch):
         heads = np.repeat(self._entry_offset[:-1], 2)
         poses = layout.first("x", np.stack([self._start, self._start + 1], axis=1)).ravel()
         columns = np.full(len(self._entry_row), -1, dtype=np.int64)
-        kinds = (("l", 0), ("point", marks), ("wheels", self._constant), ("sensor", self._constant + robots))
+        kinds = [("l", 0), ("point", marks)]
+        kinds += [(word, self._constant + k * robots) for k, word in enumerate(CONSTANT)]
         for word, before in kinds:
             mine = (self._entry_row >= before) & (self._entry_row < before + layout.count(word))
             columns[mine] = layout.first(word, self._entry_row[mine] - before)
@@ -204,7 +207,7 @@ class SubmapBatch(FactorBatch):
             self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
             self._bent, self._constant,
         )  # fmt: skip
-        others = [values[w] for w in ("point", "wheels", "sensor") if values.count(w)]
+        others = [values[w] for w in ("point", *CONSTANT) if values.count(w)]
         places = np.concatenate([values.landmarks, *others]) if others else values.landmarks
         submap_blocks(
             np.ascontiguousarray(values.poses), np.ascontiguousarray(places), submaps, hessian,
@@ -243,7 +246,7 @@ def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.Cus
 def _terms(
     keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array
 ) -> Callable[..., Array]:
-    constants = 2 if record.robot >= 0 else 0  # keys that stand last
+    constants = len(CONSTANT) if record.robot >= 0 else 0  # keys that stand last
     whole = record.whitener
     m = whole.shape[1] - 2 * constants
     z, W, group = record.z[:m], whole[:, :m], record.chart == "group"

@@ -1,6 +1,6 @@
 """What is known of the constant errors of a robot's wheels and sensor (:mod:`graphslam.core.lasting`).
 
-Rows ``R g - d`` of unit variance over ``g = [wheels, sensor]``: what is known of them beforehand, and what each
+Rows ``R g - d`` of unit variance over ``g = [wheels, sensor, mount]``: what is known of them beforehand, and what each
 submap's own motion and sightings say, exit and landmarks left free. How they move a submap stands in the submap's own
 factor.
 """
@@ -16,8 +16,20 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.lasting import CONSTANTS
 from graphslam.graph.factors.batch import Index, UniformBatch
+from graphslam.graph.factors.landmark_submap import CONSTANT
+from graphslam.graph.variables import Values
 
 SIZE = len(CONSTANTS)
+
+
+def errors_at(values: Values, robot: int) -> Array:
+    """Constant errors ``(6,)`` of a robot, in the order of :data:`~graphslam.core.lasting.CONSTANTS`."""
+    return np.concatenate([values[w][robot] for w in CONSTANT])
+
+
+def names_of(robot: int) -> list[str]:
+    """Names of the variables that hold them."""
+    return [f"{w}{robot}" for w in CONSTANT]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +39,8 @@ class LastingRecord:
     Parameters
     ----------
     robot : int
-        Row of its wheels and of its sensor.
-    root, told : (4, 4), (4,)
+        Row of its variables.
+    root, told : (6, 6), (6,)
         ``R`` and ``d``; rows of zeros say nothing.
     what : str
         Whose word it is, for messages.
@@ -48,7 +60,7 @@ class LastingRecord:
 
     def variables(self) -> list[str]:
         """Names of the variables."""
-        return [f"wheels{self.robot}", f"sensor{self.robot}"]
+        return names_of(self.robot)
 
     def label(self) -> str:
         """Name for messages."""
@@ -59,7 +71,7 @@ class LastingBatch(UniformBatch):
     """Words on constant errors."""
 
     record = LastingRecord
-    slots = ("wheels", "sensor")
+    slots = CONSTANT
     prior = True
 
     def __init__(self, records: Sequence[LastingRecord], layout: object) -> None:
@@ -74,8 +86,8 @@ class LastingBatch(UniformBatch):
 
     @staticmethod
     def keys(record: LastingRecord) -> Sequence[int | None]:
-        """The robot's wheels and its sensor."""
-        return record.robot, record.robot
+        """The robot's wheels, its sensor, and where that stands."""
+        return (record.robot,) * len(CONSTANT)
 
     @staticmethod
     def whitener(record: LastingRecord) -> Array:
