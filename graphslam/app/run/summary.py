@@ -59,6 +59,7 @@ ADVICE: dict[str, str] = {
     "scan-encoder": "take the offset off the angles of the encoder",
     "calibration-contradiction": "run `graphslam data check` to find the stream that is wrong",
     "calibration": "correct the error of calibration that is named below",
+    "lasting": "check unit, sign and mounting of the sensor whose error is named below",
     # then what the run did with it
     "sightings-not-used": "check units, signs and identities of the sightings",
     "*-not-used": "mend why a stream was not used",
