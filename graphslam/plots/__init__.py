@@ -19,6 +19,7 @@ _FACE = {
     "reports": "plot_report plot_submap_chi2",
     "scans": "plot_scan",
     "segment_exits": "plot_exit_nees plot_segment_exit",
+    "segmap": "plot_expansion plot_score_map plot_segmap",
     "segments": "plot_entropies plot_samples plot_scores plot_segments sample_paths",
     "segslam_study": "plot_by_particles",
     "solid": "plot_cloud plot_solid",
@@ -27,7 +28,7 @@ _FACE = {
     "style": "NAMES use_palette",
     "submaps": "plot_submap_chain",
     "surface": "plot_surface",
-    "terrain": "plot_terrain",
+    "terrain": "plot_bands plot_terrain",
     "trajectory": "plot_gps_residuals",
     "without_truth": "plot_innovations plot_loop_matrix",
 }

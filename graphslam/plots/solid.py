@@ -81,8 +81,6 @@ def plot_solid(
     ------
     DataError
         Nothing of the world is below the cut.
-    GraphSlamError
-        Open3D, which casts the rays, is not there.
     """
     view = View() if view is None else view
     ax = style.new_axes(ax, (8.0, 5.0))
@@ -118,9 +116,14 @@ def plot_cloud(
     *,
     view: View | None = None,
     size: float = 1.5,
+    path: npt.ArrayLike | None = None,
+    colours: npt.ArrayLike | None = None,
     title: str | None = None,
 ) -> Axes:
-    """Points ``(n, 3)``, coloured by height; upon :func:`plot_solid` of the same view they lie where they were hit.
+    """Points, coloured by height; upon :func:`plot_solid` of the same view they lie where they were hit.
+
+    With a path: the cloud it makes, as of raw and of calibrated dead reckoning (SegSLAM Fig. 15). With colours of their
+    terrain: what a scan means to a vehicle (urban mapping Fig. 2).
 
     Parameters
     ----------
@@ -130,22 +133,36 @@ def plot_cloud(
     view : View, optional
     size : float
         Of a point.
+    path : (m, 3), optional
+        Drawn over the points, whatever hides it [m].
+    colours : (n, 4), optional
+        Of the points, 0 to 1, instead of those of their heights.
 
     Raises
     ------
     DataError
-        No points, or not finite ones.
+        No points, or not finite ones; colours of another number.
     """
     p = np.asarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 3 or not len(p) or not np.all(np.isfinite(p)):
         raise DataError("no cloud to draw", got=p.shape, wanted="(n ≥ 1, 3), finite")
+    own = None if colours is None else np.asarray(colours, dtype=np.float64)
+    if own is not None and own.shape != (len(p), 4):
+        raise DataError("colours do not belong to the points", got=own.shape, wanted=f"({len(p)}, 4)")
     view = View() if view is None else view
     ax = style.new_axes(ax, (8.0, 5.0))
     order = np.argsort(p @ view.axes[2])  # the nearest last, on top
     xy = view.project(p[order])
-    dots = ax.scatter(xy[:, 0], xy[:, 1], c=p[order, 2], s=size, cmap="viridis", lw=0, zorder=5)
-    if ax.figure is not None:
-        ax.figure.colorbar(dots, ax=ax, label="height [m]", shrink=0.7, pad=0.01)
+    if own is not None:
+        ax.scatter(xy[:, 0], xy[:, 1], c=own[order], s=size, lw=0, zorder=5)
+    else:
+        dots = ax.scatter(xy[:, 0], xy[:, 1], c=p[order, 2], s=size, cmap="viridis", lw=0, zorder=5)
+        if ax.figure is not None:
+            ax.figure.colorbar(dots, ax=ax, label="height [m]", shrink=0.7, pad=0.01)
+    if path is not None:
+        way = view.project(np.asarray(path, dtype=np.float64))
+        ax.plot(way[:, 0], way[:, 1], color=style.VERMILION, lw=1.2, label="path", zorder=6)
+        style.legend(ax, outside=False, loc="best")
     _bare(ax, title)
     return ax
 

@@ -45,6 +45,18 @@ NAMES = {
 }
 
 
+TERRAIN = {
+    "unknown": "#FFFFFF",
+    "free": "#8FD19E",
+    "above_reach": "#5DA9D6",
+    "step": "#F0A202",
+    "steep": "#B07AA1",
+    "obstacle": "#C8102E",
+    "hole": "#202020",
+}
+"""Of the classes of terrain: what can be driven is green and blue, what cannot is warm or black."""
+
+
 def ellipses(of: str, confidence: float = 0.95) -> str:
     """Name of the ellipses of something, for legends: ``95 % ellipses of the path``."""
     return f"{100 * confidence:.3g} % ellipses of {'the ' if of == 'path' else ''}{of}"

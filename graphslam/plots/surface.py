@@ -36,8 +36,11 @@ def plot_surface(
     title: str = "",
     slant: float = 40.0,
     width: int = 1400,
+    edges: bool = False,
 ) -> Axes:
     """Draw triangles in parallel projection from the south, the nearest in front; back sides are left out.
+
+    The model and, with `edges`, its edges alone are the two halves of urban mapping's Fig. 5.
 
     Parameters
     ----------
@@ -52,6 +55,8 @@ def plot_surface(
         Of the view below the vertical [deg]: 0 is from above.
     width : int
         Of the picture [pixels] at most; a pixel is never smaller than a triangle.
+    edges : bool
+        Only lines, where the surface folds or ends, on white; of the values nothing is shown.
     """
     ax = style.new_axes(ax)
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
@@ -81,13 +86,19 @@ def plot_surface(
     facing = np.zeros(picture.shape)
     picture[iy[top], ix[top]] = colour * shade[:, None]
     facing[iy[top], ix[top]] = normal[front][top]
-    for axis in (0, 1):  # edges
+    there = np.any(facing != 0, axis=2)
+    folds = np.zeros(there.shape, bool)
+    for axis in (0, 1):
         turned = np.sum(facing * np.roll(facing, 1, axis=axis), axis=2)
-        both = np.any(facing != 0, axis=2) & np.any(np.roll(facing, 1, axis=axis) != 0, axis=2)
+        both = there & np.roll(there, 1, axis=axis)
         picture[both & (turned < _EDGE)] *= 0.55
+        folds |= (both & (turned < _EDGE)) | (there != np.roll(there, 1, axis=axis))
+    if edges:
+        picture = np.where(folds[..., None], 0.0, 1.0) * np.ones(3)
     extent = (float(u.min()), float(u.min() + pixel * picture.shape[1]), 0.0, float(pixel * picture.shape[0]))
     ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
-    ax.figure.colorbar(matplotlib.cm.ScalarMappable(norm, palette), ax=ax, label=label, shrink=0.7)
+    if not edges:
+        ax.figure.colorbar(matplotlib.cm.ScalarMappable(norm, palette), ax=ax, label=label, shrink=0.7)
     ax.set_xlabel("x [m]")
     ax.grid(False)
     ax.set_yticks([])

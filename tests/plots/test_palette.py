@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
 from pathlib import Path
 
@@ -25,6 +26,7 @@ VISION = {
 XYZ = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
+HEX = re.compile(r"[\"']#[0-9A-Fa-f]{3,8}[\"']")
 LEAST = 12.0
 """Distance in CIELAB; 2.3 is just noticed side by side, and a line of a map stands alone."""
 
@@ -48,6 +50,7 @@ def closest(colours: list[str], vision: str) -> float:
 def test_colours_that_mean_something_are_told_apart(vision: str) -> None:
     assert closest(sorted(set(style.NAMES.values())), vision) > LEAST
     assert closest(list(style.CYCLE), vision) > LEAST
+    assert closest(list(style.TERRAIN.values()), vision) > LEAST
 
 
 def test_red_and_green_would_not_pass() -> None:
@@ -64,6 +67,6 @@ def test_white_and_black_are_where_they_belong() -> None:
 def test_colours_stand_in_one_file() -> None:
     """No figure has a colour of its own but the white of edges, and black and shades of grey of a canvas."""
     plots = Path(style.__file__).parent
-    own = [f.name for f in sorted(plots.glob("*.py")) if f.name != "style.py" and '="#' in f.read_text()]
+    own = [f.name for f in sorted(plots.glob("*.py")) if f.name != "style.py" and HEX.search(f.read_text())]
     assert own == []
     assert "#" not in Path(scene.__file__).read_text().replace("# ", "")

@@ -1,4 +1,4 @@
-"""Worlds seen from a corner of the sky: what is drawn is what rays meet, and the way where it is seen."""
+"""Worlds, clouds, surfaces and terrain: what is drawn is what is there, and the way where it is seen."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError
+from graphslam.maps.terrain.pyramid import TerrainMap
 from graphslam.plots.solid import View, plot_cloud, plot_solid
+from graphslam.plots.surface import plot_surface
+from graphslam.plots.terrain import plot_bands
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.world import World
 
@@ -84,7 +87,52 @@ def test_clouds_are_drawn_far_to_near_and_refused_if_broken() -> None:
     order = np.argsort(p @ view.axes[2])
     np.testing.assert_allclose(dots.get_offsets(), view.project(p)[order])
     np.testing.assert_allclose(dots.get_array(), p[order, 2])
+    way = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    own = rng.uniform(size=(50, 4))
+    both = plot_cloud(p, view=view, path=way, colours=own)
+    np.testing.assert_allclose(both.collections[0].get_facecolors(), own[order])
+    np.testing.assert_allclose(both.lines[-1].get_xydata(), view.project(way))
+    with pytest.raises(DataError, match="colours"):
+        plot_cloud(p, colours=own[:9])
     for bad in (np.zeros((0, 3)), np.zeros((3, 2)), np.full((2, 3), np.nan)):
         with pytest.raises(DataError, match="no cloud"):
             plot_cloud(bad)
+    plt.close("all")
+
+
+def test_edges_of_a_surface_are_its_folds_and_its_rim() -> None:
+    """A flat square with a flat roof 2 m above its middle: lines there, none inside the flats, and no scale."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 8.01, 0.1), np.arange(0.0, 8.01, 0.1), indexing="ij"))
+    n = 81
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    z = np.where((np.abs(x - 4.0) < 2.0) & (np.abs(y - 4.0) < 2.0), 2.0, 0.0)
+    ax = plot_surface(np.column_stack([x, y, z]), triangles, z, edges=True, slant=0.0)
+    image, at = picture(ax)
+    black = image[..., 0] < 0.5
+    at = at - at[0, 0]
+    off = np.maximum(np.abs(at[..., 0] - 4.0), np.abs(at[..., 1] - 4.0))  # distance from the middle, by squares
+    assert black[(off > 1.7) & (off < 2.2)].mean() > 0.2
+    assert not black[off < 1.5].any()
+    assert not black[(off > 2.4) & (off < 3.6)].any()
+    assert len(ax.figure.axes) == 1  # no scale of a value that is not shown
+    assert len(plot_surface(np.column_stack([x, y, z]), triangles, z).figure.axes) == 2
+    plt.close("all")
+
+
+def test_bands_of_a_pyramid_are_named_with_their_share() -> None:
+    band = np.full((4, 5), -1, np.int8)
+    band[:2, :3], band[2:, 3:] = 0, 1
+    known = np.where(band >= 0, 0.1, np.nan)
+    zero = np.zeros((4, 5))
+    found = TerrainMap(np.array([-1.0, 2.0]), 0.5, known, np.zeros((4, 5), np.int8), zero, zero, band, zero > 0)
+    ax = plot_bands(found, (0.5, 1.0), place=(0.0, 3.0))
+    said = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert said == ["cells of 0.5 m (30%)", "cells of 1 m (20%)", "vehicle"]
+    shown = ax.get_images()[0].get_array()
+    np.testing.assert_array_equal(np.ma.filled(shown, -1), band)
+    assert tuple(ax.get_images()[0].get_extent()) == (-1.0, 1.5, 2.0, 4.0)
+    with pytest.raises(DataError, match="without a width"):
+        plot_bands(found, (0.5,))
     plt.close("all")

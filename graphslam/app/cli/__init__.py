@@ -1,6 +1,6 @@
 """The command line: verbs, exit codes, and the one place where errors become a line of text.
 
-Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage.
+Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted, and one line how to go on.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ import errno
 import os
 import shlex
 import sys
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 import graphslam
 
@@ -29,8 +31,24 @@ from graphslam.app.cli import tools as cli_tools
 from graphslam.app.cli.terminal import log_to_stderr
 from graphslam.core.errors import GraphSlamError
 
+
+class Interrupted(Exception):
+    """Ctrl-C, under a name that Typer does not know: it would leave without a word."""
+
+
+class Verbs(TyperGroup):
+    """The verbs; Ctrl-C in one of them reaches :func:`main`."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise Interrupted from None
+
+
 app = typer.Typer(
     name="graphslam",
+    cls=Verbs,
     help="Globally consistent maps with an uncertainty you can trust.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -70,15 +88,16 @@ def main() -> None:
     except BrokenPipeError:  # `graphslam … | head`
         sys.stderr.close()
         sys.exit(1)
-    except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
+    except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt, Interrupted) as error:
+        _end_bars()
         typer.echo(f"graphslam: {one_line(error)}", err=True)
         _drop_output()
-        sys.exit(1)
+        sys.exit(130 if isinstance(error, (KeyboardInterrupt, Interrupted)) else 1)
 
 
 def one_line(error: BaseException) -> str:
     """What a user reads of an error: ours as they are, those of the machine with what can be done."""
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, (KeyboardInterrupt, Interrupted)):
         return f"interrupted; {_go_on(sys.argv[1:])}"
     if isinstance(error, MemoryError):  # NumPy says how much was asked for
         return f"not enough memory; use a smaller part of the data, or another machine. {error}".strip()
@@ -101,6 +120,13 @@ def _go_on(arguments: list[str]) -> str:
     if verb in ("demo", "study"):
         return f"what is finished is kept; go on with: {command}"
     return "files that were there before are as they were"
+
+
+def _end_bars() -> None:
+    """Leave no bar of progress on the line that is written next."""
+    if "tqdm" in sys.modules:
+        for bar in list(getattr(sys.modules["tqdm"].tqdm, "_instances", ())):
+            bar.close()
 
 
 def _drop_output() -> None:

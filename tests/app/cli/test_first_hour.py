@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import ClassVar
 
@@ -73,6 +76,31 @@ def test_shells_complete_verbs() -> None:
 def test_ctrl_c_says_how_to_go_on(typed: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["graphslam", *typed.split()])
     assert one_line(KeyboardInterrupt()).endswith(said)
+
+
+def test_ctrl_c_in_a_run_is_one_line_that_says_how_to_go_on(tmp_path: Path) -> None:
+    """The real program, a real signal, after the first submap; and what it says to type goes on to the end."""
+    log, out = tmp_path / "log", tmp_path / "run"
+    CliRunner().invoke(app, ["simulate", "landmark-field", "--preset", "demo", "--out", str(log)])
+    typed = ["run", str(log), "--set", "frontend.particles=150", "--out", str(out)]
+    command = [sys.executable, "-m", "graphslam.app.cli"]
+
+    def hear() -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+
+    with subprocess.Popen([*command, *typed], stderr=subprocess.PIPE, text=True, preexec_fn=hear) as run:
+        until = time.monotonic() + 240.0
+        while not any((out / "submaps").glob("*")) and run.poll() is None and time.monotonic() < until:
+            time.sleep(0.01)
+        run.send_signal(signal.SIGINT)
+        said = run.communicate()[1]
+    assert run.returncode == 130, said
+    last = said.splitlines()[-1]
+    assert last.startswith("graphslam: interrupted; finished submaps are kept; go on with:")
+    assert last.endswith(f"{' '.join(typed[2:])} --resume")
+    assert "Traceback" not in said
+    more = subprocess.run([*command, *typed, "--resume", "--json"], capture_output=True, text=True, check=True)
+    assert json.loads(more.stdout)
 
 
 def test_a_run_prints_the_figures_that_are_asked_for_first(run: Run, tmp_path: Path) -> None:
