@@ -37,7 +37,7 @@ _LISTS = dict.fromkeys(("front_ends", "solvers", "joiners", "worlds"), "graphsla
 _TYPES = {
     "SensorLog": "graphslam.core.log",
     **dict.fromkeys(("LaserScans", "LandmarkObservations", "Odometry", "Gps"), "graphslam.core.records"),
-    **dict.fromkeys(("SteeringControls", "VelocityControls"), "graphslam.core.records"),
+    **dict.fromkeys(("PointObservations", "SteeringControls", "VelocityControls"), "graphslam.core.records"),
     "RangeScans": "graphslam.core.range_scans",
     "PointClouds": "graphslam.core.point_clouds",
     "Imu": "graphslam.core.imu",

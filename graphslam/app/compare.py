@@ -85,15 +85,17 @@ def _errors(
             )
         d = group_of(have).dof
         return pose_error(estimate.poses[rows], have).ravel(), (d * (rows[:, None] - 1) + np.arange(d)).ravel()
-    if truth.exit_poses.shape[1] != 3:
-        raise DataError("truth is not two-dimensional", got=truth.exit_poses.shape, wanted="(m, 3)")
+    g = group_of(estimate.poses)
+    if truth.exit_poses.shape[1] != g.size:
+        raise DataError("truth is of another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
     m = len(estimate.poses) - 1
     i, j = match_ids(np.asarray(keys), truth.keys)
     poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # what has no truth has no error
     poses[i] = truth.exit_poses[j]
     a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
     landmarks[a] = truth.landmarks[b]
-    at = np.concatenate([(3 * i[:, None] + np.arange(3)).ravel(), (3 * m + 2 * a[:, None] + np.arange(2)).ravel()])
+    d, n = g.dof, g.dim
+    at = np.concatenate([(d * i[:, None] + np.arange(d)).ravel(), (d * m + n * a[:, None] + np.arange(n)).ravel()])
     return estimate.difference(poses, landmarks, chart=chart)[at], at
 
 
@@ -207,7 +209,8 @@ def dof_of(submaps: Material, estimate: SubmapEstimate) -> int:
     """Scalars that submaps and their ties measure, less the free ones."""
     if not isinstance(submaps, Sequence):
         return submaps.dof
-    return sum(3 + 2 * (0 if s.landmarks is None else len(s.landmarks)) for s in submaps) - estimate.states
+    g = group_of(estimate.poses)
+    return sum(g.dof + g.dim * (0 if s.landmarks is None else len(s.landmarks)) for s in submaps) - estimate.states
 
 
 def _describe(method: str, submaps: Material, estimate: SubmapEstimate) -> dict[str, Any]:

@@ -29,8 +29,17 @@ def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> S
     return simulate_landmark_field(landmark_field_preset(preset or "A", **changes), seed)
 
 
+def _point_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
+    from graphslam.sim.point_field import point_field_preset, simulate_point_field
+
+    return simulate_point_field(point_field_preset(preset or "flight", **changes), seed)
+
+
 # name -> what simulates it from a preset, a seed and changed figures
-WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {"landmark-field": _landmark_field}
+WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {
+    "landmark-field": _landmark_field,
+    "point-field": _point_field,
+}
 
 
 def simulate(
@@ -48,13 +57,14 @@ def simulate(
     Parameters
     ----------
     world : str
-        ``landmark-field``, ``garage``, ``mine``, ``building``; ``court``, the small one; ``campus``.
+        ``landmark-field``; ``point-field``, landmarks in space; ``garage``, ``mine``, ``building``; ``court``, the
+        small one; ``campus``.
     seed : int
         Of every error, and of what can be moved in the world.
     preset : str, optional
         Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard``
-        confuse an association. Of the campus: ``full``, ``three-blocks``, ``block``, ``quick``. Of the robot in the
-        other worlds: ``light``, ``full``, ``two-scanners``.
+        confuse an association. Of the point field: ``flight``, ``drift``, ``quick``. Of the campus: ``full``,
+        ``three-blocks``, ``block``, ``quick``. Of the robot in the other worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
         Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
     world_seed : int, optional

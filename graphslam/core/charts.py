@@ -17,6 +17,11 @@ and covariance of a map stay what they are, and the chart is one scaled rotation
     V(d)⁻¹ = a I - b S,        a = (d/2) cot(d/2),  b = d/2.
 
 In a joined map a point hangs on its *anchor*, the end pose of the submap that saw it first.
+
+In space the same holds in SE₁₊ₙ(3). The error of the rotation is ``w = Log(R R̂ᵀ)``, about the axes of the base frame;
+``Exp(w) = I + [w]× V(w)``, so with the Cartesian information matrix over ``(w, t, l…)`` the weighted square of the
+residual is that of ``(w, V(w)⁻¹ (t - t̂), V(w)⁻¹ (l - l̂))``. For a pose alone that is its right tangent, exactly:
+``Log(T T̂⁻¹) = Ad(T̂) Log(T̂⁻¹ T)``.
 """
 
 from __future__ import annotations
@@ -27,10 +32,14 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
+from graphslam.core.se3 import quat_multiply, skew, so3_left_jacobian_inverse, so3_log
 
 Chart = Literal["cartesian", "group"]
 CHARTS: tuple[str, ...] = get_args(Chart)
 
+_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+_SMALL_TURN = 0.1
+"""Below this angle [rad] the series of :func:`arc_slopes` are as exact as the closed forms."""
 _SMALL = 1e-3
 """Below this half angle [rad] series are exact to rounding, and differences of cotangents are not."""
 
@@ -65,9 +74,56 @@ def along_arc(difference: Array, d: ArrayLike) -> Array:
     return np.stack([a * x + b * y, a * y - b * x], -1)
 
 
-def map_difference(x: ArrayLike, mean: ArrayLike, chart: str) -> Array:
+def arc_matrices(w: Array) -> Array:
+    """``V(w)⁻¹`` ``(..., 3, 3)`` for rotation vectors ``(..., 3)``."""
+    return so3_left_jacobian_inverse(w)
+
+
+def arc_slopes(w: Array, e: Array) -> Array:
+    """Derivatives ``(..., 3, 3)`` of ``V(w)⁻¹ e`` by w, for rotation vectors and differences ``(..., 3)``.
+
+    ``V(w)⁻¹ = I - ½ W + c W²`` with ``W = [w]×`` and ``c = (1 - (φ/2) cot(φ/2)) / φ²``.
+    """
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = angle < _SMALL_TURN
+    safe = np.where(small, 1.0, angle)
+    half = 0.5 * safe
+    cot = 1.0 / np.tan(half)
+    rest = 1.0 - half * cot
+    slope = -0.5 * (cot - half / np.sin(half) ** 2)  # of `rest` by the angle
+    t2 = angle**2
+    c = np.where(small, 1.0 / 12.0 + t2 / 720.0 + t2**2 / 30240.0, rest / safe**2)
+    by_angle = np.where(
+        small, 1.0 / 360.0 + t2 / 7560.0 + t2**2 / 201600.0, slope / safe**3 - 2.0 * rest / safe**4
+    )  # dc/dφ over φ
+    W, E = skew(w), skew(e)
+    We = (W @ e[..., None])[..., 0]
+    along = (W @ We[..., None]) * w[..., None, :]
+    return np.asarray(0.5 * E - c * (skew(We) + W @ E) + by_angle * along)
+
+
+def pose_differences(poses: Array, means: Array, chart: str) -> tuple[Array, Array]:
+    """What poses in space differ from means by ``(m, 6)``: turn about the axes of the base, then shift; and the turns.
+
+    Parameters
+    ----------
+    poses, means : (m, 7)
+    chart : "cartesian" or "group"
+    """
+    w = so3_log(quat_multiply(poses[:, 3:], means[:, 3:] * _CONJUGATE))
+    e = poses[:, :3] - means[:, :3]
+    return np.hstack([w, bent(e, w, chart)]), w
+
+
+def bent(e: Array, w: Array, chart: str) -> Array:
+    """Differences ``(n, 3)`` of points that hang on poses turned by ``w`` ``(n, 3)``, in a chart."""
+    return np.einsum("kij,kj->ki", arc_matrices(w), e) if chart == "group" else e
+
+
+def map_difference(x: ArrayLike, mean: ArrayLike, chart: str, *, space: bool = False) -> Array:
     """What a vector ``[x, y, θ, l1x, l1y, …]`` differs from a mean by, in the coordinates of a chart ``(n,)``.
 
+    In space the vector is ``[pose (7), l1x, l1y, l1z, …]``, and the difference has the pose's turn and shift (6) first.
     ``rᵀ P⁻¹ r`` with the covariance P of the Cartesian vector is the squared distance in that chart.
 
     Parameters
@@ -75,8 +131,14 @@ def map_difference(x: ArrayLike, mean: ArrayLike, chart: str) -> Array:
     x, mean : (n,)
         In the base frame.
     chart : "cartesian" or "group"
+    space : bool
     """
-    r = np.asarray(x, dtype=np.float64) - np.asarray(mean, dtype=np.float64)
+    x, mean = np.asarray(x, dtype=np.float64), np.asarray(mean, dtype=np.float64)
+    if space:
+        first, w = pose_differences(x[None, :7], mean[None, :7], chart)
+        e = (x[7:] - mean[7:]).reshape(-1, 3)
+        return np.concatenate([first[0], bent(e, np.broadcast_to(w, e.shape), chart).ravel()])
+    r = x - mean
     r[2] = wrap_angle(r[2])
     if chart == "group":
         points = along_arc(np.concatenate([r[:2], r[3:]]).reshape(-1, 2), r[2])

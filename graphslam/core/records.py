@@ -18,6 +18,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.reading import usable
 
 IDENTITY2 = np.zeros(3)
+IDENTITY3 = np.array([0.0, 0, 0, 0, 0, 0, 1])
 
 
 @runtime_checkable
@@ -499,4 +500,88 @@ class LandmarkObservations:
             bearings=self.bearings[r],
             sigmas=self.sigmas[r],
             ids=None if self.ids is None else self.ids[r],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointObservations:
+    """Identified points in space that a sensor saw, several per scan (ragged): of a stereo or depth camera, say.
+
+    Parameters
+    ----------
+    times : (n,)
+        Scan stamps; a scan may be empty.
+    offsets : (n + 1,) int64
+        Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
+    points : (q, 3)
+        In the sensor frame [m].
+    covariances : (q, 3, 3)
+    ids : (q,) int64
+        Identity of each, not negative; once in a scan.
+    T_base_sensor : (7,)
+
+    Examples
+    --------
+    >>> seen = gs.PointObservations(
+    ...     times=np.array([0.0, 0.2]), offsets=np.array([0, 2, 3]), points=np.ones((3, 3)),
+    ...     covariances=np.tile(0.01 * np.eye(3), (3, 1, 1)), ids=np.array([4, 7, 4]),
+    ... )
+    >>> seen.take(slice(1, 2)).ids
+    array([4])
+    """
+
+    times: Array
+    offsets: npt.NDArray[np.int64]
+    points: Array
+    covariances: Array
+    ids: npt.NDArray[np.int64]
+    T_base_sensor: Array = field(default_factory=lambda: IDENTITY3.copy())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
+        q = len(self.points)
+        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
+            raise DataError(
+                "offsets do not partition the observations", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
+            )
+        object.__setattr__(self, "offsets", offsets)
+        object.__setattr__(self, "points", _finite(_array(self.points, (q, 3), "points"), "points"))
+        covariances = _finite(_array(self.covariances, (q, 3, 3), "covariances"), "covariances")
+        if q:
+            low = np.linalg.eigvalsh(covariances)[:, 0]
+            asymmetric = np.abs(covariances - covariances.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-6 * np.abs(
+                covariances
+            ).max(axis=(1, 2))
+            if np.any((low <= 0.0) | asymmetric):
+                k = int(np.flatnonzero((low <= 0.0) | asymmetric)[0])
+                raise DataError(
+                    f"covariance of observation {k} is not symmetric and positive definite", got=covariances[k].tolist()
+                )
+        object.__setattr__(self, "covariances", covariances)
+        ids = np.ascontiguousarray(self.ids, dtype=np.int64)
+        if ids.shape != (q,) or np.any(ids < 0):
+            raise DataError("ids of points are missing or negative", got=ids.shape, wanted=f"({q},), each ≥ 0")
+        scan = np.repeat(np.arange(len(self.times)), np.diff(offsets))
+        if len(np.unique(np.column_stack([scan, ids]), axis=0)) < q:
+            raise DataError("an id stands twice in one scan", wanted="each once")
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (7,), "T_base_sensor"))
+
+    def scan(self, k: int) -> slice:
+        """Rows of scan k."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def take(self, index: Any) -> PointObservations:
+        """See :class:`Stream`."""
+        keep = np.arange(len(self.times))[index]
+        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
+        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+        return replace(
+            self,
+            times=self.times[keep],
+            offsets=np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64),
+            points=self.points[r],
+            covariances=self.covariances[r],
+            ids=self.ids[r],
         )

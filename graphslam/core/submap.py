@@ -23,7 +23,18 @@ from graphslam.core.lasting import LastingErrors
 from graphslam.core.markup import element, join, pairs
 from graphslam.core.path_points import PathPoints
 from graphslam.core.reading import usable
+from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.trajectory import Trajectory
+
+
+def turned_covariance(R: Array, covariance: Array) -> Array:
+    """Covariance ``(6, 6)`` of the turn and the shift of a pose, about axes that are turned by ``R`` ``(3, 3)``.
+
+    With ``R = R(exit)ᵀ`` the block of a landmark map in space becomes the right tangent at the exit, with ``R(exit)``
+    it goes back.
+    """
+    both = np.kron(np.eye(2), R)
+    return np.asarray(both @ covariance @ both.T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +44,8 @@ class LandmarkMap:
     In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame. ``chart`` names what it is Gaussian in:
     these coordinates themselves (the residual of Combined SLAM eq. 15 with the heading wrapped), or those of the exit's
     own group, in which an error of the heading turns exit and landmarks together (:mod:`graphslam.core.charts`). Mean
-    and covariance are the same in both. In 3-D the pose block is the right tangent at the exit.
+    and covariance are the same in both. In 3-D the pose block is a turn about the axes of the base frame [rad], then a
+    shift along them [m].
 
     Parameters
     ----------
@@ -119,7 +131,7 @@ class LandmarkMap:
 
     @property
     def mean(self) -> Array:
-        """``[exit pose, landmarks…]`` as one vector (2-D only)."""
+        """``[exit pose, landmarks…]`` as one vector; in 3-D the pose is its seven numbers."""
         return np.concatenate([self.exit_pose, self.positions.ravel()])
 
     def dense_covariance(self) -> Array:
@@ -177,8 +189,8 @@ class LandmarkMap:
         )  # fmt: skip
 
     def difference(self, x: Array) -> Array:
-        """What ``x`` ``(n,)``, laid out as :attr:`mean`, differs from the mean by in this map's chart (2-D only)."""
-        return map_difference(x, self.mean, self.chart)
+        """What ``x``, laid out as :attr:`mean`, differs from the mean by in this map's chart ``(n,)``."""
+        return map_difference(x, self.mean, self.chart, space=self.dim == 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -286,6 +298,8 @@ class Submap:
         exit_cov = P[:d, :d]
         if landmarks.dim == 2:
             exit_cov = vector_to_tangent_covariance(landmarks.exit_pose, exit_cov)
+        else:
+            exit_cov = turned_covariance(quat_to_matrix(landmarks.exit_pose[3:]).T, exit_cov)
         return cls(
             key=key,
             interval=interval or (float(key), float(key + 1)),

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core import se3
+from graphslam.core.charts import map_difference
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_between, se2_inverse, se2_transform
 from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
-from graphslam.evaluate.consistency import Consistency, joint_nees, nees, pose_error, vector_pose_error
+from graphslam.evaluate.consistency import Consistency, joint_nees, nees, pose_error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +77,8 @@ def true_submap(submap: Submap, truth: Truth) -> tuple[Array, np.ndarray, Array]
 def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
     """NEES of exit, landmarks and both together.
 
-    A landmark submap is judged in its own chart, and as the vector of Combined SLAM eq. 15 beside it (2-D), or with the
-    tangent at the exit (3-D); a submap without landmarks by its exit alone. Landmarks by themselves are judged plainly.
+    A landmark submap is judged in its own chart, and beside it as a plain vector, that of Combined SLAM eq. 15 in the
+    plane; a submap without landmarks by its exit alone. Landmarks by themselves are judged plainly.
     """
     exit_true, known, landmarks_true = true_submap(submap, truth)
     d = 3 if submap.dim == 2 else 6
@@ -96,12 +97,10 @@ def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
         )
     m = submap.landmarks.subset(known)
     P = m.dense_covariance()
-    error = vector_pose_error if submap.dim == 2 else pose_error
-    e_exit = error(m.exit_pose, exit_true)
+    true = np.concatenate([exit_true, landmarks_true.ravel()])
+    e, e_plain = m.difference(true), map_difference(true, m.mean, "cartesian", space=submap.dim == 3)
     e_landmarks = landmarks_true - m.positions
     k = d + submap.dim * np.arange(len(m))[:, None] + np.arange(submap.dim)
-    e_plain = np.concatenate([e_exit, e_landmarks.ravel()])
-    e = e_plain if submap.dim == 3 else m.difference(np.concatenate([exit_true, landmarks_true.ravel()]))
     blocks = P[k[:, :, None], k[:, None, :]]
     return SubmapNees(
         key=submap.key,

@@ -134,7 +134,10 @@ class PoseGraph(GraphRecord):
         if submap.landmarks is None:
             return self._add_dense(submap, covariance_scale, spacing, level_sigma)
         if self.dim != 2:
-            raise GeometryError(f"submap {submap.key} has landmarks in space", wanted="landmark submaps in the plane")
+            raise GeometryError(
+                f"submap {submap.key} has landmarks in space, and a graph holds landmarks in the plane",
+                wanted="submaps joined by graphslam.join_submaps or compared by graphslam.compare",
+            )
         return self._add_landmarks(submap, landmark_ids, covariance_scale)
 
     def _add_landmarks(self, submap: Submap, landmark_ids: npt.ArrayLike | None, covariance_scale: float) -> int:

@@ -70,17 +70,26 @@ class Methods(NamedTuple):
 
 
 def is_dense(submaps: Sequence[Submap]) -> bool:
-    """Whether submaps are to be joined by their poses: those in space, and those of which none has landmarks."""
-    return bool(submaps) and (any(s.dim == 3 for s in submaps) or all(s.landmarks is None for s in submaps))
+    """Whether submaps are to be joined by their poses: none of them has landmarks."""
+    return bool(submaps) and all(s.landmarks is None for s in submaps)
+
+
+def in_space(submaps: Sequence[Submap]) -> bool:
+    """Whether submaps with landmarks are three-dimensional."""
+    return any(s.dim == 3 for s in submaps)
 
 
 def methods_for(material: Material) -> Methods:
-    """The methods that take landmark submaps, or those that take dense ones."""
+    """The methods that take landmark submaps, in the plane or in space, or those that take dense ones."""
     if not isinstance(material, Sequence):
         from graphslam.join.pose_estimate import polish_poses
         from graphslam.join.pose_join import POSE_JOINERS, POSE_SOLVERS
 
         return Methods(POSE_JOINERS, POSE_SOLVERS, polish_poses)
+    if in_space(material):
+        from graphslam.join.space import SPACE_JOINERS, SPACE_SOLVERS, polish_space
+
+        return Methods(SPACE_JOINERS, SPACE_SOLVERS, polish_space)
     return Methods(JOINERS, SOLVERS, polish_join)
 
 
@@ -93,6 +102,8 @@ def prepared(submaps: Material, *, associate: str | Association = "given", covar
     """
     association = association_of(associate)
     if isinstance(submaps, Sequence) and not is_dense(submaps):
+        if association is not None and in_space(submaps):
+            raise ConfigError(f"landmarks in space are joined by the ids that they bear; got {associate!r}")
         return list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
     if association is not None:
         raise ConfigError(f"dense submaps have no landmarks to be associated; got {associate!r}, wanted 'given'")
@@ -167,9 +178,11 @@ def join(
     if workers is not None and cluster is not None:
         raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
     association = association_of(associate)
-    if not isinstance(submaps, Sequence):
+    if not isinstance(submaps, Sequence) or in_space(submaps):
         if workers is not None or cluster is not None:
-            raise ConfigError("dense submaps are joined in one process; wanted neither workers nor a cluster")
+            raise ConfigError(
+                "dense submaps and those in space are joined in one process; wanted neither workers nor a cluster"
+            )
         if method in methods.solvers:
             return methods.solvers[method](submaps, polish=polish, progress=progress)
         found = methods.joiners[method](submaps, progress=progress)

@@ -11,7 +11,7 @@ import pytest
 from graphslam.app.compare import compare, default_methods
 from graphslam.app.join_verdict import compare_verdict
 from graphslam.app.submap_sources import submap_source
-from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError, UnknownNameError
+from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
@@ -209,7 +209,7 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
     )
     mixed = [replace(submaps[0], landmarks=marks), *submaps[1:]]
     refused = [
-        (lambda: join(mixed, "eif-tree"), GeometryError, "landmarks in space"),
+        (lambda: join(mixed, "eif-tree"), DataError, "not joined by matches"),
         (lambda: join(problem, "eif-online"), UnknownNameError, "eif-online"),
         (lambda: compare(problem, ["magic"], memory=False), UnknownNameError, "magic"),
         (lambda: join(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),

@@ -215,7 +215,7 @@ def demo(
 
 def simulate(
     world: str = typer.Argument(
-        ..., help="Name of the world: landmark-field, garage, mine, building, court or campus."
+        ..., help="Name of the world: landmark-field, point-field, garage, mine, building, court or campus."
     ),
     out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),

@@ -18,6 +18,7 @@ from graphslam.core.records import (
     LandmarkObservations,
     LaserScans,
     Odometry,
+    PointObservations,
     SteeringControls,
     VelocityControls,
 )
@@ -88,6 +89,8 @@ def _wanted(log: SensorLog) -> str:
         return "odometry beside the laser scans (wheels, or poses of the robot)"
     if LandmarkObservations in kinds:
         return "odometry or velocities beside the sightings"
+    if PointObservations in kinds:
+        return 'local maps by graphslam.local_maps(log, "points"), joined by graphslam.join_submaps'
     if Pseudoranges in kinds:
         return "scans or sightings of landmarks; pseudoranges alone are solved by `graphslam study smartloc`"
     if Gps in kinds and Imu in kinds:

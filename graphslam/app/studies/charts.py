@@ -3,20 +3,26 @@
 A robot drives at random (the slow one in rows, like a lawn mower) through features whose identities are known; every
 run draws its own route, features and noise. Odometry is white, and stated as it is. Worlds differ in how much the
 heading drifts within a submap of 35 m: ``base``, ``good`` and ``poor`` sensors, ``slow`` (0.6 m/s), ``drift`` (exit
-heading uncertain by about 2.5°) and ``strong-drift`` (7°).
+heading uncertain by about 2.5°) and ``strong-drift`` (7°). In ``space`` and ``space-drift`` (exit rotation uncertain by
+about 6°) a robot flies through points (:mod:`graphslam.sim.point_field`).
 
 Quantities
 ----------
 Of local map k (``local``): ``local_joint_nees``, ``local_joint_nees_plain``, ``local_joint_dof``. Of a joined map:
 ``nees`` and ``nees_plain`` of all poses and landmarks by degree of freedom, in the group chart and of the plain vector;
-``rms`` of the poses [m], ``objective_ratio``: objective of the joiner over that of the optimum of the same factors;
-``exit_sigma``: median σ of the exit headings [deg]. Algorithms: ``eif-tree``, ``eif-sequential``, both ``-classical``,
-``batch``, and ``batch-cartesian``: the optimum of the same maps, their residuals taken as plain vectors.
+``nees_ends`` of the ends of the submaps alone, in the group chart; ``rms`` of the poses [m]; ``objective_ratio``:
+objective of the joiner over that of the optimum of the same factors; ``exit_sigma``: median σ of the exit headings
+(in space of a component of the rotation) [deg]; ``failed``.
+
+Algorithms: ``eif-tree``, ``eif-sequential``, both ``-classical``; ``batch``, which starts at the chain of the exits,
+that is from odometry alone, and ``eif-tree+polish``, which starts at the tree; ``batch-cartesian``: the optimum of the
+same maps, their residuals taken as plain vectors; ``unknown-eif-tree`` and its polish: nobody tells who is who, neither
+within the submaps nor between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,20 +33,27 @@ from graphslam.app.compare import map_nees
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_exp, wrap_angle
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations, Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
+from graphslam.join.association import Association
 from graphslam.join.joined_map import JoinResult
-from graphslam.join.registry import JOINERS
+from graphslam.join.polish import polish
+from graphslam.join.registry import JOINERS, methods_for
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
+from graphslam.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field
 
 RATE, SENSOR_RATE = 10.0, 2.0
+PARTICLES = 40
+"""Where identities are not told."""
 JOINED = ("eif-tree", "eif-tree-classical", "eif-sequential", "eif-sequential-classical")
 
 
@@ -130,10 +143,37 @@ def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
     return SensorLog(name="charts", streams=streams, truth=truth)
 
 
-def run_trial(c: ChartConfig, seed: int) -> list[Measurement]:
+def run_trial(c: ChartConfig | PointFieldConfig, seed: int) -> list[Measurement]:
     """All figures of one run (see the module)."""
     with one_blas_thread():
-        return list(_trial(c, SeedTree(seed)))
+        return list(_trial_in_space(c, seed) if isinstance(c, PointFieldConfig) else _trial(c, SeedTree(seed)))
+
+
+def _trial_in_space(c: PointFieldConfig, seed: int) -> Iterator[Measurement]:
+    log = simulate_point_field(c, seed)
+    submaps = list(make_front_end("points", {"max_distance": 12.0}).submaps(log, seed=SeedTree(seed)))
+    assert log.truth is not None
+    yield from _local(submaps, log.truth)
+    truth = _truth_of(submaps, log.truth)
+    methods = methods_for(submaps)
+    optimum = methods.solvers["batch"](submaps)
+    yield from _judged("batch", optimum, submaps, truth, optimum.objective)
+    plain = [replace(s, landmarks=replace(s.landmarks, chart="cartesian")) for s in submaps if s.landmarks is not None]
+    cartesian = methods.solvers["batch"](plain)
+    yield from _judged("batch-cartesian", cartesian, submaps, truth, cartesian.objective)
+    for name in JOINED:
+        yield from _judged(name, methods.joiners[name](submaps), submaps, truth, optimum.objective)
+
+
+def _local(submaps: Sequence[Submap], truth: Truth) -> Iterator[Measurement]:
+    for s in submaps:
+        r = submap_nees(s, truth)
+        yield Measurement("local", "local_joint_nees", r.joint, s.key)
+        yield Measurement("local", "local_joint_nees_plain", r.joint_plain, s.key)
+        yield Measurement("local", "local_joint_dof", float(r.joint_dof), s.key)
+    turns = [s.exit_covariance[2:, 2:] if s.dim == 2 else s.exit_covariance[:3, :3] for s in submaps]
+    sigmas = [np.sqrt(np.trace(P) / len(P)) for P in turns]
+    yield Measurement("local", "exit_sigma", float(np.rad2deg(np.median(sigmas))))
 
 
 def _trial(c: ChartConfig, seed: SeedTree) -> Iterator[Measurement]:
@@ -142,13 +182,7 @@ def _trial(c: ChartConfig, seed: SeedTree) -> Iterator[Measurement]:
     options = {"association": "known", "particles": 4, "max_range": c.max_range, "stopping": stopping}
     submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=seed.child("frontend")))
     assert log.truth is not None
-    for s in submaps:
-        r = submap_nees(s, log.truth)
-        yield Measurement("local", "local_joint_nees", r.joint, s.key)
-        yield Measurement("local", "local_joint_nees_plain", r.joint_plain, s.key)
-        yield Measurement("local", "local_joint_dof", float(r.joint_dof), s.key)
-    headings = [np.sqrt(s.exit_covariance[2, 2]) for s in submaps]
-    yield Measurement("local", "exit_sigma", float(np.rad2deg(np.median(headings))))
+    yield from _local(submaps, log.truth)
     truth = _truth_of(submaps, log.truth)
     optimum = solve_submaps(submaps)
     yield from _judged("batch", optimum, submaps, truth, optimum.objective)
@@ -158,44 +192,76 @@ def _trial(c: ChartConfig, seed: SeedTree) -> Iterator[Measurement]:
     for name in JOINED:
         joined: JoinResult = JOINERS[name](submaps)
         yield from _judged(name, joined, submaps, truth, optimum.objective)
+        if name == "eif-tree":
+            yield from _judged(f"{name}+polish", polish(submaps, joined), submaps, truth, optimum.objective)
+    options |= {"association": "likelihood", "particles": PARTICLES}
+    try:
+        submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=seed.child("unknown")))
+        rule = Association(rule="joint", sensor_range=c.max_range)
+        joined = JOINERS["eif-tree"](submaps, association=rule)
+        best = polish(submaps, joined)
+    except GraphSlamError:
+        yield Measurement("unknown-eif-tree", "failed", 1.0)
+        return
+    yield Measurement("unknown-eif-tree", "failed", 0.0)
+    nobody = replace(_truth_of(submaps, log.truth), landmark_ids=np.zeros(0, np.int64), landmarks=np.zeros((0, 2)))
+    for name, found in (("unknown-eif-tree", joined), ("unknown-eif-tree+polish", best)):
+        yield from _judged(name, found, submaps, nobody, _objective(best))
 
 
 def _judged(
     name: str, estimate: SubmapEstimate, submaps: list[Submap], truth: MapTruth, optimum: float
 ) -> Iterator[Measurement]:
     keys = [s.key for s in submaps]
-    for quantity, chart in (("nees", "group"), ("nees_plain", "cartesian")):
-        d2, dof = map_nees(estimate, keys, truth, chart=chart)
-        yield Measurement(name, quantity, d2 / dof)
+    ends = replace(truth, landmark_ids=truth.landmark_ids[:0], landmarks=truth.landmarks[:0])
+    for quantity, chart, known in (
+        ("nees", "group", truth),
+        ("nees_plain", "cartesian", truth),
+        ("nees_ends", "group", ends),
+    ):
+        if known is ends or len(truth.landmark_ids):
+            d2, dof = map_nees(estimate, keys, known, chart=chart)
+            yield Measurement(name, quantity, d2 / dof)
     error = estimate.poses[1:, :2] - truth.exit_poses[:, :2]
     yield Measurement(name, "rms", float(np.sqrt(np.mean(np.sum(error**2, axis=1)))))
-    yield Measurement(name, "objective_ratio", estimate.objective / optimum)
+    yield Measurement(name, "objective_ratio", _objective(estimate) / optimum)
+
+
+def _objective(estimate: SubmapEstimate) -> float:
+    """Of the map as it is: that of the optimum where it was polished."""
+    polished = estimate.objective_polished
+    return estimate.objective if polished is None else polished
 
 
 def _truth_of(submaps: list[Submap], truth: Truth) -> MapTruth:
     base = truth.trajectory.interpolate(np.array([submaps[0].interval[0]]))[0]
     ends = truth.trajectory.interpolate(np.array([s.interval[1] for s in submaps]))
-    marks = np.column_stack([truth.landmarks, np.zeros(len(truth.landmarks))])
+    g = group_of(base)
     return MapTruth(
         keys=np.array([s.key for s in submaps]),
-        exit_poses=se2_between(base, ends),
+        exit_poses=g.between(base, ends),
         landmark_ids=truth.landmark_ids,
-        landmarks=se2_between(base, marks)[:, :2],
+        landmarks=g.transform(g.inverse(base), truth.landmarks),
     )
 
 
-WORLDS = {
+WORLDS: dict[str, ChartConfig | PointFieldConfig] = {
     "base": ChartConfig(),
     "good": ChartConfig(sensor=(0.05, 0.5)),
     "poor": ChartConfig(sensor=(1.0, 8.0)),
     "slow": ChartConfig(odometry=(0.005, 0.001, 0.573), speed=0.6, seconds=400.0, max_range=10.0, rows=True),
     "drift": ChartConfig(odometry=(0.03, 0.03, 1.0)),
     "strong-drift": ChartConfig(odometry=(0.1, 0.1, 3.0)),
+    "space": PRESETS["flight"],
+    "space-drift": PRESETS["drift"],
 }
-QUICK_WORLDS = {"strong-drift-quick": ChartConfig(odometry=(0.1, 0.1, 3.0), seconds=80.0, landmarks=40)}
+QUICK_WORLDS: dict[str, ChartConfig | PointFieldConfig] = {
+    "strong-drift-quick": ChartConfig(odometry=(0.1, 0.1, 3.0), seconds=80.0, landmarks=40),
+    "space-quick": PRESETS["quick"],
+}
 
 
-class ChartStudy(WorldsStudy[ChartConfig]):
+class ChartStudy(WorldsStudy[ChartConfig | PointFieldConfig]):
     """See the module."""
 
     run_one = staticmethod(run_trial)
@@ -233,7 +299,7 @@ def local_table(table: pd.DataFrame) -> pd.DataFrame:
 
 def joined_table(table: pd.DataFrame) -> pd.DataFrame:
     """Means over the runs, a row for each world and way of joining."""
-    names = ["nees", "nees_plain", "rms", "objective_ratio"]
+    names = ["nees", "nees_plain", "nees_ends", "rms", "objective_ratio", "failed"]
     rows = table[table["quantity"].isin(names) & (table["submap"] == -1)]
     if rows.empty:
         return pd.DataFrame(columns=["world", "algorithm", *names])

@@ -4,7 +4,8 @@ Algorithms
 ----------
 ``ekf``, ``rbpf``: single-map filters. ``ekf-eif``, ``ekf-eif-tree``: EKF local maps joined by the information filter in
 sequence or by binary tree. ``rbpf-ekf``, ``rbpf-eif``, ``rbpf-eif-tree``: moment-matched particle maps (the paper's),
-joined by EKF, EIF in sequence (SS), EIF by tree (BS). ``default-…``: the same with the default, smoothed maps.
+joined by EKF, EIF in sequence (SS), EIF by tree (BS). ``default-…``: the same with the default, smoothed maps: in the
+group chart, and, ``…-classical``, as the paper joins.
 ``…+polish``: the least-squares optimum of those maps. ``default-isam2``; ``default-online``: sequence with
 relinearisation at loop closures; ``default-optimum``: relinearised at every submap. ``full-batch``: no submaps at all.
 ``local-…``: the local maps by themselves.
@@ -15,7 +16,9 @@ After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom; of the plain vector x
 ``pose_nees_tangent`` (of the right perturbation ``Log(T_est⁻¹ T_true)``), ``error_*``, ``sigma_*``, and, after every
 ninth, ``feature_nees`` (mean over features, 2 degrees of freedom each) and ``feature_rms``. At the end (submap -1):
 ``pose_nees``, ``feature_nees``, ``feature_inside``, ``feature_joint_nees`` with ``feature_joint_dof``, ``feature_rms``,
-``feature_median_error``, ``pose_rms``, ``heading_rms`` [rad], ``objective`` and ``objective_optimum``, ``diverged``.
+``feature_median_error``, ``pose_rms``, ``heading_rms`` [rad], ``objective`` and ``objective_optimum``, ``diverged``; of
+joined maps ``map_nees`` (all ends and features together, in the group chart), ``map_nees_plain`` (of the plain vector)
+and ``map_dof``.
 Of local map k: ``local_joint_nees`` with ``local_joint_dof``, ``local_pose_nees``, ``local_inside``, …
 """
 

@@ -54,15 +54,15 @@ class TrialConfig:
         Preset of the landmark field.
     scans : int
         Scans of a submap, the same for all algorithms.
-    layout_seed : int
-        The features stay where they are over the runs; only noise is drawn anew.
+    layout_seed : int, optional
+        Holds the features where they are over the runs. Every run draws its own features where it is not given.
     particles, default_particles : int
         Of the paper's filters, and of the default front end.
     """
 
     world: str
     scans: int
-    layout_seed: int = 1
+    layout_seed: int | None = None
     particles: int = 40
     default_particles: int = 100
 
@@ -103,8 +103,8 @@ class _Trial:
         yield from self._joined("rbpf", rbpf, {"ekf": join_ekf, **CLASSICAL})
         smooth, seconds = clock("local-default", partial(self._submaps, "rbpf-ekf", default))
         yield seconds
-        own: dict[str, Callable[..., JoinResult]] = {"ekf": join_ekf, "eif-classical": CLASSICAL["eif"]}
-        own |= {"eif": join_sequential, "eif-tree": join_tree}
+        own: dict[str, Callable[..., JoinResult]] = {"ekf": join_ekf, "eif": join_sequential, "eif-tree": join_tree}
+        own |= {f"{name}-classical": join for name, join in CLASSICAL.items()}
         yield from self._joined("default", smooth, own)
         for name, maps in (("local-ekf", ekf), ("local-paper", rbpf), ("local-default", smooth)):
             yield from self.judge.local(name, maps)
@@ -158,7 +158,7 @@ class _Trial:
         for kind, join in joiners.items():
             name = f"{family}-{kind}"
             try:
-                if kind == "eif-tree":
+                if kind.startswith("eif-tree"):
                     joined = join(submaps)
                 else:
                     watch = Watch(self.judge, name)

@@ -13,9 +13,11 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.app.compare import map_nees
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_between, vector_to_tangent_covariance
 from graphslam.core.log import Truth
+from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
 from graphslam.evaluate.montecarlo import Measurement
@@ -146,6 +148,16 @@ class Judge:
             poses=estimate.poses[1:],
             pose_covariance=estimate.pose_covariance(m),
         )
+        truth = MapTruth(
+            keys=np.arange(m),
+            exit_poses=self.end_poses,
+            landmark_ids=np.array(list(self._positions)),
+            landmarks=np.array(list(self._positions.values())),
+        )
+        for quantity, chart in (("map_nees", "group"), ("map_nees_plain", "cartesian")):
+            d2, dof = map_nees(estimate, range(m), truth, chart=chart)
+            yield Measurement(algorithm, quantity, d2)
+        yield Measurement(algorithm, "map_dof", float(dof))
 
     def local(self, algorithm: str, submaps: list[Submap]) -> Iterator[Measurement]:
         """Honesty of local maps, each in its own frame, and what their front end says of them."""
