@@ -19,6 +19,10 @@ FLATNESS = 1e-3
 """Variance across a surface over that along it, of the covariance that stands for a point (Segal 2009)."""
 LEAST_NEIGHBOURS = 5
 """With fewer a point has no normal."""
+SMALLER = (5, 3)
+"""Neighbours to do with where more of them do not lie on one line."""
+SCATTER = 9.0
+"""Neighbours whose variance across their line is more than this many times the usual one do not lie on one line."""
 
 
 class Target:
@@ -98,19 +102,53 @@ class Target:
             Of a plane through n neighbours whose spread across it is λ₀ and along its axes λⱼ: λ₀ / (n λⱼ) about each.
             Computed when first asked for.
         """
+        if self.dim == 2:
+            return self._lines[0][rows], self._lines[1][rows]
         known, normals, noise = self._normals
         new = np.unique(rows[~known[rows]])
         n = min(self.neighbours, len(self))
         if len(new) and n >= LEAST_NEIGHBOURS:
-            around = self.points[self.tree.query(self.points[new], n)[1]]
-            d = around - around.mean(axis=1, keepdims=True)
-            spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", d, d) / n)
-            spread = np.maximum(spread, 1e-12 * np.maximum(spread[:, -1:], 1e-300))
+            spread, axes = self._spread(self.points[new], n)
             normals[new] = axes[:, :, 0]
             turned = np.minimum(spread[:, :1] / (n * spread[:, 1:]), 1.0)
             noise[new] = np.einsum("mij,mj,mkj->mik", axes[:, :, 1:], turned, axes[:, :, 1:])
         known[new] = True
         return normals[rows], noise[rows]
+
+    def _spread(self, points: Array, n: int) -> tuple[Array, Array]:
+        """Variances ``(k, dim)`` of the n nearest of all points around each, the least first, and their axes."""
+        around = self.points[self.tree.query(points, n)[1]]
+        d = around - around.mean(axis=1, keepdims=True)
+        spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", d, d) / n)
+        return np.maximum(spread, 1e-12 * np.maximum(spread[:, -1:], 1e-300)), axes
+
+    @cached_property
+    def _lines(self) -> tuple[Array, Array]:
+        """Normals in the plane and their noise.
+
+        Where a scan is sparse, far down a corridor or at a corner, the neighbours of a point lie on two walls. The line
+        through them is neither, and as it follows the pattern of the beams, which moves along with the robot, a match
+        would find that nothing moved. Such a point makes do with fewer neighbours, or has no normal.
+        """
+        m = len(self)
+        normals, noise = np.zeros((m, 2)), np.zeros((m, 2, 2))
+        n = min(self.neighbours, m)
+        if n < LEAST_NEIGHBOURS:
+            return normals, noise
+        rows, usual = np.arange(m), 0.0
+        for k in (n, *(k for k in SMALLER if k < n)):
+            spread, axes = self._spread(self.points[rows], k)
+            usual = usual or float(np.median(spread[:, 0]))
+            good = spread[:, 0] <= SCATTER * usual
+            across = spread[good, 0] if k == n else np.maximum(spread[good, 0], usual)  # of three, it says little
+            turned = np.minimum(across / (k * spread[good, 1]), 1.0)
+            along = axes[good, :, 1]
+            normals[rows[good]] = axes[good, :, 0]
+            noise[rows[good]] = turned[:, None, None] * along[:, :, None] * along[:, None, :]
+            rows = rows[~good]
+            if not len(rows):
+                break
+        return normals, noise
 
     @cached_property
     def _normals(self) -> tuple[npt.NDArray[np.bool_], Array, Array]:
