@@ -32,6 +32,10 @@ _PLY_TYPES = {
 _HEADER = 1 << 16
 _PCD = rb"(#.*\n)*\s*VERSION\s"
 _KNOWN = "BIN, PLY, PCD, LAS or LAZ"
+BIN_COLUMNS = 4
+"""Columns of BIN files where neither a user nor the content says it: x, y, z and intensity of KITTI …"""
+USUAL_COLUMNS = (3, 4, 5, 6)
+"""… and numbers of columns that are looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,55 @@ def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
     if ending(p) == ".bin":
         return _bin(raw, str(p), columns)
     raise FormatError("no cloud of a known format", where=str(p), got=repr(raw[:12]), wanted=_KNOWN)
+
+
+def bin_columns(paths: list[Path], *, most: int = 1 << 20) -> int:
+    """Number of float32 columns of BIN files, told by their content.
+
+    Columns hold different things: heights are not widths, intensities are not metres. Read with a number of columns
+    that is not theirs, all columns are mixtures of the true ones, and no mixture is as far from the average as its
+    parts are, on average. So the distance of columns from the pool of all (Kolmogorov–Smirnov), averaged over columns,
+    is largest for the true number and its multiples; of those that are as large but for chance the smallest is taken.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Of one kind; others than BIN, compressed ones and those that cannot be read say nothing.
+    most : int
+        Bytes that are read of a file.
+    """
+    raws: list[bytes] = []
+    whole = dict.fromkeys(USUAL_COLUMNS, 0)
+    for p in paths:
+        try:
+            size = p.stat().st_size
+            with open(p, "rb") as stream:
+                raws.append(stream.read(most))
+        except OSError:
+            continue
+        for c in USUAL_COLUMNS:
+            whole[c] += size % (4 * c) == 0
+    fits = [c for c in USUAL_COLUMNS if 2 * whole[c] > len(raws)]  # a file may be damaged
+    values = [np.frombuffer(r[: len(r) // 4 * 4], "<f4") for r in raws]
+    total = sum(len(v) for v in values)
+    if not fits or total < 300:
+        return BIN_COLUMNS
+    apart = {c: _columns_apart([v[: len(v) // c * c].reshape(-1, c) for v in values]) for c in fits}
+    best = max(apart.values())
+    chance = {c: 2.0 * np.sqrt(c / total) for c in apart}  # of c distances of n / c values each
+    if best <= max(chance.values()):
+        return BIN_COLUMNS
+    return min(c for c in apart if apart[c] > best - chance[c])
+
+
+def _columns_apart(tables: list[npt.NDArray[np.float32]]) -> float:
+    """Mean distance of the distribution of a column from that of all columns."""
+    columns = np.nan_to_num(np.concatenate(tables), nan=3e38, posinf=3e38, neginf=-3e38)
+    pool = np.sort(columns, axis=None)
+    at = np.unique(pool)
+    below = np.searchsorted(pool, at, side="right") / len(pool)
+    far = [np.abs(np.searchsorted(np.sort(c), at, side="right") / len(c) - below).max() for c in columns.T]
+    return float(np.mean(far))
 
 
 def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:

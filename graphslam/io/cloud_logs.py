@@ -32,7 +32,7 @@ from graphslam.core.reading import read_text, usable
 from graphslam.core.records import Gps, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.cloud_files import Cloud, count_points, read_cloud
+from graphslam.io.cloud_files import BIN_COLUMNS, Cloud, bin_columns, count_points, read_cloud
 from graphslam.io.look import Look, ending
 from graphslam.io.recognise import cloud_folder, is_kitti_poses, numbers, pose_file
 from graphslam.io.text_records import read_table
@@ -46,6 +46,8 @@ _SWEEP = (0.005, 2.0)  # how long a scan lasts [s]
 _TIMED = {"none": "points without times", "constant": "times of points say nothing: as good as one time for all"}
 MOST_DECODED = 100
 """Clouds that are decoded when a folder is opened, evenly over it."""
+LOOKED_AT = 5
+"""BIN files, evenly over a folder, by whose content the number of their columns is told."""
 _KEPT = 8  # decoded clouds that are kept
 
 
@@ -118,7 +120,7 @@ def read_clouds(
     path: str | os.PathLike[str],
     *,
     period: float | None = None,
-    columns: int = 4,
+    columns: int | None = None,
     poses: str | None = None,
     point_times: bool = True,
     odometry_sigmas: tuple[float, float] = ODOMETRY_SIGMAS,
@@ -133,8 +135,8 @@ def read_clouds(
     period : float, optional
         Seconds from scan to scan; by default stamps come from ``times.txt``, from the poses, from names that are
         stamps, or else scans are 0.1 s apart.
-    columns : int
-        Of float32 in BIN files.
+    columns : int, optional
+        Of float32 in BIN files; by default told by their content.
     poses : str, optional
         Name of the table of poses (TUM or KITTI rows) in the folder, ``none`` for none; by default the one that is
         there.
@@ -154,14 +156,25 @@ def read_clouds(
         raise MissingDataError("no such folder", where=str(root), wanted="a folder of clouds, one file a scan")
     look = Look(root)
     files, _ = cloud_folder(look)
+    told = ""
+    if columns is None:
+        bins = [p for p in files if p.name.lower().endswith(".bin")]
+        columns = (
+            bin_columns([bins[k] for k in np.unique(np.linspace(0, len(bins) - 1, LOOKED_AT).round().astype(int))])
+            if bins
+            else BIN_COLUMNS
+        )
+        if bins and columns != BIN_COLUMNS:
+            told = f"BIN of {columns} columns, by their content (--reader-option columns=)"
     table: Path | None = None
     if poses is None:
         table = pose_file(look)
     elif poses != "none":
         table = root / poses
-    return _cloud_log(
+    log = _cloud_log(
         root, look, files, table, None, period, columns, point_times, odometry_sigmas, name, drops, {}, DropCounter()
     )
+    return replace(log, meta={**log.meta, "notes": [told, *log.meta["notes"]]}) if told else log
 
 
 def _cloud_log(

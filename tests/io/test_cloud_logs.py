@@ -13,7 +13,7 @@ from graphslam.core.geodesy import geodetic_to_ecef
 from graphslam.core.gnss import TangentPlane
 from graphslam.io import cloud_logs
 from graphslam.io.catalog import load
-from graphslam.io.cloud_files import count_points, read_cloud
+from graphslam.io.cloud_files import bin_columns, count_points, read_cloud
 from graphslam.io.readers import recognise
 from tests.io import small_sources as small
 
@@ -162,6 +162,30 @@ def test_columns_of_bin_and_options_that_are_wrong(tmp_path: Path) -> None:
     for bad in ({"period": 0.0}, {"odometry_sigmas": (0.0, 0.1)}, {"colums": 5}):
         with pytest.raises(ConfigError):
             load(folder, reader="clouds", **bad)
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+def test_columns_of_bin_are_told_by_content(tmp_path: Path, columns: int) -> None:
+    rng = np.random.default_rng(columns)
+    for k in range(6):
+        n = 60 * int(rng.integers(10, 20))  # whole points for 3, 4, 5 and 6 columns
+        far, beam, turn = rng.uniform(2, 20, n), rng.integers(0, 16, n), rng.uniform(-np.pi, np.pi, n)
+        tilt = np.deg2rad(2.0 * beam - 15.0)
+        xyz = far[:, None] * np.column_stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
+        more = np.column_stack([rng.uniform(0, 1, n), beam, (turn + np.pi) / 62.8])
+        np.column_stack([xyz, more])[:, :columns].astype("<f4").tofile(tmp_path / f"{k}.bin")
+    log = load(tmp_path)
+    np.testing.assert_allclose(log["clouds"].cloud(5), xyz, rtol=1e-6)
+    said = [n for n in log.meta["notes"] if "columns" in n]
+    assert bool(said) == (columns != 4)
+    assert all(f"of {columns} columns" in n for n in said)
+
+
+def test_bin_files_that_say_nothing_of_their_columns_are_those_of_kitti(tmp_path: Path) -> None:
+    for k in range(3):
+        np.random.default_rng(k).normal(size=6000).astype("<f4").tofile(tmp_path / f"{k}.bin")
+    assert bin_columns(sorted(tmp_path.iterdir())) == 4
+    assert bin_columns([]) == 4
 
 
 def test_kitti_odometry_brings_poses_of_the_camera_to_the_lidar(tmp_path: Path) -> None:
