@@ -28,11 +28,20 @@ from graphslam.frontends.base import Watch
 from graphslam.frontends.grid.ancestry import Ancestry
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter import GridFilter, GridParticles, Tally
+from graphslam.frontends.grid.filter_drift import Passed, between_knots
 from graphslam.frontends.odometry.drift import DriftModel
-from graphslam.frontends.odometry.scan_use import uncorrected, uncorrected_covariance, with_findings
+from graphslam.frontends.odometry.scan_use import (
+    reckoned_covariance,
+    uncorrected,
+    uncorrected_covariance,
+    with_findings,
+)
 from graphslam.frontends.odometry.steps import StepConfig, Steps
 from graphslam.frontends.segslam.covariance import Drift, exit_covariance
 from graphslam.frontends.stepwise import StepwiseFrontEnd
+
+KNOTS = 33
+"""Places along the path at which errors that are passed on are worked out; between them they are interpolated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,7 +191,13 @@ def run_rbpf(
 
 
 def rbpf_submap(
-    result: RbpfResult, drift: Drift, *, key: int = 0, drift_scale: float = 1.0, steps: Steps | None = None
+    result: RbpfResult,
+    drift: Drift,
+    *,
+    key: int = 0,
+    drift_scale: float = 1.0,
+    steps: Steps | None = None,
+    passed: Passed | None = None,
 ) -> Submap:
     """The whole run as one submap: the best particle's map and path, and an honest covariance of where it ends.
 
@@ -196,7 +211,9 @@ def rbpf_submap(
         Factor on the drift model's covariance.
     steps : Steps, optional
         With them, dead reckoning's own covariance is added where no scan corrects it
-        (:mod:`graphslam.frontends.odometry.scan_use`).
+        (:mod:`graphslam.frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
+    passed : Passed, optional
+        That share; default none.
 
     Raises
     ------
@@ -225,6 +242,12 @@ def rbpf_submap(
         more = [uncorrected_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
         path = Trajectory(path.times, path.poses, path.covariances + np.array(more))
         added = more[-1]
+    if steps is not None and passed is not None and not alone:
+        assert path.covariances is not None
+        leaked = drift_scale * passed_along(steps, path.poses, passed, len(result.particles))
+        path = Trajectory(path.times, path.poses, path.covariances + leaked)
+        added = added + leaked[-1]
+    report["exit_sigma_drift"] = np.sqrt(np.diag(drift_scale * exit.drift + added)).tolist()
     return Submap(
         key=key,
         interval=(float(times[0]), float(times[-1])),
@@ -237,6 +260,21 @@ def rbpf_submap(
     )
 
 
+def passed_along(steps: Steps, poses: Array, passed: Passed, particles: int) -> Array:
+    """Covariances ``(n, d, d)``, along a filter's path, of the errors of dead reckoning that it passes on."""
+    n = len(poses)
+    knots = np.unique(np.linspace(0, n - 1, min(n, KNOTS)).round().astype(np.int64))
+    tilt = None if steps.tilt is None else steps.tilt_sigma
+    way = steps.path_length
+    C = [
+        passed.covariance(
+            reckoned_covariance(steps, 0, k, level_end=False), float(way[k] - way[0]), particles, tilt=tilt
+        )
+        for k in knots.tolist()
+    ]
+    return between_knots(knots, np.array(C), poses, way)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RbpfGridConfig:
     """The front end ``rbpf-grid``."""
@@ -247,8 +285,10 @@ class RbpfGridConfig:
     """Particles, motion, weights."""
     drift: DriftModel = field(default_factory=DriftModel)
     """Errors that all particles share, by the length of the path; its dimension is that of the log."""
+    passed: Passed = field(default_factory=Passed)
+    """What comes on top of them: the share of the errors of dead reckoning that the filter passes on."""
     drift_scale: float = 1.0
-    """Factor on the drift model's covariance."""
+    """Factor on the covariances of both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +315,9 @@ class RbpfGrid(StepwiseFrontEnd):
             steps = self.steps(log, drops=drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))
             drift = replace(self.config.drift, dim=steps.dim)
-            submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps)
+            submap = rbpf_submap(
+                result, drift, drift_scale=self.config.drift_scale, steps=steps, passed=self.config.passed
+            )
             if len(result.particles) == 1:
                 text = "A single particle corrects nothing: the path is dead reckoning, and its covariance says so."
                 steps = replace(steps, findings=(*steps.findings, Finding("look", "one-particle", text)))

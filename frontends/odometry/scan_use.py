@@ -115,7 +115,7 @@ def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path:
         a, b = max(begin, first + 1), min(end, last)
         if a > b:
             continue
-        P, there = _reckoned(steps, a - 1, b), path[b - first]
+        P, there = reckoned_covariance(steps, a - 1, b), path[b - first]
         if group.dim == 3 and steps.tilt is not None:
             there = level(there)
         A = group.adjoint(group.between(path[-1], there))
@@ -123,12 +123,22 @@ def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path:
     return 0.5 * (total + total.T)
 
 
-def _reckoned(steps: Steps, start: int, end: int) -> Array:
-    """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent."""
+def reckoned_covariance(steps: Steps, start: int, end: int, *, level_end: bool = True) -> Array:
+    """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent.
+
+    As the source of the motion states it, with what lasts; else of the increments, as if nothing did.
+
+    Parameters
+    ----------
+    steps : Steps
+    start, end : int
+    level_end : bool
+        The frame at the end stands level where gravity is told, as that at the start does.
+    """
     if steps.errors is not None:
         gravity = steps.tilt is not None
         try:
-            return steps.errors.between(start, end, level_start=gravity, level_end=gravity)[1]
+            return steps.errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
         except DataError:  # recorded odometry does not know level frames
             return steps.errors.between(start, end)[1]
     o, group = steps.odometry, group_of(steps.odometry.increments)

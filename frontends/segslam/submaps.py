@@ -14,15 +14,14 @@ from typing import Any, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.geometry import Array
 from graphslam.core.poses import frame_between, group_of, level, normalised, pose_scatter
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.odometry.scan_use import uncorrected, uncorrected_covariance
+from graphslam.frontends.grid.filter_drift import FilterDrift, between_knots
+from graphslam.frontends.odometry.scan_use import reckoned_covariance, uncorrected, uncorrected_covariance
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.followed import FollowedErrors
 from graphslam.frontends.segslam.config import HandoverConfig
@@ -54,19 +53,25 @@ class _Errors(Protocol):
 def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | None = None) -> Drift:
     """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
 
-    With the steps also what dead reckoning adds where no scan corrects it
+    With the steps also the share that the filter passes on of what dead reckoning states of its own errors
+    (:class:`~graphslam.frontends.grid.filter_drift.Passed`), and all of it where no scan corrects it
     (:mod:`graphslam.frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
     """
     if steps is not None and isinstance(steps.errors, FollowedErrors):
         steps.errors.prepare(segmap[int(i)].interval[0] for i in chain)
         return drift_by_errors(steps.errors, gravity=segmap.gravity)
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
-    stretches = [] if steps is None else uncorrected(steps)
+    # a single particle corrects nothing anywhere
+    stretches = [] if steps is None or segmap.particles == 1 else uncorrected(steps)
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
-        path = paths[start][: end - start + 1]
-        C = model.covariance(path, segmap.particles, gravity=segmap.gravity and level_end)
-        return C if steps is None else C + uncorrected_covariance(steps, stretches, path, start, end)
+        path, level_here = paths[start][: end - start + 1], segmap.gravity and level_end
+        if steps is None:
+            return model.covariance(path, segmap.particles, gravity=level_here)
+        reckoned = reckoned_covariance(steps, start, end, level_end=level_here)
+        tilt = None if steps.tilt is None else steps.tilt_sigma
+        C = model.covariance(path, segmap.particles, gravity=level_here, reckoned=reckoned, told_tilt=tilt)
+        return C + uncorrected_covariance(steps, stretches, path, start, end)
 
     return drift
 
@@ -276,26 +281,8 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
         P += wk * e[:, :, None] * e[:, None, :]
     knots = np.unique(np.linspace(0, n - 1, min(KNOTS, n)).round().astype(np.int64))
     D = np.stack([drift(start, start + int(k), level_end=False) for k in knots])
-    # in the axes of the base, where neighbours differ by drift alone and not by the turn of the body
-    R = _axes(poses)
-    D = R[knots] @ D @ np.swapaxes(R[knots], 1, 2)
-    along = segmap.path_length[start : end + 1] + 1e-9 * np.arange(n)  # a robot that stands still: by steps
-    j = np.clip(np.searchsorted(knots, np.arange(n), side="right") - 1, 0, len(knots) - 2)
-    a, b = along[knots[j]], along[knots[j + 1]]
-    u = ((along - a) / (b - a))[:, None, None]
-    return P + scale * (np.swapaxes(R, 1, 2) @ ((1.0 - u) * D[j] + u * D[j + 1]) @ R)
-
-
-def _axes(poses: Array) -> Array:
-    """Rotation of tangents from the axes of the body to those of the frame ``(n, d, d)``."""
-    n = len(poses)
-    if poses.shape[1] == 3:
-        out = np.zeros((n, 3, 3))
-        out[:, :2, :2], out[:, 2, 2] = rotation2(poses[:, 2]), 1.0
-        return out
-    out = np.zeros((n, 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = se3.quat_to_matrix(poses[:, 3:])
-    return out
+    along = segmap.path_length[start : end + 1]
+    return P + scale * between_knots(knots, D, poses, along)
 
 
 def _matches(

@@ -319,7 +319,7 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     segmap, steps = result.segmap, result.steps
     g = segmap.group
     chain = settled_chain(segmap, int(result.closed[result.best]))
-    by_path = drift_by_path(segmap, chain, drift)
+    by_path = drift_by_path(segmap, chain, drift, steps)
     stated: Drift = by_path if steps.errors is None else drift_by_errors(steps.errors, gravity=segmap.gravity)
     made = [
         settle(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
@@ -340,6 +340,21 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     lengths = segmap.path_length[t.end[chain]] - segmap.path_length[t.start[chain]]
     by_block = {name: score(made[0], of) for name, of in blocks.items()}
     return ExitErrors(lengths, scores[0], scores[1], scores[2], by_block)
+
+
+def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
+    """Where a submap of a whole log ends, in space: all four components that are not gravity's (``""``), and by block.
+
+    Parameters
+    ----------
+    submap : Submap
+    truth : (n, 7)
+        At the steps.
+    """
+    g = group_of(truth)
+    true = g.between(level(truth[0]), truth[-1])
+    blocks = {"": (2, 3, 4, 5), "heading": (2,), "plan": (3, 4), "height": (5,)}
+    return {k: exit_nees(submap.exit_pose, submap.exit_covariance[None], true, components=c) for k, c in blocks.items()}
 
 
 def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None) -> EvidenceGrid:

@@ -12,6 +12,7 @@ STUDIES: dict[str, str] = {
     "segmap-graph": "graphslam.app.studies.segmap_graph:STUDY",
     "campus": "graphslam.app.studies.campus:STUDY",
     "refinement": "graphslam.app.studies.refinement:STUDY",
+    "exits": "graphslam.app.studies.exits:STUDY",
     "heights": "graphslam.app.studies.heights:STUDY",
     "calibration": "graphslam.app.studies.calibration:STUDY",
     "scale": "graphslam.app.studies.scale:STUDY",

@@ -127,7 +127,7 @@ class GraphTrial(GridTrial):
         """The settled chain of the likeliest particle, with maps."""
         segmap = result.segmap
         chain = settled_chain(segmap, int(result.closed[result.best]))
-        return settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift))
+        return settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps))
 
     def build(self, submaps: Sequence[Submap], kind: str) -> BuiltGraph:
         """The graph of settled segments, one of :data:`GRAPHS`."""
@@ -158,7 +158,9 @@ class GraphTrial(GridTrial):
             if tuple(chain.tolist()) not in chains:
                 chains.add(tuple(chain.tolist()))
                 found.append(
-                    self.build(settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift)), "loops")
+                    self.build(
+                        settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps)), "loops"
+                    )
                 )
         seconds = sum(b.seconds for b in found)
         best = min(found, key=lambda b: self.clarity(b).entropy)

@@ -29,7 +29,8 @@ from graphslam.evaluate.refined import heading_error
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.frontends.grid.config import GridFilterConfig
 from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.grid.rbpf_grid import RbpfResult, run_rbpf
+from graphslam.frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
+from graphslam.frontends.odometry.drift import DriftModel
 from graphslam.frontends.odometry.steps import StepConfig, Steps, make_steps
 from graphslam.frontends.segslam.config import (
     CandidateSearch,
@@ -92,6 +93,8 @@ class GridTrialConfig:
     """Ways in which the grid of each stands (see :func:`~graphslam.evaluate.segslam_judge.clarity`)."""
     crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
     """The robot."""
+    speed: float = 1.0
+    """Its speed by that of the world's robot."""
     steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))
     """How its log becomes steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
@@ -101,7 +104,9 @@ class GridTrialConfig:
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
     """What SegSLAM adds."""
     drift: FilterDrift = field(default_factory=FilterDrift)
-    """In the covariance of exits."""
+    """In the covariance of exits of SegSLAM."""
+    rbpf_drift: DriftModel = field(default_factory=DriftModel)
+    """The same of an RBPF, whose errors that are passed on are those of ``drift``."""
 
     def __post_init__(self) -> None:
         for name in self.algorithms:
@@ -111,7 +116,8 @@ class GridTrialConfig:
 
     def make_world(self, seed: int) -> World:
         """The world of a seed, which moves what can be moved in it."""
-        return court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=self.layout, seed=seed)
+        made = court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=self.layout, seed=seed)
+        return replace(made, speed=self.speed * made.speed)
 
 
 def run_trial(config: GridTrialConfig, seed: int) -> list[Measurement]:
@@ -230,6 +236,8 @@ class GridTrial:
                 yield from self._matches(name, result)
             if "exits" in wanted:
                 yield from self._exits(name, result)
+        elif isinstance(result, RbpfResult) and "exits" in wanted:
+            yield from self._end(name, result)
 
     def leg_angle(self, poses: Array) -> float:
         """How far straight pieces of the way on different levels are from parallel, along poses at the steps [rad]."""
@@ -260,6 +268,17 @@ class GridTrial:
             for block, of in e.blocks.items():
                 yield Measurement(name, f"exit_nees_{block}", float(of.values[k]) / of.dof, k)
         yield Measurement(name, "exit_dof", e.default.dof)
+
+    def _end(self, name: str, result: RbpfResult) -> Iterator[Measurement]:
+        """The one exit of a filter over the whole way."""
+        c = self.config
+        submap = rbpf_submap(result, c.rbpf_drift, steps=self.steps, passed=c.drift.passed)
+        e = judge.end_errors(submap, self.truth)
+        yield Measurement(name, "exit_length", float(result.path_length[-1]), 0)
+        yield Measurement(name, "exit_nees", float(e[""].values[0]), 0)
+        for block in ("heading", "plan", "height"):
+            yield Measurement(name, f"exit_nees_{block}", float(e[block].values[0]) / e[block].dof, 0)
+        yield Measurement(name, "exit_dof", e[""].dof)
 
     def _climbs(self, name: str, path: Trajectory) -> Iterator[Measurement]:
         """Climbs of the ramps up and down apart, mean error of a run; what is left of the path seen from above."""

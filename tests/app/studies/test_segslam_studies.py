@@ -323,7 +323,8 @@ def test_legs_of_the_way_are_straight(trial: GridTrial) -> None:
 
 
 def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) -> None:
-    """One particle has no spread: its NEES is that of the drift model, written out."""
+    """One particle has no spread and corrects nothing: its NEES is that of the drift model and of all that dead
+    reckoning states of itself, written out."""
     model = FilterDrift(heading_walk=0.02, position_walk=0.05)
     e = judge.exit_errors(single, trial.truth, model)
     t = single.segmap.table
@@ -334,7 +335,11 @@ def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) 
         x = SE3.log(SE3.between(est, true))[2:]
         L = float(single.steps.path_length[b] - single.steps.path_length[a])
         assert e.lengths[k] == pytest.approx(L)
-        D = model.covariance(t.paths[i], 1)[2:, 2:]
+        assert single.steps.errors is not None
+        O = single.steps.errors.between(a, b, level_start=True, level_end=True)[1]
+        D = (replace(model, alone_walk=np.sqrt(1.0 + model.few) * model.heading_walk).covariance(t.paths[i], 1) + O)[
+            2:, 2:
+        ]
         assert e.default.values[k] == pytest.approx(x @ np.linalg.solve(D, x), rel=1e-6)
         floor = np.array([1e-3, 0.01, 0.01, 0.01])
         assert e.matched.values[k] == pytest.approx(np.sum((x / floor) ** 2), rel=1e-6)

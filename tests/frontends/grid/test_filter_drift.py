@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.poses import SE2, SE3, Group, level
-from graphslam.frontends.grid.filter_drift import FilterDrift
+from graphslam.frontends.grid.filter_drift import FilterDrift, Passed, between_knots
 
 MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
 
@@ -99,3 +99,65 @@ def test_impossible_models_and_paths() -> None:
         MODEL.covariance(np.zeros((0, 7)), 5)
     with pytest.raises(DataError, match="no path or no particle"):
         MODEL.covariance(_bend(SE2), 0)
+
+
+# --- what is passed on -------------------------------------------------------------------------------------------
+
+
+def _reckoned(d: int, seed: int = 3) -> np.ndarray:
+    A = np.random.default_rng(seed).standard_normal((d, d))
+    return A @ A.T
+
+
+@pytest.mark.parametrize(("dim", "tilt"), [(3, None), (6, None), (6, 0.01)])
+def test_errors_of_which_a_share_is_passed_on_have_that_covariance(dim: int, tilt: float | None) -> None:
+    """Drawn: of every error of dead reckoning its share reaches the end, and the floor pulls by tilt² a metre."""
+    passed, O, rng = Passed(heading=0.5, position=0.8, height_tilt=200.0), _reckoned(dim), np.random.default_rng(0)
+    share = {3: [0.8, 0.8, 0.5], 6: [0.5, 0.5, 0.5, 0.8, 0.8, 0.8]}[dim]
+    if tilt is not None:  # roll, pitch and heights are gravity's
+        share = [0.0, 0.0, 0.5, 0.8, 0.8, 0.0]
+    e = np.array(share) * rng.multivariate_normal(np.zeros(dim), O, 40_000)
+    if tilt is not None:
+        e[:, 5] += 200.0 * tilt**2 * 30.0 * rng.standard_normal(len(e))
+    C = passed.covariance(O, 30.0, 20, tilt=tilt)
+    sigma = np.sqrt(np.diag(C) + 1e-12)
+    np.testing.assert_allclose(C / np.outer(sigma, sigma), e.T @ e / len(e) / np.outer(sigma, sigma), atol=0.03)
+
+
+def test_a_single_particle_passes_everything_on_and_more_never_less_than_nothing() -> None:
+    path, O = _bend(SE3), 0.01 * _reckoned(6)
+    assert np.array_equal(Passed().covariance(O, 40.0, 1, tilt=0.01), O)
+    quiet = FilterDrift(few=0.0)
+    # of one the heading walks as dead reckoning says, not as the robot that the model was fitted to
+    assert quiet.covariance(path, 1, reckoned=O) - O == pytest.approx(quiet.covariance(path, 40))
+    for tilt in (None, 0.005):
+        more = MODEL.covariance(path, 20, reckoned=O, told_tilt=tilt) - MODEL.covariance(path, 20)
+        assert np.linalg.eigvalsh(more).min() > -1e-12  # the fitted constants are a floor
+        assert more == pytest.approx(MODEL.passed.covariance(O, 40.0, 20, tilt=tilt), rel=1e-3, abs=1e-12)
+
+
+def test_impossible_shares_are_refused() -> None:
+    for bad in ({"heading": -0.1}, {"position": 1.1}, {"height_tilt": np.nan}):
+        with pytest.raises(ConfigError, match="passed on"):
+            Passed(**bad)
+
+
+@pytest.mark.parametrize("group", [SE2, SE3])
+def test_between_knots_covariances_are_those_of_a_slow_twin(group: Group) -> None:
+    poses = _bend(group)
+    n, d = len(poses), group.dof
+    along = np.linspace(0.0, 40.0, n)
+    knots = np.array([0, 20, 45, n - 1])
+    C = np.array([k * _reckoned(d, 5) + np.eye(d) for k in range(4)])
+    got = between_knots(knots, C, poses, along)
+    assert got[knots] == pytest.approx(C)
+    for at in (7, 33, 58):
+        j = int(np.searchsorted(knots, at)) - 1
+        u = (at - knots[j]) / (knots[j + 1] - knots[j])
+        total = np.zeros((d, d))
+        for knot, share in ((j, 1.0 - u), (j + 1, u)):
+            turn = group.between(poses[at], poses[knots[knot]])  # the same error, told in the axes of the body there
+            turn[: group.dim] = 0.0
+            A = group.adjoint(turn)
+            total += share * A @ C[knot] @ A.T
+        np.testing.assert_allclose(got[at], total, atol=1e-9)

@@ -19,7 +19,9 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.memory import memory
 from graphslam.frontends.base import FrontEnd
 from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam.frontends.grid.filter_drift import Passed
 from graphslam.frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
+from graphslam.frontends.odometry.scan_use import reckoned_covariance
 from graphslam.frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring, true_end
 
@@ -118,6 +120,23 @@ def test_submap_is_the_best_particles_with_an_honest_exit(run: tuple[Steps, Rbpf
     assert doubled.exit_covariance - submap.exit_covariance == pytest.approx(wanted - spread, abs=1e-12)
     json.dumps(dict(submap.report))
     assert result.trajectory().covariances is None
+
+
+def test_the_exit_takes_along_what_the_filter_passes_on_of_dead_reckoning(run: tuple[Steps, RbpfResult]) -> None:
+    steps, result = run
+    n = len(steps)
+    plain, passed = rbpf_submap(result, drift, steps=steps), Passed(heading=0.5, position=0.7)
+    submap = rbpf_submap(result, drift, steps=steps, passed=passed)
+    tilt = None if steps.tilt is None else steps.tilt_sigma
+    reckoned = reckoned_covariance(steps, 0, n - 1, level_end=False)
+    wanted = passed.covariance(reckoned, float(steps.path_length[-1]), len(result.particles), tilt=tilt)
+    assert np.trace(wanted) > 0
+    assert submap.exit_covariance - plain.exit_covariance == pytest.approx(wanted, rel=1e-6, abs=1e-12)
+    assert submap.trajectory is not None
+    assert submap.trajectory.covariances is not None
+    assert submap.trajectory.covariances[-1] == pytest.approx(submap.exit_covariance, rel=1e-9, abs=1e-15)
+    sigma = np.sqrt(np.diag(drift(float(steps.path_length[-1])) + wanted))
+    assert submap.report["exit_sigma_drift"] == pytest.approx(sigma, rel=1e-6)
 
 
 def test_ends_lie_inside_what_the_exit_covariance_promises() -> None:
