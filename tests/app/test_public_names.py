@@ -19,8 +19,8 @@ VERBS = {
 }
 LISTS = {"front_ends", "joiners", "solvers", "worlds"}
 STREAMS = {
-    *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "RangeScans", "SteeringControls"),
-    "VelocityControls",
+    *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "PointObservations", "RangeScans"),
+    *("SteeringControls", "VelocityControls"),
 }
 TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
 

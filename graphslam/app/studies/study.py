@@ -297,7 +297,7 @@ def open_study(folder: str | Path, definition: StudyDefinition | str | None = No
     --------
     >>> made = gs.study("charts", 1, quick=True, out="studies/charts", progress=False)
     >>> gs.open_study("studies/charts")
-    Study('charts': runs strong-drift-quick: 1; 0 failed)
+    Study('charts': runs strong-drift-quick: 1, space-quick: 1; 0 failed)
     """
     opened = StudyFolder(folder)
     if definition is None:
