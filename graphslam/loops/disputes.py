@@ -9,6 +9,7 @@ clearly the answer is that it is not known, and neither side is believed.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.geometry import Array
+from graphslam.loops.witness import ERROR
 
 DOUBT = 4.0
 """A side is believed if the other's χ² is greater by so much: odds of e² to 1."""
@@ -32,11 +34,16 @@ SHUTS_OUT = 0.25
 OUTNUMBERED = 4
 """A group with so many times as many rivals is wrong."""
 
+AMBIGUOUS = "ambiguous"
+"""What begins the reasons of loops of which nothing tells whether they are right …"""
+SETTLED = ("dispute", AMBIGUOUS)
+"""… and of all that lost a dispute."""
+
 Outcome = Literal["stays", "changes", "ambiguous"]
 
 
 def disputes(
-    D2: Array, inside: int, ends: npt.NDArray[np.int64], clash: float
+    D2: Array, inside: int, ends: npt.NDArray[np.int64], clash: float, least: int = 2
 ) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
     """Sides that contradict each other.
 
@@ -49,11 +56,13 @@ def disputes(
     ends : (l, 2)
     clash : float
         Two loops contradict each other beyond this.
+    least : int
+        Loops of a group outside.
 
     Returns
     -------
     list of (rows, rows)
-        In the graph, and outside: groups of two or more neighbours that agree, the largest first, each with those that
+        In the graph, and outside: groups of neighbours that agree, the largest first, each with those that
         shut out a good part of it. Not where these are too many to be one mistake.
     """
     out = np.arange(inside, len(D2))
@@ -64,24 +73,32 @@ def disputes(
     for name in np.argsort(-np.bincount(label), kind="stable"):
         group = out[label == name]
         rivals = np.flatnonzero((D2[:inside, group] > clash).mean(axis=1) > SHUTS_OUT)
-        if len(group) > 1 and 0 < len(rivals) <= OUTNUMBERED * len(group):
+        if len(group) >= least and 0 < len(rivals) <= OUTNUMBERED * len(group):
             found.append((rivals, group))
     return found
 
 
-def weigh(inside: Array, outside: Array) -> tuple[Outcome, str]:
+def weigh(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outcome, str]:
     """Which of two sides is believed, and why in words.
 
     Parameters
     ----------
     inside, outside : (a,), (b,)
         χ² of the loops of the side in the graph and of the other, against the graph without either.
+    maps : float
+        Log of how much likelier the maps are with the other side (:func:`graphslam.loops.witness.log_ratio`). Against
+        one loop alone nothing else speaks.
     """
     own, other = float(np.median(inside)), float(np.median(outside))
     score = own - other + MAJORITY * (len(outside) - len(inside))
     words = f"without either, χ² {own:.1f} of {len(inside)} in the graph, {other:.1f} of {len(outside)} outside"
+    if abs(maps) > -math.log(ERROR):
+        said = f"dispute: the maps say so by a log-ratio of {abs(maps):.1f}; {words}"
+        return ("changes" if maps > 0 else "stays"), said
+    if len(outside) == 1:
+        return "stays", f"dispute: {words}"
     if score > DOUBT:
         return "changes", f"dispute: {words}"
     if score < -DOUBT:
         return "stays", f"dispute: {words}"
-    return "ambiguous", f"ambiguous, two groups: {words}"
+    return "ambiguous", f"{AMBIGUOUS}, two groups: {words}"

@@ -135,8 +135,9 @@ class LoopSearch:
         ours = GraphLoops(graph, solver)
         p = ours.places
         if self.closer is None or self._measurer is None:
-            self.closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions, judge=settled_loops)
-            self._measurer = LoopMeasurer(submaps, p, c.pairs)
+            self._measurer = m = LoopMeasurer(submaps, p, c.pairs)
+            chain = chain_of_graph(graph)
+            self.closer = LoopCloser(ours, *chain, c.decisions, judge=settled_loops, witness=m.contradictions)
         closer, measurer = self.closer, self._measurer
         closer.go_on(ours, *chain_of_graph(graph))
         measurer.go_on(submaps, p)

@@ -10,8 +10,9 @@ One wrong loop ruins a map, so a loop passes, in this order,
    are in, every one is asked what the graph *without* it says of it;
 5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
    and by what a second opinion says that judges all of them together;
-6. of two groups that cannot both be right the one is believed that the rest of the graph bears out, whatever their
-   number; neither, if it cannot tell (:mod:`~graphslam.loops.disputes`).
+6. of two groups that cannot both be right the one is believed by which maps lie on each other as they do elsewhere
+   (:mod:`~graphslam.loops.witness`); if they do not tell, the one that the rest of the graph bears out, whatever their
+   number; neither, if that cannot tell (:mod:`~graphslam.loops.disputes`).
 
 With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
@@ -33,11 +34,12 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.graph.noise import Robust
-from graphslam.loops.disputes import CLASH, SHUTS_OUT, disputes, weigh
+from graphslam.loops.disputes import CLASH, SETTLED, SHUTS_OUT, disputes, weigh
 from graphslam.loops.ledger import Decision, LoopLedger, Verdict
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 from graphslam.loops.rules import Judge, LoopConfig, LoopGraph, chi2_without
+from graphslam.loops.witness import Witness, log_ratio, of_pairs
 from graphslam.registration.submap_pairs import prediction_chi2
 
 
@@ -56,6 +58,8 @@ class LoopCloser:
         Which of all loops the chain and the others bear out, judged together: from increments, covariances and the
         loops' ends, relative poses and covariances to ``(l,) bool``
         (:func:`graphslam.loops.judge.settled_loops`).
+    witness : callable, optional
+        What the maps of loops say at relative poses of their ends (:mod:`graphslam.loops.witness`).
     """
 
     def __init__(
@@ -66,12 +70,13 @@ class LoopCloser:
         config: LoopConfig | None = None,
         ledger: LoopLedger | None = None,
         judge: Judge | None = None,
+        witness: Witness | None = None,
     ) -> None:
         self.graph = graph
         self.increments, self.covariances = increments, covariances
         self.config = LoopConfig() if config is None else config
         self.ledger = LoopLedger() if ledger is None else ledger
-        self.judge = judge
+        self.judge, self.witness = judge, witness
         self.loops: dict[int, Loop] = {}
         self._dof = group_of(increments).dof
 
@@ -144,8 +149,15 @@ class LoopCloser:
             self._reconsider()
         if self._second_opinion():
             self._reconsider()
-        if self._disputes():
-            self._reconsider()
+        seen: list[list[int]] = []
+        while self.accepted not in seen:  # what a group held down may now stand against the next one
+            seen.append(self.accepted)
+            if self._disputes():
+                self._reconsider()
+                if self.witness is not None:
+                    settled = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
+                    self._round([], settled)
+                    self._reconsider()
         self._say_weights()
 
     def _round(self, new: list[int], out: set[int]) -> set[int]:
@@ -271,21 +283,23 @@ class LoopCloser:
         """Groups that cannot both be right: the one that the rest of the graph bears out, or neither."""
         inside = self.accepted
         outside = [n for n in self._refused_by_company() if self._bears(n)]
-        if not inside or len(outside) < 2:
+        least = 2 if self.witness is None else 1  # the maps may tell of one loop alone
+        if not inside or len(outside) < least:
             return False
         both = [*inside, *outside]
         ends = self._arrays(both)[0]
         limit = float(stats.chi2.ppf(CLASH, self._dof))
         changed = False
-        for rows, columns in disputes(self._consistent(both).chi2, len(inside), ends, limit):
+        for rows, columns in disputes(self._consistent(both).chi2, len(inside), ends, limit, least):
             a, b = [both[k] for k in rows], [both[k] for k in columns]
             if not set(a) <= set(self.accepted):
                 continue  # another dispute has changed that
+            with_a = self._relative([*a, *b])
             for n in a:
                 self.graph.remove_loop(self.ledger.of(n).factor_id)
             self.graph.solve()
             other = self._against_graph(b)
-            outcome, why = weigh(self._against_graph(a), other)
+            outcome, why = weigh(self._against_graph(a), other, self._maps_say(a, b, with_a))
             for n in a:
                 d = self.ledger.of(n)
                 if outcome == "stays":
@@ -301,6 +315,37 @@ class LoopCloser:
             self.graph.solve()
             changed |= outcome != "stays"
         return changed
+
+    def _maps_say(self, a: list[int], b: list[int], with_a: Array) -> float:
+        """Log of how much likelier the maps are with the loops b than with a; neither is in the graph.
+
+        Parameters
+        ----------
+        with_a : (k, 7|3)
+            Relative poses of the ends of all of them when a was.
+        """
+        others = [n for n in self.accepted if n not in a]
+        if self.witness is None or not others:
+            return 0.0
+        factors = [self.graph.add_loop(self.loops[n], self._kernel()) for n in b]
+        self.graph.solve()
+        with_b = self._relative([*a, *b])
+        for f in factors:
+            self.graph.remove_loop(f)
+        self.graph.solve()
+        asked, calm = [self.loops[n] for n in [*a, *b]], [self.loops[n] for n in others]
+        at, g = self._relative(others), group_of(with_a)
+        D = g.between(with_a, with_b)
+        # by what the solutions differ there, one after the other, both ways
+        D = np.concatenate([D, g.inverse(D)])
+        moved = g.compose(at, D[np.arange(len(at)) % len(D)])
+        shares = [self.witness(x, T) for x, T in ((calm, at), (calm, moved), (asked, with_b), (asked, with_a))]
+        return log_ratio(*(of_pairs(x, s) for x, s in zip((calm, calm, asked, asked), shares)))
+
+    def _relative(self, numbers: list[int]) -> Array:
+        """Relative poses of the ends of loops in the graph as it is ``(k, 7|3)``."""
+        x = [self.loops[n] for n in numbers]
+        return self.graph.relative(np.array([a.i for a in x]), np.array([a.j for a in x]))[0]
 
     def _against_graph(self, numbers: list[int]) -> Array:
         """χ² of loops that are not in the graph, each by itself ``(k,)``."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from graphslam.core.geometry import Array
@@ -15,7 +16,7 @@ from graphslam.evidence.views import view_of
 from graphslam.loops.candidates import FRONT_END, TIE, Candidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import PreparedMap, match_pair
+from graphslam.registration.submap_pairs import PreparedMap, contradiction, match_pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,3 +128,13 @@ class LoopMeasurer:
             i=i, j=c.j, T_ij=g.between(p.T_base_node[i], m.T_target_source), covariance=m.covariance, source=c.source,
             score=c.score, gain=c.gain, why=m.why, gates={**m.gates(), **c.facts}, submaps=keys,
         )  # fmt: skip
+
+    def contradictions(self, loops: Sequence[Loop], T_ij: Array) -> Array:
+        """Share of contradiction between the maps of loops ``(k,)``, at relative poses of their ends ``(k, 7|3)``."""
+        p, g, out = self.places, group_of(T_ij), []
+        for x, T in zip(loops, T_ij):
+            source, target = self.prepared(int(p.submap[x.j])), self.prepared(int(p.submap[x.i]))
+            at_j, at_i = p.T_base_node[x.j], p.T_base_node[x.i]
+            out.append(contradiction(source, at_j, target, g.compose(at_i, T), source.around(at_j)))
+            self._let_go()
+        return np.array(out)

@@ -1,6 +1,6 @@
 """Loops between submaps in simulated worlds: matched, decided on, with wrong ones among them, and recognised by sight.
 
-    python -m tests.benchmarks.bench_loops [WORLD:SEED ...] [--wrong N] [--appearance] [--cache FOLDER] [--quick]
+    python -m tests.benchmarks.bench_loops [WORLD:SEED ...] [--wrong N] [--first SEED] [--appearance] [--cache FOLDER]
 
 SegSLAM with 5 particles that never looks back makes submaps with grids, whose paths drift as far as the world is long.
 Per world: candidates by proximity; of those that the gates accept, how many are right (within 0.8 m and 0.1 rad of the
@@ -38,6 +38,7 @@ from graphslam.loops.judge import settled_loops
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import ChainRelative, Places, places_of
+from graphslam.loops.witness import Witness
 from graphslam.registration.place_descriptor import describe, join, similarity
 from tests.reference.loop_network import LoopNetwork
 from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops
@@ -106,23 +107,23 @@ def nees(net: LoopNetwork, truth: Array) -> float:
     return float(np.mean(np.einsum("ki,kij,kj->k", e, np.linalg.inv(S), e)) / 6)
 
 
-def closed(chain: ChainRelative, loops: list[Loop]) -> tuple[LoopNetwork, LoopCloser]:
+def closed(chain: ChainRelative, loops: list[Loop], witness: Witness | None = None) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
-    closer = LoopCloser(net, chain.increments, chain.covariances, judge=settled_loops)
+    closer = LoopCloser(net, chain.increments, chain.covariances, judge=settled_loops, witness=witness)
     closer.propose(loops)
     return net, closer
 
 
-def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: int) -> None:
+def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
     """Precision and recall of decisions, and the ATE against that of the clean run."""
-    clean = ate(closed(chain, loops)[0].poses[: len(truth)], truth)
+    clean = ate(closed(chain, loops, witness)[0].poses[: len(truth)], truth)
     for kind in KINDS:
-        for share in (0.3, 0.5):
+        for share in (0.1, 0.3, 0.5):
             counts, ratios = np.zeros((2, 2), int), []
-            for seed in range(seeds):
+            for seed in seeds:
                 rng = SeedTree(seed).child("wrong", kind).generator()
                 mixed, wrong = inject_wrong_loops(loops, truth, share, rng, kind=kind)
-                net, closer = closed(chain, mixed)
+                net, closer = closed(chain, mixed, witness)
                 taken = np.isin(np.arange(len(mixed)), closer.accepted)
                 np.add.at(counts, (wrong.astype(int), taken.astype(int)), 1)
                 ratios.append(ate(net.poses[: len(truth)], truth) / clean)
@@ -160,6 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("worlds", nargs="*", default=DEFAULT, help=f"name:seed; names: {', '.join(WORLDS)}")
     parser.add_argument("--wrong", type=int, default=0, help="seeds of each kind and share of wrong loops")
+    parser.add_argument("--first", type=int, default=0, help="the first of these seeds")
     parser.add_argument("--appearance", action="store_true")
     parser.add_argument("--cache", type=Path, help="folder for the submaps")
     parser.add_argument("--quick", action="store_true", help="one garage")
@@ -172,12 +174,13 @@ def main() -> None:
         begin = time.perf_counter()
         config = CandidateConfig(height=2.0 if world == "mine" else 1.0)
         candidates = proximity_candidates(places, chain, config)
-        loops = [x for x in LoopMeasurer(submaps, places).measure(candidates) if not x.why]
+        measurer = LoopMeasurer(submaps, places)
+        loops = [x for x in measurer.measure(candidates) if not x.why]
         matched = time.perf_counter()
         right = [x for x in loops if is_right(x, truth)]
         e = np.array([error_of(x, truth) for x in right]).reshape(-1, 6)
         own = [v @ np.linalg.solve(x.covariance, v) / 6 for v, x in zip(e, right)]
-        net, closer = closed(chain, loops)
+        net, closer = closed(chain, loops, measurer.contradictions)
         taken = [is_right(closer.loops[n], truth) for n in closer.accepted]
         print(
             f"{name}: {len(places)} places, {len(submaps)} submaps, {len(candidates)} candidates; accepted by the "
@@ -195,7 +198,8 @@ def main() -> None:
             f"{nees(LoopNetwork(chain.increments, chain.covariances), truth):.2f} → {nees(net, truth):.2f}"
         )
         if args.wrong and right:
-            wrong_table(chain, right, truth, args.wrong)
+            seeds = range(args.first, args.first + args.wrong)
+            wrong_table(chain, right, truth, seeds, measurer.contradictions)
         if args.appearance:
             appearance_table(submaps, places, truth)
 

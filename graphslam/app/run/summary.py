@@ -67,6 +67,7 @@ ADVICE: dict[str, str] = {
     "refine-motion": "look for a place taken for another one, or leave the refinement out (--set refine.use=false)",
     "input-better": "take the path of the odometry, or state its noise as small as it is",
     "passes*": "look where walls stand twice in the map, and try another seed (--seed 1)",
+    "loops-undecided": "look at the loops in dispute (`graphslam loops RUN`)",
     "session": "check whether the sessions are of one place",
     "uneven-motion": "give the IMU of the lidar, or move it more steadily",
     "points-without-times": "give the points their times within the scan",

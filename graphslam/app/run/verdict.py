@@ -14,12 +14,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from graphslam.app.run.stream_use import StreamUse
+from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
 from graphslam.evaluate.trust import Evidence, Trust, rows_of_json, trust
 from graphslam.evaluate.without_truth import LASTING, two_sided
+from graphslam.loops.disputes import AMBIGUOUS
+from graphslam.loops.ledger import ledger_of_events
 from graphslam.maps.contradictions import LOOK
 
 CONFIDENCE = 0.95
@@ -96,6 +99,7 @@ def stated(figures: Figures) -> list[Finding]:
         *_nees(figures),
         *_tests(figures),
         _certificate(figures),
+        *_undecided(figures),
         *_left_out(figures),
     ]
 
@@ -108,6 +112,7 @@ _STATED = frozenset(
         "nees",
         "consistency-test",
         "certificate",
+        "loops-undecided",
         "map-left-out",
         "map-coarser",
         "passes",
@@ -516,6 +521,23 @@ def _attempts(rows: Any) -> list[Finding]:
     )
     settled = isinstance(share := rows[kept].get("share"), float) and share <= LOOK
     return [Finding("" if settled else "look", "passes-attempts", text)]
+
+
+def _undecided(figures: Figures) -> list[Finding]:
+    """Groups of loops that cannot both be right, of which neither is in the graph."""
+    try:
+        loops = ledger_of_events(figures.events).current()
+    except DataError:  # events of another version
+        return []
+    out = [d for d in loops if d.verdict != "accepted" and d.why.startswith(AMBIGUOUS)]
+    if not out:
+        return []
+    text = (
+        f"{len(out)} loops are in two groups that cannot both be right ({', '.join(str(d.loop) for d in out[:6])}"
+        f"{', …' if len(out) > 6 else ''}), and neither maps nor path tell which: this map has neither "
+        "group, so that it drifts there."
+    )
+    return [Finding("bad", "loops-undecided", text)]
 
 
 def _left_out(figures: Figures) -> list[Finding]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import itertools
 import json
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -30,6 +32,8 @@ from graphslam.app.run.summary import (
 from graphslam.app.run.verdict import Figures, observed, stated
 from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst
 from graphslam.evaluate.trust import by_size, rows_as_json
+from graphslam.loops.disputes import weigh
+from graphslam.loops.ledger import Decision
 from tests.reference.page import Page
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -232,3 +236,20 @@ def test_the_note_on_the_join_is_one_that_honest_runs_do_not_get(run: Run) -> No
     (line,) = noted(1.5, 200, [Finding("bad", "calibration", "x"), Finding("", "streams", "y")])
     assert "calibration" in line
     assert "covariance_scale" not in line
+
+
+def test_loops_of_which_nothing_tells_are_said() -> None:
+    """Two groups that cannot both be right, neither in the graph; not where one of them was taken since."""
+    why = weigh(np.array([5.4, 5.0, 5.2]), np.array([1.9, 1.7, 1.7]))[1]
+    lost = [Decision(loop=k, verdict="rejected", why=why, i=k, j=k + 40) for k in range(6)]
+
+    def said(decisions: list[Decision]) -> list[Finding]:
+        return [f for f in stated(Figures({}, {}, [d.event() for d in decisions])) if f.code == "loops-undecided"]
+
+    (line,) = said(lost)
+    assert line.level == "bad"
+    assert line.text.startswith("6 loops are in two groups")
+    assert line.code in ADVICE
+    taken = [replace(d, verdict="accepted", why="agrees with the graph") for d in lost]
+    assert said([*lost, *taken]) == []
+    assert said([]) == []
