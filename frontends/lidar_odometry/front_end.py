@@ -30,6 +30,7 @@ from graphslam.frontends.lidar_odometry.cells import evenly
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam.frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
 from graphslam.frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, Seen
+from graphslam.frontends.lidar_odometry.reckoned import Reckoned
 from graphslam.frontends.odometry.steps import Steps
 from graphslam.frontends.scan_window.exits import relative_covariance
 
@@ -47,8 +48,10 @@ UNNAMED = ("auto", "none")
 """Choices of an IMU that are no name of a stream."""
 OF_USE = 15.0
 """Readings are of use for so long after a scan [s]."""
+LEVEL = 1e-6
+"""Odometry is that of wheels if heights and tilts change by no more while the first scans are made [m, quaternion]."""
 REHEARSED = 60
-"""Scans at the start that are followed twice at most, until it is known what an IMU does not know."""
+"""Scans at the start that are followed thrice at most, until it is known what an IMU does not know."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +102,9 @@ class LidarFrontEndConfig:
     imu: str = "auto"
     """Stream of an IMU that tells where a match begins, unbends scans, and knows up; ``none``; or the first of the
     log."""
+    wheels: str = "auto"
+    """Stream of odometry that stands where scans find no place, and tells where a match begins if it tells that better
+    than an even motion; ``none``; or the first of the log, if it is that of wheels: without heights and tilts."""
     odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     """How scans are matched."""
     submap: LidarSubmapConfig = field(default_factory=LidarSubmapConfig)
@@ -164,21 +170,28 @@ class LidarFrontEnd(FrontEnd):
         while not feed.ended and (feed.count(name) < FIRST or self.config.imu not in (*feed.names(object), *UNNAMED)):
             yield None
         unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
+        wheels = _Wheels(feed, self._wheels(feed, name))
         yield from unit.rehearse(name)
         odometry = unit.odometry()
+        odometry.reckoned = wheels.reckoned
         seen: list[Follow] = []
-        self._made[:] = [feed, seen, unit]
+        self._made[:] = [feed, seen, unit, wheels.name]
         config = self.config.submap
         kept: list[Follow] = []
         k, key, way, told, mapped, most = -1, 0, 0.0, False, False, 0
         while True:
-            while not feed.ended and (feed.count(name) <= k + 2 or not unit.reaches(feed.part(name, k + 1, k + 2))):
+            while not feed.ended and (
+                feed.count(name) <= k + 2
+                or not unit.reaches(feed.part(name, k + 1, k + 2))
+                or not wheels.reaches(feed.part(name, k + 1, k + 2))
+            ):
                 yield None
             k, scans = k + 1, feed.count(name)  # only the end tells that a scan is the last
             if k >= scans:
                 break
             clouds = self._checked(name, feed.part(name, k, k + 1))
             unit.hear(float(clouds.times[0]))
+            wheels.hear(float(clouds.times[0]))
             seen.append(self._follow(odometry, clouds, 0))
             mapped, most = mapped or seen[-1].seen.state in MAPPED, max(most, seen[-1].seen.points)
             feed.let_go(name, k + 1)
@@ -196,7 +209,7 @@ class LidarFrontEnd(FrontEnd):
                     base = kept[0].pose
                     if key == 0 and odometry.inertial is not None:
                         base = upright(base, odometry.inertial.up)
-                    yield _submap((name, unit.name), base, kept, origin, config, key, ended, bent)
+                    yield _submap((name, unit.name, wheels.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
                 for i in range(k - n, k):  # what is in a submap is asked for once more, by a refinement
                     seen[i] = replace(seen[i], points=seen[i].points.astype(np.float32))
@@ -224,10 +237,15 @@ class LidarFrontEnd(FrontEnd):
             unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
             for _ in unit.rehearse(name):
                 pass
+            wheels = _Wheels(feed, self._wheels(feed, name))
+            wheels.hear()
             odometry = unit.odometry()
-            self._made[:] = [feed, [self._follow(odometry, clouds, k) for k in range(len(clouds))], unit]
-        _, seen, unit = self._made
-        return _steps(log, name, clouds, seen, self.config, unit.tilt(log, *_stamped(seen)))
+            odometry.reckoned = wheels.reckoned
+            followed = [self._follow(odometry, clouds, k) for k in range(len(clouds))]
+            self._made[:] = [feed, followed, unit, wheels.name]
+        _, seen, unit, moves = self._made
+        uses = {name} | ({moves} if any(f.seen.bridged for f in seen) else set())
+        return _steps(log, frozenset(uses), clouds, seen, self.config, unit.tilt(log, *_stamped(seen)))
 
     def forget(self) -> None:
         """Let go of the path and the scans of the last log."""
@@ -260,6 +278,20 @@ class LidarFrontEnd(FrontEnd):
             raise ConfigError(f"frontend.imu = {name!r} is no IMU; got {type(stream).__name__}")
         scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
         return name if len(stream.times) and len(scans) and stream.times[0] <= scans[-1] else None
+
+    def _wheels(self, feed: Feed, clouds: str) -> str | None:
+        """Name of the odometry that is taken: one that tells motions as soon as the first scans are made."""
+        asked = self.config.wheels
+        name = feed.of_type(Odometry) if asked == "auto" else asked
+        scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
+        if name is None or name == "none" or not len(scans):
+            return None
+        stream = feed.part(name)
+        if not isinstance(stream, Odometry):
+            raise ConfigError(f"frontend.wheels = {name!r} is no odometry; got {type(stream).__name__}")
+        some = stream.increments[stream.times <= scans[-1]]
+        level = some.shape[1] == 3 or np.abs(some[:, 2:5]).max(initial=0.0) <= LEVEL
+        return name if len(some) and (level or asked != "auto") else None
 
     def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> Follow:
         seen = _step(odometry, clouds, k)
@@ -303,29 +335,38 @@ class _Unit:
             self._heard = n
 
     def rehearse(self, clouds: str) -> Iterator[None]:
-        """Follow the first scans to learn what the unit does not know; None: more records are wanted."""
+        """Follow the first scans to learn what the unit does not know; None: more records are wanted.
+
+        A unit that does not tell the turns of these scans is trusted in a second try: where scans are so bent or so
+        sparse that they follow their own pattern rather than the place, they are straightened and led by it. If it
+        tells the turns then, and scans fit as well or better, the scans were wrong, not the unit.
+        """
         if self.name is None:
             return
         while not self.feed.ended and self.feed.count(self.name) < USUAL:
             yield None
-        self._heard = self.feed.count(self.name)
-        self.inertial = Inertial(self._part(0, self._heard))
-        odometry = LidarOdometry(self.config, self.inertial)
-        for k in range(REHEARSED):
-            while not self.feed.ended and (
-                self.feed.count(clouds) <= k or not self.reaches(self.feed.part(clouds, k, k + 1))
-            ):
-                yield None
-            if k >= self.feed.count(clouds):
-                break
-            self.hear()
-            _step(odometry, self.feed.part(clouds, k, k + 1), 0)
-            if self.inertial.rehearsed:
-                break
-        if self.inertial.believed and self.inertial.known:
-            self.inertial.rewind()
-        else:
-            self.inertial = Inertial(self._part(0, self._heard))  # it may be believed later
+        fitted: list[float] = []
+        for trusted in (False, True):
+            self._heard = self.feed.count(self.name)
+            self.inertial = Inertial(self._part(0, self._heard), trusted=trusted)
+            odometry, overlaps = LidarOdometry(self.config, self.inertial), []
+            for k in range(REHEARSED):
+                while not self.feed.ended and (
+                    self.feed.count(clouds) <= k or not self.reaches(self.feed.part(clouds, k, k + 1))
+                ):
+                    yield None
+                if k >= self.feed.count(clouds):
+                    break
+                self.hear()
+                overlaps.append(_step(odometry, self.feed.part(clouds, k, k + 1), 0).overlap)
+                if self.inertial.rehearsed and not trusted:
+                    break
+            self.inertial.trusted = False
+            fitted.append(float(np.median(overlaps[1:])) if len(overlaps) > 1 else 0.0)
+            if self.inertial.believed and self.inertial.known and fitted[-1] >= fitted[0]:
+                self.inertial.rewind()
+                return
+        self.inertial = Inertial(self._part(0, self._heard))  # it may be believed later
 
     def odometry(self) -> LidarOdometry:
         """At its start."""
@@ -342,6 +383,40 @@ class _Unit:
         assert self.name is not None
         stream = self.feed.part(self.name, first, last)
         assert isinstance(stream, Imu)
+        return stream
+
+
+class _Wheels:
+    """The odometry of a feed, if there is one that is taken.
+
+    Parameters
+    ----------
+    feed : Feed
+    name : str or None
+    """
+
+    def __init__(self, feed: Feed, name: str | None) -> None:
+        self.feed, self.name = feed, name
+        self.reckoned = None if name is None else Reckoned(self._part(0, 0))
+        self._heard = 0
+
+    def reaches(self, scan: Stream) -> bool:
+        """Have its records come up to the stamp of a scan?"""
+        return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
+
+    def hear(self, now: float = -np.inf) -> None:
+        """Take the records that have come, and forget those that are of no use any more ``now`` [s]."""
+        if self.name is None or self.reckoned is None:
+            return
+        n = self.feed.count(self.name)
+        if n > self._heard:
+            self.reckoned.more(self._part(self._heard, n), now - OF_USE)
+            self._heard = n
+
+    def _part(self, first: int, last: int) -> Odometry:
+        assert self.name is not None
+        stream = self.feed.part(self.name, first, last)
+        assert isinstance(stream, Odometry)
         return stream
 
 
@@ -411,7 +486,7 @@ def _stamped(made: list[Follow]) -> tuple[Array, Array]:
 
 
 def _submap(
-    names: tuple[str, str | None],
+    names: tuple[str, str | None, str | None],
     base: Array,
     kept: list[Follow],
     origin: Array,
@@ -454,7 +529,11 @@ def _submap(
     aided = sum(f.seen.aided for f in kept[int(key > 0) :])
     if names[1] is not None:
         report["scans_aided"] = aided
-    findings = [*bent, *_findings(key, kept, report, names[1])]
+    bridged = sum(f.seen.bridged for f in kept[int(key > 0) :])
+    watched = any(f.seen.watched for f in kept[int(key > 0) :])
+    if names[2] is not None:
+        report["scans_bridged"] = bridged
+    findings = [*bent, *_findings(key, kept, report, names[1:])]
     if findings:
         report["findings"] = [f.as_row() for f in findings]
     cloud = None
@@ -470,30 +549,42 @@ def _submap(
         trajectory=Trajectory(np.array([f.time for f in kept]), path, C),
         grid=grid,
         cloud=cloud,
-        uses=frozenset({names[0]}),
-        aids=frozenset({names[1]} if names[1] is not None and aided else ()),
+        uses=frozenset(n for n, used in ((names[0], True), (names[2], bridged)) if n is not None and used),
+        aids=frozenset(n for n, of in ((names[1], aided), (names[2], watched and not bridged)) if n is not None and of),
         report=report,
     )
 
 
-def _findings(key: int, kept: list[Follow], report: dict[str, Any], imu: str | None) -> list[Finding]:
+def _findings(
+    key: int, kept: list[Follow], report: dict[str, Any], names: tuple[str | None, str | None]
+) -> list[Finding]:
     out, n = [], report["scans"]
+    imu, wheels = names
     if imu is not None and report["scans_aided"] < 0.5 * n:
         text = (
             f"Submap {key}: {imu} was left aside in {n - report['scans_aided']} of {n} scans. There its readings have "
             "a pause, or an even motion tells the turns between scans better: look at its axes, units and stamps."
         )
         out.append(Finding("look", "imu-left-aside", text))
+    own = kept[int(key > 0) :]
+    alone = sum(f.seen.unheld == 6 and not f.seen.bridged for f in own)
+    even = "The path there is that of an even motion, and the covariance as wide as that may be off."
     if report["scans_lost"] > MANY * n + (BEGUN if key == 0 else 0):
         text = (
             f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
-            "are not in it. The path there is that of an even motion, and the covariance as wide as that may be off."
+            "are not in it. "
         )
-        out.append(Finding("bad" if report["scans_lost"] > 0.5 * n else "look", "scans-lost", text))
+        if alone < report["scans_lost"]:
+            but = f", but for {alone} of them, of which it tells nothing" if alone else ""
+            text += f"The path there is that of {wheels}{but}, with a covariance as scans elsewhere found it to be off."
+        else:
+            text += even
+        out.append(Finding("bad" if alone > 0.5 * n else "look", "scans-lost", text))
     if report["scans_unheld"] > 0.5 * n:
+        by = "an even motion" if not any(f.seen.bridged for f in own) else wheels
         text = (
             f"Submap {key}: nothing holds {report['scans_unheld']} of {n} scans along some direction, as in a corridor "
-            "or on a plain. The path along it is that of an even motion."
+            f"or on a plain. The path along it is that of {by}."
         )
         out.append(Finding("look", "scans-unheld", text))
     return out
@@ -501,7 +592,7 @@ def _findings(key: int, kept: list[Follow], report: dict[str, Any], imu: str | N
 
 def _steps(
     log: SensorLog,
-    name: str,
+    uses: frozenset[str],
     clouds: PointClouds,
     made: list[Follow],
     config: LidarFrontEndConfig,
@@ -527,7 +618,7 @@ def _steps(
         tilt=None if tilt is None else tilt.at(times, poses),
         tilt_sigma=0.0 if tilt is None else tilt.sigma,
         tilt_time=1.0 if tilt is None else tilt.time,
-        uses=frozenset({name}),
+        uses=uses,
         name=log.name,
         truth=log.truth.trajectory if log.truth is not None else None,
     )

@@ -191,6 +191,8 @@ class Inertial:
     Parameters
     ----------
     imu : Imu
+    trusted : bool
+        It is believed whatever scans say, until this is taken back.
 
     Attributes
     ----------
@@ -200,8 +202,8 @@ class Inertial:
         In the body at the last scan that was learned [m/s], [m/s²].
     """
 
-    def __init__(self, imu: Imu) -> None:
-        self.readings = Readings(imu)
+    def __init__(self, imu: Imu, *, trusted: bool = False) -> None:
+        self.readings, self.trusted = Readings(imu), trusted
         n = imu.noise
         self._bias_var = max(n.gyro_bias, 1e-6) ** 2
         self.bias, self.bias_var = np.zeros(3), self._bias_var
@@ -220,6 +222,8 @@ class Inertial:
     @property
     def believed(self) -> bool:
         """Does it tell turns as well as scans do, or far better than an even motion?"""
+        if self.trusted:
+            return True
         if len(self.missed) < FEWEST:
             return False
         own, even = np.median(self.missed, axis=0)  # the first matches of a map may be poor

@@ -22,6 +22,7 @@ from graphslam.frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, 
 from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam.frontends.lidar_odometry.inertial import Inertial
 from graphslam.frontends.lidar_odometry.joint import JointErrors
+from graphslam.frontends.lidar_odometry.reckoned import Reckoned
 from graphslam.frontends.scan_window.tracker import directions
 
 Index = npt.NDArray[np.int64]
@@ -48,6 +49,8 @@ LIKELY = 0.85
 """Overlap of the prediction's match beside the running median above which rotations are not searched …"""
 NEAR = (np.deg2rad(4.0), 0.6)
 """… if it corrects the prediction by less than this [rad], [m]."""
+FAR = 5.0
+"""What overlaps little is no new space where it corrects the prediction by so many of its σ more than that."""
 LATE = 2.5
 """Time since the last scan, in usual ones, from which a scan is looked for far and wide anyhow."""
 BETTER = 1.2
@@ -98,6 +101,10 @@ class Seen:
     searched : bool
     aided : bool
         An IMU told where the match began, or unbent the points.
+    watched : bool
+        Odometry told the motion, and was of use so far: it leads if it is better, stands where nothing is matched.
+    bridged : bool
+        The pose, or what of it no surface holds, is that of odometry.
     """
 
     points: int
@@ -106,6 +113,8 @@ class Seen:
     state: str
     searched: bool
     aided: bool = False
+    watched: bool = False
+    bridged: bool = False
 
 
 def _spreads() -> tuple[Array, Array]:
@@ -158,6 +167,8 @@ class LidarOdometry:
     config : LidarOdometryConfig
     inertial : Inertial, optional
         Tells where a match begins and how a scan is bent, as long as it is believed; an even motion does otherwise.
+    reckoned : Reckoned, optional
+        Odometry: where nothing is matched, and where a match begins if no IMU tells it.
 
     Attributes
     ----------
@@ -170,8 +181,10 @@ class LidarOdometry:
     errors : JointErrors
     """
 
-    def __init__(self, config: LidarOdometryConfig, inertial: Inertial | None = None) -> None:
-        self.config, self.inertial = config, inertial
+    def __init__(
+        self, config: LidarOdometryConfig, inertial: Inertial | None = None, reckoned: Reckoned | None = None
+    ) -> None:
+        self.config, self.inertial, self.reckoned = config, inertial, reckoned
         last = len(config.levels) - 1
         self.levels = [
             CellMap(LevelConfig(size, config.finest_sigma if k == last else 0.25 * size, k == last))
@@ -230,7 +243,14 @@ class LidarOdometry:
         before = self.pose
         even = se3.se3_compose(before, self.predict(time))
         ahead = None if self.inertial is None else self.inertial.ahead(time)
-        predicted = even if ahead is None else ahead
+        told, bridge, Q, led = None, None, None, False
+        if self.reckoned is not None and self.scan > 0:
+            told = self.reckoned.motion(self.time, time)
+            if told is not None and self.reckoned.useful:
+                bridge = np.asarray(se3.se3_compose(before, told[0]))
+                Q = np.diag(np.repeat(self.reckoned.variances(told[1]), 3))
+                led = ahead is None and (self.lost > 0 or self.reckoned.better)
+        predicted = ahead if ahead is not None else bridge if led and bridge is not None else even
         rows = thin(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
         kept = rows[evenly(len(rows), c.most_kept)]
         raw = self._raw(cloud[kept], None if ages is None or not c.deskew else ages[kept], time)
@@ -242,13 +262,22 @@ class LidarOdometry:
             seen = Seen(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
             self.first += len(points) < FEW
             fit = None
+            if bridge is not None:
+                self.pose, seen = bridge, replace(seen, bridged=True)
         else:
-            self.pose, fit, seen = self._match(raw, chosen, predicted, time)
+            self.pose, fit, seen = self._match(raw, chosen, predicted, bridge, Q, time)
+            seen = replace(seen, watched=bridge is not None, bridged=bridge is not None and seen.unheld > 0)
         if ahead is not None or raw.straight is not None:
             seen = replace(seen, aided=True)
         self.points = self._unbent(raw, self.pose, time)
         points = self.points[chosen]
-        self._doubt(raw, points, before, predicted, even, dt, fit, seen)
+        if seen.bridged and bridge is not None:
+            predicted = bridge
+        self._doubt(raw, points, before, predicted, even, dt, fit, seen, Q if seen.bridged else None)
+        sure = fit is not None and not seen.unheld and not self.lost and seen.state in MAPPED
+        if sure and told is not None and self.reckoned is not None:
+            made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
+            self.reckoned.learn(told[0], made, guess)
         if self.inertial is not None and seen.state in MAPPED:
             self.inertial.learn(time, self.pose, even)
         if seen.state in MAPPED:
@@ -337,11 +366,13 @@ class LidarOdometry:
         dt: float,
         fit: Fit | None,
         seen: Seen,
+        reckoned: Array | None = None,
     ) -> None:
         """How far the pose of now is off, jointly with those of the window.
 
         What is expected of a motion is what an even one would miss, also where an IMU predicted it: nothing of what
-        that tells is in the covariance, so that a graph may still count it.
+        that tells is in the covariance, so that a graph may still count it. Where odometry stands for scans, what it
+        may miss is: ``reckoned`` (6, 6).
         """
         motion = se3.se3_between(before, predicted)
         if seen.state in MAPPED and seen.state != "first":
@@ -357,6 +388,9 @@ class LidarOdometry:
         self.spread = np.diag([turn2] * 3 + [shift2] * 3)
         # a speed that nothing holds is off for as long as nothing holds it
         Q = self.loose**2 * self.spread
+        if reckoned is not None:
+            # as far as it is off in one way all along, σ grows with the time: k² − (k − 1)² of it are of this step
+            Q = self.spread = (2 * self.loose - 1) * reckoned
         H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
         if fit is not None and self.errors.ends:
             H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
@@ -379,10 +413,34 @@ class LidarOdometry:
 
     # --- matching ----------------------------------------------------------------------------------------------------
 
-    def _match(self, raw: Raw, chosen: Index, predicted: Array, time: float) -> tuple[Array, Fit | None, Seen]:
+    def _match(
+        self,
+        raw: Raw,
+        chosen: Index,
+        predicted: Array,
+        bridge: Array | None,
+        told: Array | None,
+        time: float,
+    ) -> tuple[Array, Fit | None, Seen]:
+        """Pose of a scan, the fit there, and what came of it.
+
+        Parameters
+        ----------
+        raw : Raw
+        chosen : (k,) int
+        predicted : (7,)
+            Where the match begins.
+        bridge : (7,) or None
+            Where odometry puts it; stands where no surface does.
+        told : (6, 6) or None
+            Covariance of that motion; None: of an even one, as scans saw it lately.
+        time : float
+            [s]
+        """
         points = self._unbent(raw, predicted, time)[chosen]
+        stands = predicted if bridge is None else bridge
         if len(points) < FEW:
-            return predicted, None, Seen(len(points), 0.0, 6, "empty", False)
+            return stands, None, Seen(len(points), 0.0, 6, "empty", False)
         few = points[evenly(len(points), SEARCHED)]
         top = self.levels[:-1] or self.levels
         start, coarse = self._descend(points, predicted, top)
@@ -408,13 +466,14 @@ class LidarOdometry:
                 fits = (
                     not self.lost and fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
                 )
-                state = "new space" if fits else "lost"
+                spread = self.spread if told is None else told
+                state = "new space" if fits and not _far(stands, pose, spread) else "lost"
         if state == "lost":
-            return predicted, None, Seen(len(points), fit.overlap, 6, state, searched)
+            return stands, None, Seen(len(points), fit.overlap, 6, state, searched)
         if fit.known < LITTLE:
-            return start, None, Seen(len(points), fit.overlap, 6, state, searched)
-        free, (pose, unheld) = pose, self._hold(pose, predicted, fit)
-        if unheld and len(self.missed) < 3:
+            return start if bridge is None else bridge, None, Seen(len(points), fit.overlap, 6, state, searched)
+        free, (pose, unheld) = pose, self._hold(pose, stands, fit)
+        if unheld and bridge is None and len(self.missed) < 3:
             # nobody knows yet how it moves: rest is believed where the scan fits there as well
             points = self._unbent(raw, pose, time)[chosen]
             if self.levels[-1].fit(points, *_split(pose), SCALE).overlap < LIKELY * fit.overlap:
@@ -486,6 +545,13 @@ class LidarOdometry:
             xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
             pose = np.asarray(se3.se3_compose(predicted, se3.se3_exp(xi)))
         return pose, unheld
+
+
+def _far(predicted: Array, pose: Array, spread: Array) -> bool:
+    """Is a pose farther from the prediction than that may be off?"""
+    off = se3.se3_log(se3.se3_between(predicted, pose))
+    turn, shift = (FAR * np.sqrt(np.trace(block)) for block in (spread[:3, :3], spread[3:, 3:]))
+    return bool(np.linalg.norm(off[:3]) > NEAR[0] + turn or np.linalg.norm(off[3:]) > NEAR[1] + shift)
 
 
 def held(H: Array, every: Array) -> Array:
