@@ -11,14 +11,22 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_compose, se2_transform
+from graphslam.core.plan_view import plan_path
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.statistics import ErrorStatistics
 
 Mask = npt.NDArray[np.bool_]
+FEWEST = 8
+"""Fewer fixes are no test of a path: a frame that is moved onto them takes up three numbers of what they say."""
+ROUNDS = 30
+"""Of weights, until distances are those of the least sum."""
+NEAR = 1e-4
+"""Square of a distance over its variance from which on a fix is as good as on the path."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,6 +146,79 @@ def gps_residuals(
         fitted=fitted,
         outside=int(np.sum(score & ~inside)),
         in_gap=int(np.sum(score & gap)),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixDistances:
+    """Distances of fixes from a path that was made without them, against what path and fixes say of themselves.
+
+    Parameters
+    ----------
+    median : float
+        Median distance in the plane [m].
+    expected : float
+        Square root of the median variance of such a distance: of the path, there, and of the fix [m].
+    ratio : float
+        Median of the squared distances over their variances.
+    fixes : int
+    """
+
+    median: float
+    expected: float
+    ratio: float
+    fixes: int
+
+    @property
+    def chance(self) -> float:
+        """How probable so large a ratio is at most, if what is stated is right, however errors are correlated.
+
+        The least favourable case is that all errors are one and the same along one axis; the median then is one draw of
+        χ² with one degree of freedom.
+        """
+        return float(stats.chi2.sf(self.ratio, 1))
+
+
+def fix_distances(trajectory: Trajectory, gps: Gps, *, sigma: float | None = None) -> FixDistances | None:
+    """Hold a path against fixes that had no part in it.
+
+    Its frame is moved onto the fixes first, by the least sum of distances over their standard deviations, which half of
+    the fixes could be wild without moving much. The right frame is among those that are tried, so that no correlation
+    between poses, which nobody states, makes the distances larger than the variances say: the test is one-sided.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        With covariances; of a path in space, what is seen from above.
+    gps : Gps
+    sigma : float, optional
+        σ of each coordinate [m] in place of the stream's own.
+
+    Returns
+    -------
+    FixDistances or None
+        None where fewer than :data:`FEWEST` fixes lie on the path, or it has no covariances.
+    """
+    path = plan_path(trajectory) if trajectory.dim == 3 else trajectory
+    if path.covariances is None or not len(path):
+        return None
+    on = (gps.times >= path.times[0]) & (gps.times <= path.times[-1])
+    if np.sum(on) < FEWEST:
+        return None
+    t, z, arm = gps.times[on], gps.positions[on, :2], gps.lever[:2]
+    points = se2_transform(path.interpolate(t), np.broadcast_to(arm, (len(t), 2)))
+    C = path.interpolate_covariance(t)
+    R = np.trace(gps.noise[on][:, :2, :2], axis1=1, axis2=2) if sigma is None else np.full(len(t), 2 * sigma**2)
+    variances = C[:, 0, 0] + C[:, 1, 1] + (arm @ arm) * C[:, 2, 2] + R
+    w = 1.0 / variances
+    for _ in range(ROUNDS):
+        d2 = np.sum((z - se2_transform(align_se2(points, z, w), points)) ** 2, axis=1)
+        w = 1.0 / (variances * np.sqrt(np.maximum(d2 / variances, NEAR)))
+    return FixDistances(
+        median=float(np.sqrt(np.median(d2))),
+        expected=float(np.sqrt(np.median(variances))),
+        ratio=float(np.median(d2 / variances)),
+        fixes=len(t),
     )
 
 

@@ -102,9 +102,10 @@ class ImuUnits:
             self.graph.note("imu-axes", stream=stream, verdict="not checked", why=str(error))
             return ""
         words = found.words()
+        verdict = "wrong" if found.wrong else "as stated" if found.turns is None else "unlike"
         self.graph.note(
-            "imu-axes", stream=stream, verdict="wrong" if found.wrong else "as stated", words=words,
-            excess=found.excess, alike=found.alike, windows=found.windows,
+            "imu-axes", stream=stream, verdict=verdict, words=words, excess=found.excess, alike=found.alike,
+            windows=found.windows, turns=found.turns,
         )  # fmt: skip
         if axes == "refuse":
             found.raise_if_wrong(stream)

@@ -589,7 +589,9 @@ def _judge(
     base = true_first_base(log, submaps[0])
     true_path = truth_path(log, global_map.trajectory.times, submaps[0])
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
-    checks = check_without_truth(out, back.graph, identified, global_map.base_poses, gps, settings)
+    checks = check_without_truth(
+        out, back.graph, identified, global_map.trajectory, global_map.base_poses, gps, settings
+    )
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:

@@ -47,6 +47,7 @@ ADVICE: dict[str, str] = {
     "imu-stuck": "leave the stuck IMU out (--set imu.use=none)",
     "imu-saturated": "look at the turns in which the IMU was saturated",
     "imu-axes": "correct the mounting of the IMU (T_base_imu)",
+    "imu-and-path": "look where the path turns otherwise than the gyro, and check unit and clock of the gyro",
     "turns-disagree": "correct the unit or the mounting of the gyro",
     "odometry-leaps": "give the raw odometry, without corrections by another map",
     "heading-not-ahead": "check unit, zero and sign of the headings of the odometry",
@@ -80,6 +81,7 @@ ADVICE: dict[str, str] = {
     "residuals": "check units and signs of wheels and sightings, or state more noise",
     "imu-contradicted": "state more noise for the IMU, or leave it out (--set imu.use=none)",
     "consistency-test": "find out why the measurements that are named below contradict the others",
+    "gps-contradicts": "use the GPS fixes (--set gps.use=all) and see what then contradicts",
     "interrupted": "go on with it: the same command, with --resume",
     # then what its covariances say
     "nees": "do not rely on its covariances before other seeds say the same (--seed 1, 2, …)",

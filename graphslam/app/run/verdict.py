@@ -19,7 +19,7 @@ from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
-from graphslam.evaluate.trust import Evidence, Trust, rows_of_json, trust
+from graphslam.evaluate.trust import LEVEL, Evidence, Trust, rows_of_json, trust
 from graphslam.evaluate.without_truth import LASTING, two_sided
 from graphslam.loops.disputes import AMBIGUOUS
 from graphslam.loops.ledger import ledger_of_events
@@ -119,6 +119,7 @@ _STATED = frozenset(
         "passes-attempts",
         "flagged",
         "imu-axes",
+        "imu-and-path",
     }
     | {"imu-contradicted", "session"}
 )
@@ -426,6 +427,13 @@ def _tests(figures: Figures) -> list[Finding]:
     m = figures.metrics
     cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
     judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
+    median, expected, chance = (m.get(f"gps_distance_{k}") for k in ("median", "expected", "chance"))
+    if median is not None and expected is not None and chance is not None and chance < LEVEL:
+        text = (
+            f"The fixes, of which none was used, lie {median:.3g} m from the path (the median); the covariances of "
+            f"path and fixes explain {expected:.2g} m: {cause} With --set gps.use=all they hold the map."
+        )
+        out.append(Finding("bad" if chance < 1.0 - CERTAIN else "look", "gps-contradicts", text))
     alike, white = m.get("gps_nis_joint_autocorrelation"), m.get("gps_nis_joint_white")
     if alike is not None and white is not None and abs(alike) > white * CERTAIN_OVER_CONFIDENT:
         text = f"Errors of withheld fixes are alike from one to the next (correlation {alike:.2f}; independent ones "
@@ -550,6 +558,14 @@ def _left_out(figures: Figures) -> list[Finding]:
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
             out.append(Finding("bad", "imu-axes", f"IMU {e.get('stream')}: {e.get('words')}"))
+        if e.get("event") == "imu-axes" and e.get("verdict") == "unlike":
+            moved, missed = e["turns"]
+            text = (
+                f"IMU {e.get('stream')}: the path turns otherwise than the gyro does, whatever its axes are: by "
+                f"{missed:.2g} rad/s, where the gyro turns by {moved:.2g} rad/s. The path follows something else than "
+                "the place, or unit or clock of the gyro is wrong."
+            )
+            out.append(Finding("bad", "imu-and-path", text))
         if e.get("event") == "imu-axes" and e.get("verdict") == "not checked":
             why = f"could not be checked ({e.get('why')})"
             text = f"IMU {e.get('stream')}: whether its axes are those of its mounting {why}."

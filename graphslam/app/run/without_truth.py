@@ -15,6 +15,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.markup import frame
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps import FixDistances, fix_distances
 from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
 from graphslam.evaluate.intervals import two_sided_width
 from graphslam.evaluate.loop_consistency import LoopConsistency, find_loops, loop_consistency
@@ -42,11 +44,14 @@ class WithoutTruth:
         Withheld fixes; None where none were withheld or the graph has no GPS.
     loops : LoopConsistency or None
         None where no two submaps share two landmarks.
+    fixes : FixDistances or None
+        Of a log whose fixes had no part in the map.
     """
 
     classes: dict[str, ClassConsistency]
     gps: GpsInnovations | None
     loops: LoopConsistency | None
+    fixes: FixDistances | None = None
 
     def table(self) -> pd.DataFrame:
         """One row a test: value (honest: 1), two-sided bounds, verdict, and the dof behind the bounds."""
@@ -95,6 +100,9 @@ class WithoutTruth:
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
                     out.append(by_score("withheld fixes from one to the next", "fixes", score))
+        if self.fixes is not None and self.fixes.ratio > 1.0:  # one-sided: fixes that lie close say nothing
+            f = self.fixes
+            out.append(Evidence("squared distances from the GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
         if self.loops is not None:
             r = self.loops.test()
             out += by_size("loops against each other", "map", r["value"], r["dof"])
@@ -108,6 +116,7 @@ def check_without_truth(
     out: Metrics,
     graph: PoseGraph,
     submaps: Sequence[Submap],
+    path: Trajectory,
     poses: Array,
     gps: Gps | None,
     settings: RunConfig,
@@ -120,6 +129,8 @@ def check_without_truth(
         At its optimum.
     submaps : sequence of Submap
         Identified.
+    path : Trajectory
+        The result.
     poses : (m + 1, 3|7)
         Solved bases of the submaps and end of the last.
     gps : Gps or None
@@ -142,19 +153,26 @@ def check_without_truth(
             for key in ("value", "low", "high", "dof", "autocorrelation", "white", "inside"):
                 direction = "one" if key == "value" else "none"
                 out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)
+    fixes = None
+    if gps is not None and graph.values.datum is None:
+        fixes = fix_distances(path, gps, sigma=settings.gps.sigma)
+    if fixes is not None:
+        out.add("gps_distance_median", fixes.median, "m", "lower")
+        out.add("gps_distance_expected", fixes.expected, "m")
+        out.add("gps_distance_chance", fixes.chance)
     loops = None
     if graph.dim == 3:  # no landmarks to compare loops by
-        return WithoutTruth(classes, innovations, None)
+        return WithoutTruth(classes, innovations, None, fixes)
     try:
         known = [graph.as_known(s) for s in submaps]
         found = find_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)
     except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
-        return WithoutTruth(classes, innovations, None)
+        return WithoutTruth(classes, innovations, None, fixes)
     test = loops.test()
     for key in ("value", "low", "high", "dof", "loops", "inside", "shape"):
         out.add(f"loops_{key}", test[key], "", "one" if key in ("value", "shape") else "none")
-    return WithoutTruth(classes, innovations, loops)
+    return WithoutTruth(classes, innovations, loops, fixes)
 
 
 def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsInnovations | None:

@@ -118,3 +118,16 @@ def test_one_turned_sensor_is_found(which: str) -> None:
     assert found.wrong
     np.testing.assert_array_equal(found.A, upside)
     assert found.sensor == {"angular_rate": "gyro", "specific_force": "accelerometer"}[which]
+
+
+def test_a_path_that_turns_otherwise_whatever_the_axes_is_no_word_on_them() -> None:
+    """A path that follows something else than the place: its turns and its tilt are its own."""
+    imu, path = drive(tilt=0.15)
+    t = path.times
+    leaning = np.stack([0.1 * t, np.sin(0.5 * t), np.zeros_like(t)], axis=1)
+    found = check_imu_axes(imu, Trajectory(t, np.concatenate([path.poses[:, :3], se3.so3_exp(leaning)], axis=1)))
+    assert found.turns is not None
+    assert found.turns[1] > found.turns[0] / np.sqrt(2.0)
+    assert not found.wrong
+    assert not found.words()
+    assert check_imu_axes(imu, path).turns is None

@@ -24,6 +24,8 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.trajectory import Trajectory
 
 _AXES = "xyz"
+TURNING = 0.05
+"""Turns of a body over a window that a path should know of [rad/s]."""
 
 
 def signed_permutations() -> Array:
@@ -54,6 +56,9 @@ class AxesCheck:
     windows : int
     sensor : {"both", "accelerometer", "gyro"}
         Whose readings A explains.
+    turns : (float, float) or None
+        What the gyro turns by (root mean square over the windows), and by how much the path turns otherwise whatever
+        the axes [rad/s], where that is as much: nothing can be said of the axes then.
     """
 
     wrong: bool
@@ -62,6 +67,7 @@ class AxesCheck:
     alike: int
     windows: int
     sensor: str = "both"
+    turns: tuple[float, float] | None = None
 
     def words(self) -> str:
         """Which axis reads what: ``"x reads −y, y reads x"``; empty if they are as stated."""
@@ -140,7 +146,10 @@ def check_imu_axes(
     r = rate - np.einsum("aij,kj->aki", ways, turn)
     r -= r.mean(axis=1, keepdims=True)  # the bias
     # a gyro that no way brings near the path (degrees for radians) tells nothing of how the body leans
-    believed = float((r**2).sum(axis=(1, 2)).min()) < 0.5 * float(((rate - rate.mean(axis=0)) ** 2).sum())
+    squares = float((r**2).sum(axis=(1, 2)).min()), float(((rate - rate.mean(axis=0)) ** 2).sum())
+    missed, moved = (float(np.sqrt(x / len(rate))) for x in squares)
+    believed = missed**2 < 0.5 * moved**2
+    unlike = not believed and moved > max(TURNING, 5.0 * imu.noise.gyro / np.sqrt(window))
     turned = _turned(imu) if believed else np.zeros((len(imu.times), 3))
     ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
     since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
@@ -159,7 +168,9 @@ def check_imu_axes(
         chi2, sensor = (pull, "accelerometer") if pull[0] > limit else (gyro, "gyro")
     best = int(np.argmin(chi2))
     excess = float(chi2[0] - chi2[best])
-    return AxesCheck(excess > limit, ways[best], excess, int(np.sum(chi2 - chi2[best] <= limit)), len(rate), sensor)
+    alike = int(np.sum(chi2 - chi2[best] <= limit))
+    turns = (moved, missed) if unlike else None
+    return AxesCheck(excess > limit and not unlike, ways[best], excess, alike, len(rate), sensor, turns)
 
 
 def _turned(imu: Imu) -> Array:
