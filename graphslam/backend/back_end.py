@@ -16,6 +16,7 @@ from graphslam.association.landmarks import AssociationConfig, associate
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
+from graphslam.backend.rivals import TwoMaps, two_maps
 from graphslam.backend.streams import FixPart, ImuPart, recentred
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
@@ -89,6 +90,8 @@ class BackEnd:
     fixes: FixPart | None = None
     """Fixes of the log, where they are to be used as they come."""
     observers: Sequence[Observer] = ()
+    two_maps: TwoMaps | None = None
+    """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
@@ -241,6 +244,8 @@ class BackEnd:
             else:
                 self.undo_loop(loop)
         start = time.perf_counter()
+        if self._loops is not None and self._loops.closer is not None:
+            self.two_maps = two_maps(self.graph, self.solver, self._loops.closer)
         recentred(self.graph, self.solver)
         self.split_wrong_identities()
         solution = self.solver.solution()

@@ -22,7 +22,8 @@ solution is needed for it. Every step writes a :class:`~graphslam.loops.ledger.D
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +35,7 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.graph.noise import Robust
-from graphslam.loops.disputes import CLASH, SETTLED, SHUTS_OUT, disputes, weigh
+from graphslam.loops.disputes import AMBIGUOUS, CLASH, SETTLED, SHUTS_OUT, disputes, weigh
 from graphslam.loops.ledger import Decision, LoopLedger, Verdict
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
@@ -78,6 +79,7 @@ class LoopCloser:
         self.ledger = LoopLedger() if ledger is None else ledger
         self.judge, self.witness = judge, witness
         self.loops: dict[int, Loop] = {}
+        self._torn: list[tuple[list[int], list[int]]] = []
         self._dof = group_of(increments).dof
 
     # ---------------------------------------------------------------- deciding
@@ -90,6 +92,28 @@ class LoopCloser:
     def accepted(self) -> list[int]:
         """Numbers of the loops that are in the graph."""
         return [d.loop for d in self.ledger.current() if d.verdict == "accepted"]
+
+    @property
+    def undecided(self) -> list[tuple[list[int], list[int]]]:
+        """Pairs of groups that cannot both be right, of which nothing tells which is: neither is in the graph."""
+        torn = {d.loop for d in self.ledger.current() if d.why.startswith(AMBIGUOUS)}
+        pairs = [([n for n in a if n in torn], [n for n in b if n in torn]) for a, b in self._torn]
+        return [(a, b) for a, b in pairs if a and b]
+
+    @contextmanager
+    def tried(self, numbers: Sequence[int]) -> Iterator[list[int]]:
+        """Of loops that are not in the graph those that it bears, in it while the block lasts; nothing is written."""
+        inside: dict[int, int] = {}
+        for _, n in sorted(zip(self._against_chain(list(numbers)), numbers)):
+            verdict, _, facts = self._try(n)
+            if verdict == "accepted":
+                inside[n] = int(facts["factor_id"])
+        try:
+            yield sorted(inside)
+        finally:
+            for fid in inside.values():
+                self.graph.remove_loop(fid)
+            self.graph.solve()
 
     def propose(self, loops: Sequence[Loop]) -> list[Decision]:
         """Decide on new loops, and again on those that are in or were refused by the company they were in.
@@ -139,6 +163,7 @@ class LoopCloser:
     def _decide(self, new: list[int]) -> None:
         """Rounds: what the graph refuses of the largest set that agrees has no say about the others any more."""
         out: set[int] = set()
+        self._torn = []  # all that lost a dispute are decided on again
         while True:
             refused = self._round(new, out)
             refused |= self._reconsider()
@@ -310,6 +335,7 @@ class LoopCloser:
             if outcome == "changes":
                 self._one_by_one(b)
             elif outcome == "ambiguous":
+                self._torn.append((a, b))
                 for n, value in zip(b, other):
                     self._refuse(n, why, float(value))
             self.graph.solve()

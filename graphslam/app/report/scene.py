@@ -82,6 +82,8 @@ def _references(folder: ReportFolder, dim: int) -> tuple[list[dict[str, Any]], l
     for name, file, colour, on in (
         ("dead reckoning", "dead_reckoning.tum", style.DEAD_RECKONING, False),
         ("graph, before the refinement", "trajectory_graph.tum", style.GRAPH, False),
+        ("two maps, the first", "two_maps/first.tum", style.VERMILION, True),
+        ("two maps, the second", "two_maps/second.tum", style.PURPLE, True),
         ("truth", "truth.tum", style.TRUTH, True),
     ):
         if (folder.path / file).is_file():

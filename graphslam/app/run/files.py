@@ -105,6 +105,11 @@ RUN: dict[str, Any] = {
     "imu?": _PART,
     "calibrate?": _PART,
     "verdict?": _PART,
+    "two_maps?": {
+        "loops": ([int], [int]),
+        **{"apart_max": float, "apart_median": float, "apart_max_node": int, "apart_max_time": float},
+        "places": [{"loops": ([int], [int]), "nodes": ((int, int), (int, int)), "times": ((float, float),) * 2}],
+    },
     "refine?": {
         "rounds?": [
             {

@@ -51,6 +51,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
+from graphslam.loops.ledger import LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import base_frames
 
@@ -73,6 +74,7 @@ SAME_BYTES = (
     ),
     *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
     *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
+    *("two_maps/*",),
     *("scans.npz", "trajectory_graph.tum", "refined/*", "figures/refined.png"),
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
@@ -94,6 +96,8 @@ _MADE_OF_MAP = (
 """What other verbs made of a map, which stays where the map does."""
 
 
+TWO_MAPS = ("two_maps/first", "two_maps/second")
+"""Path (``.tum``) and loops (``.csv``) of two maps of which nothing told which is right."""
 REFINED = "refined"
 """Folder of a run in which the submaps along the refined path lie."""
 SAME_FRAME = 1e-6
@@ -140,6 +144,8 @@ def _write_files(new: Generation, run: Run) -> None:
     for name, path in paths.items():
         if path is not None:
             write_tum(root / f"{name}.tum", path)
+    if run.two_maps is not None:
+        _write_two_maps(new, run)
     if run.refined is not None:
         store = SubmapStore(root / REFINED)
         for s in run.refined.submaps:
@@ -166,6 +172,17 @@ def _write_files(new: Generation, run: Run) -> None:
         write_run_map(new, run.fused, mark["generation"])
         draw_run_map(run.fused, m.trajectory, new.figures, name=run.name, truth=run.truth_path)
     new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
+
+
+def _write_two_maps(new: Generation, run: Run) -> None:
+    """The path of either map, and its ledger: what was in dispute is accepted in one of them."""
+    assert run.two_maps is not None
+    current = ledger_of_events(run.events).current()
+    for name, path, loops in zip(TWO_MAPS, run.two_maps, run.report["two_maps"]["loops"]):
+        (new.path / name).parent.mkdir(exist_ok=True)
+        write_tum(new.path / f"{name}.tum", path)
+        inside = [replace(d, verdict="accepted") if d.loop in loops else d for d in current]
+        new.write_text(f"{name}.csv", LoopLedger(inside).table().to_csv(index=False))
 
 
 def figure_rows(run: Run) -> list[dict[str, Any]]:
@@ -307,6 +324,7 @@ def _open(home: Path, root: Path) -> Run:
         truth_path=_path(root / "truth.tum", m.dim),
         dead_reckoning=_path(root / "dead_reckoning.tum", m.dim),
         graph_path=_path(root / "trajectory_graph.tum", m.dim),
+        two_maps=_two_maps(root, m.dim),
     )
 
 
@@ -364,6 +382,11 @@ def _check_submaps(home: Path, root: Path) -> None:
 
 def _path(file: Path, dim: int) -> Trajectory | None:
     return read_tum(file, dim=dim) if file.is_file() else None
+
+
+def _two_maps(root: Path, dim: int) -> tuple[Trajectory, Trajectory] | None:
+    first, second = (_path(root / f"{name}.tum", dim) for name in TWO_MAPS)
+    return None if first is None or second is None else (first, second)
 
 
 def graph_facts(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:

@@ -637,6 +637,8 @@ def _judge(
         report["lasting"] = lasting
     if refined is not None:
         report["refine"] = refinement_facts(refined.refinement)
+    if back.two_maps is not None:
+        report["two_maps"] = back.two_maps.facts()
     if why_not:
         report["map_left_out"] = why_not
     if fused is not None and fused.said():
@@ -676,6 +678,7 @@ def _judge(
         fused=fused,
         graph_path=None if refined is None else refined.graph_path,
         refined=refined,
+        two_maps=None if back.two_maps is None else (back.two_maps.maps[0].path, back.two_maps.maps[1].path),
     )
 
 

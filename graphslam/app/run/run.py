@@ -104,6 +104,9 @@ class Run:
         Of a refined run the path of the graph, where the refinement began; from disk without covariances.
     refined : Refined or None
         The path refined by its scans; None for a run read back from disk, whose ``map`` has the refined path.
+    two_maps : tuple of two Trajectory, or None
+        Where two groups of loops cannot both be right and nothing told which is: the path of the graph with either,
+        of which ``map`` has neither; from disk without covariances. What is in dispute is in ``report["two_maps"]``.
 
     Examples
     --------
@@ -135,6 +138,7 @@ class Run:
     fused: RunMap | None = _Part()  # type: ignore[assignment]
     graph_path: Trajectory | None = None
     refined: Refined | None = None
+    two_maps: tuple[Trajectory, Trajectory] | None = None
 
     def holds(self, part: str) -> bool:
         """Is ``solution``, ``graph`` or ``fused`` there, made already?"""

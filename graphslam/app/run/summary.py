@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from graphslam.app.run.verdict import Figures, Judged, judged_chi2, judged_nees, judged_trust, number, of_the_start
+from graphslam.app.run.verdict import (
+    TWO_MAPS_DO,
+    Figures,
+    Judged,
+    judged_chi2,
+    judged_nees,
+    judged_trust,
+    number,
+    of_the_start,
+)
 from graphslam.core.errors import DataError
 from graphslam.core.findings import LEVELS, Finding, Level, worst
 from graphslam.loops.ledger import ledger_of_events
@@ -68,7 +77,7 @@ ADVICE: dict[str, str] = {
     "refine-motion": "look for a place taken for another one, or leave the refinement out (--set refine.use=false)",
     "input-better": "take the path of the odometry, or state its noise as small as it is",
     "passes*": "look where walls stand twice in the map, and try another seed (--seed 1)",
-    "loops-undecided": "look at the loops in dispute (`graphslam loops RUN`)",
+    "two-maps": TWO_MAPS_DO,
     "session": "check whether the sessions are of one place",
     "uneven-motion": "give the IMU of the lidar, or move it more steadily",
     "points-without-times": "give the points their times within the scan",

@@ -5,13 +5,11 @@ from __future__ import annotations
 import ast
 import itertools
 import json
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -32,8 +30,6 @@ from graphslam.app.run.summary import (
 from graphslam.app.run.verdict import Figures, observed, stated
 from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst
 from graphslam.evaluate.trust import by_size, rows_as_json
-from graphslam.loops.disputes import weigh
-from graphslam.loops.ledger import Decision
 from tests.reference.page import Page
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -238,18 +234,25 @@ def test_the_note_on_the_join_is_one_that_honest_runs_do_not_get(run: Run) -> No
     assert "covariance_scale" not in line
 
 
-def test_loops_of_which_nothing_tells_are_said() -> None:
-    """Two groups that cannot both be right, neither in the graph; not where one of them was taken since."""
-    why = weigh(np.array([5.4, 5.0, 5.2]), np.array([1.9, 1.7, 1.7]))[1]
-    lost = [Decision(loop=k, verdict="rejected", why=why, i=k, j=k + 40) for k in range(6)]
+def test_two_maps_that_explain_a_log_are_said() -> None:
+    """What is in either, how far they lie apart, and what is in dispute."""
+    place = {"loops": [[3, 4, 5], [7]], "nodes": [[14, 19], [94, 99]], "times": [[42.0, 57.0], [282.0, 297.0]]}
+    facts = {
+        "loops": [[3, 4, 5], [7]],
+        **{"apart_max": 8.125, "apart_median": 0.4, "apart_max_node": 95, "apart_max_time": 285.0},
+        "places": [place],
+    }
 
-    def said(decisions: list[Decision]) -> list[Finding]:
-        return [f for f in stated(Figures({}, {}, [d.event() for d in decisions])) if f.code == "loops-undecided"]
+    def said(report: dict[str, Any]) -> list[Finding]:
+        return [f for f in stated(Figures(report, {}, [])) if f.code == "two-maps"]
 
-    (line,) = said(lost)
+    (line,) = said({"two_maps": facts})
     assert line.level == "bad"
-    assert line.text.startswith("6 loops are in two groups")
+    assert "one with loops 3, 4, 5, one with loop 7." in line.text
+    assert "up to 8.12 m apart in them (at 285 s; median 0.40 m)" in line.text
+    assert "42 to 57 s and 282 to 297 s" in line.text
+    assert "by itself" not in line.text
     assert line.code in ADVICE
-    taken = [replace(d, verdict="accepted", why="agrees with the graph") for d in lost]
-    assert said([*lost, *taken]) == []
-    assert said([]) == []
+    assert said({}) == []
+    two = {**facts, "places": [place, place]}
+    assert "Each of these places by itself" in said({"two_maps": two})[0].text
