@@ -41,7 +41,7 @@ demo: $(BASE)
 	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # The documentation site, build/site/index.html; a warning is an error.
 $(DOCS): $(BASE)

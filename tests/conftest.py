@@ -11,6 +11,14 @@ import pytest
 
 matplotlib.use("Agg")
 
+LONGEST = ("test_notebooks.py", "test_docs.py", "test_study.py", "test_kills.py", "test_refined_run.py")
+"""Files that take a minute or more. They come first, so that no process is left with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order in which files are given to processes; in a file nothing changes."""
+    items.sort(key=lambda item: item.path.name not in LONGEST and item.path.parent.name != "refine")
+
 
 def data_root() -> Path | None:
     """Folder of recorded data (GRAPHSLAM_DATA), or None."""

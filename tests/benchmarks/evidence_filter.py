@@ -203,16 +203,20 @@ print(time.perf_counter() - begin[0], time.process_time() - begin[1])
 """
 
 
-def start_up(repetitions: int) -> tuple[float, float]:
+def start_up(compiled: int) -> tuple[float, float]:
     """Seconds from the first import to every kernel compiled, in a fresh process and its helper; CPU seconds from
     NumPy imported to a grid made, a scan inserted and a beam cast, in a process that finds them compiled. The least of
-    the repetitions.
+    ``compiled`` repetitions; of none, kernels are those that this machine has compiled before, and the first is NaN.
     """
+    if not compiled:
+        warm = min(_child(_START, os.environ.get("NUMBA_CACHE_DIR", ""))[1] for _ in range(3))
+        print(f"start: compiled before {warm:.2f} s", flush=True)
+        return float("nan"), warm
     with tempfile.TemporaryDirectory() as folder:
         cold = []
-        for k in range(repetitions):
+        for k in range(compiled):
             cold.append(_child(_COMPILE, f"{folder}/{k}"))
-        warm = min(_child(_START, f"{folder}/0")[1] for _ in range(repetitions + 2))
+        warm = min(_child(_START, f"{folder}/0")[1] for _ in range(compiled + 2))
         megabytes = sum(p.stat().st_size for p in Path(folder, "0").rglob("*") if p.is_file()) / 1e6
     wall = min(w for w, _ in cold)
     print(
@@ -223,7 +227,7 @@ def start_up(repetitions: int) -> tuple[float, float]:
 
 def _child(code: str, cache: str) -> tuple[float, float]:
     """What a fresh process prints: wall and CPU seconds."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": cache} if cache else dict(os.environ)
     done = subprocess.run([sys.executable, "-c", code], check=True, env=environment, stdout=subprocess.PIPE, text=True)
     wall, cpu = map(float, done.stdout.split())
     return wall, cpu
