@@ -8,6 +8,7 @@ Neighbouring fixes share most of it, so their innovations are correlated and mus
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -85,6 +86,16 @@ class GpsInnovations:
         """Root mean square of the innovations' lengths [m]."""
         return float(np.sqrt(np.mean(np.sum(self.innovations**2, axis=1))))
 
+    def facts(self) -> dict[str, list[Any]]:
+        """What ``run.json`` holds of every fix: time, innovation and its σ along each axis, NIS; six digits."""
+        sigmas = np.sqrt(np.diagonal(self.blocks, axis1=1, axis2=2))
+        return {
+            "times": self.times.tolist(),
+            "innovations": [[_six(v) for v in row] for row in self.innovations],
+            "sigmas": [[_six(v) for v in row] for row in sigmas],
+            "nis": [_six(v) for v in self.nis],
+        }
+
     def tests(self) -> pd.DataFrame:
         """Two tests, one row each: ``value`` is 1 if the prediction is honest, ``low … high`` its two-sided bounds.
 
@@ -117,6 +128,10 @@ class GpsInnovations:
                 }
             )
         return pd.DataFrame(rows)
+
+
+def _six(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def gps_innovations(

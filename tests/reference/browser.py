@@ -27,14 +27,15 @@ addEventListener("load", () => setTimeout(() => {
 """Around the body of a function: it is called when the page stands, and what it returns is written beside the page."""
 
 
-def act(html: str, folder: Path, script: str, *, width: int = 1280, height: int = 900) -> Any:
+def act(html: str, folder: Path, script: str, *, width: int = 1280, height: int = 900, before: str = "") -> Any:
     """Open a page in a window of this size, run the body of a function in it, and return its value.
 
-    Nothing but the addition of the script and its permission is changed in the page; no request leaves the machine.
+    ``before`` runs before anything of the page does. Nothing but the addition of the script and its permission is
+    changed in the page; no request leaves the machine.
     """
     assert CHROMIUM is not None
     policy = re.sub(r"script-src '[^']+'", "script-src 'unsafe-inline'", html, count=1)
-    inner = policy.replace("</head>", f"<script>{RUN % script}</script></head>", 1)
+    inner = policy.replace("</head>", f"<script>{before}\n{RUN % script}</script></head>", 1)
     file = folder / "page.html"
     # a window is never narrower than 500 pixels; a frame is
     frame = f'<iframe style="border: 0; width: {width}px; height: {height}px" srcdoc="{escape(inner)}"></iframe>'

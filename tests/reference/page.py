@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 
-VIEWER = Path(__file__).resolve().parents[2] / "graphslam" / "app" / "report" / "templates" / "viewer.js"
+TEMPLATES = Path(__file__).resolve().parents[2] / "graphslam" / "app" / "report" / "templates"
+VIEWER = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in ("viewer.js", "curves.js"))
 VOID = {"img", "meta", "br"}
 
 
@@ -118,10 +119,10 @@ class Page(HTMLParser):
         raise AssertionError(f"no table with {columns} in {section}: {[t.rows[:1] for t in self.tables]}")
 
     def check_alone(self) -> None:
-        """Nothing outside the page is asked for, and nothing in it runs but the viewer of the map."""
+        """Nothing outside the page is asked for, and nothing in it runs but the viewer of the map and its curves."""
         assert not self.tags & {"link", "iframe", "object", "embed", "base", "form", "video", "audio"}
         viewer = [code for values, code in self.scripts if not values]
-        assert viewer in ([], [VIEWER.read_text(encoding="utf-8")])
+        assert viewer in ([], [VIEWER])
         data = [code for values, code in self.scripts if values == {"type": "application/json", "id": "scene"}]
         assert len(data) == len(viewer)
         assert len(self.scripts) == 2 * len(viewer)

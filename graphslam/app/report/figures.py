@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.app.report.curves import chart_of
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import missing, note, picture, section
 from graphslam.app.run.files import read_map, read_merged_dense
 from graphslam.backend.sessions import SESSION
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.markup import Markup, join
-from graphslam.evaluate.consistency import Consistency, nees, pose_error
+from graphslam.evaluate.consistency import Consistency, nees
+from graphslam.evaluate.path_consistency import map_errors
 from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum
 
@@ -143,7 +145,7 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
         if not np.any(here):
             return [missing("NEES by submap: the truth is of none of its submaps.")]
         end = bases[1 + np.searchsorted(keys, truth.keys[here])]
-        d2 = nees(pose_error(nodes[end], truth.exit_poses[here]), covariances[end])
+        d2 = nees(*map_errors(nodes[end], covariances[end], truth.exit_poses[here], chart_of(folder)))
     except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
         return [missing("NEES by submap: ", _said(folder, error), ".")]
     from graphslam.plots.consistency import plot_consistency

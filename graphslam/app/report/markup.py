@@ -1,6 +1,6 @@
 """Parts of the report's page.
 
-A page needs no network and no other file: pictures, style and the script of its map are in it.
+A page needs no network and no other file: pictures, style and the script of its map and curves are in it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from importlib.resources import files
 from typing import Any
 
 from graphslam.core.markup import Markup, element, environment, join
+
+SCRIPTS = ("viewer.js", "curves.js")
+"""Joined, the one script of a page."""
 
 
 def folded(summary: str, body: Markup) -> Markup:
@@ -48,6 +51,7 @@ def compact(value: Any) -> str:
 def page(**values: Any) -> str:
     """A whole page: ``title``, ``headline``, ``findings``, ``parts`` and ``scene`` in the template ``page.html``."""
     pages = environment("graphslam.app.report")
-    viewer = (files("graphslam.app.report") / "templates" / "viewer.js").read_text(encoding="utf-8")
+    templates = files("graphslam.app.report") / "templates"
+    viewer = "".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(viewer.encode()).digest()).decode("ascii")
     return pages.get_template("page.html").render(viewer=Markup(viewer), digest=digest, **values) + "\n"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from graphslam.app.report.curves import curves
 from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.packed import base64_floats, packed_points, space
 from graphslam.app.run.files import read_gps_residuals, read_map
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_inverse, se2_transform
@@ -38,7 +39,8 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
     dict
         ``dim``, ``layers``: each ``name``, ``kind`` (points, line, ellipses, loops), ``colour``, ``on``, and its data:
         ``xyz`` as base64 of float32 ``(n, 3)`` [m]; of ellipses ``cov`` as well, ``(n, 3)``: xx, xy, yy of the 95 %
-        ellipse [m²]; of loops ``rows``: number, verdict, and both ends.
+        ellipse [m²]; of loops ``rows``: number, verdict, and both ends. ``curves``: panels of
+        :func:`~graphslam.app.report.curves.curves`.
     """
     if folder.kind != "run":
         return None
@@ -57,7 +59,7 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
         name = style.ellipses("landmarks")
         layers.append(_ellipses(name, style.LANDMARK, m.landmarks, m.landmark_covariances))
     layers += [*above, *_loops(folder, m)]
-    return {"dim": m.dim, "layers": layers}
+    return {"dim": m.dim, "layers": layers, "curves": curves(folder, m)}
 
 
 def _map(folder: ReportFolder) -> list[dict[str, Any]]:
@@ -108,7 +110,7 @@ def _references(folder: ReportFolder, dim: int) -> tuple[list[dict[str, Any]], l
 
 
 def _loops(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
-    nodes = _space(m.node_poses[:, : m.dim])
+    nodes = space(m.node_poses[:, : m.dim])
     colours = {
         "accepted": style.VERMILION,
         "switched-off": style.ORANGE,
@@ -130,30 +132,25 @@ def _loops(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
 
 
 def _points(name: str, colour: str, points: Array, *, size: float) -> dict[str, Any]:
-    return {"name": name, "kind": "points", "colour": colour, "on": True, "size": size, "xyz": _packed(points)}
+    return {"name": name, "kind": "points", "colour": colour, "on": True, "size": size, "xyz": packed_points(points)}
 
 
 def _line(name: str, colour: str, points: Array, *, dashed: bool = False, on: bool = True) -> dict[str, Any]:
     step = max(1, math.ceil(len(points) / MOST_PLACES))
     kept = np.vstack([points[::step], points[-1:]])
-    return {"name": name, "kind": "line", "colour": colour, "on": on, "dashed": dashed, "xyz": _packed(kept)}
+    return {"name": name, "kind": "line", "colour": colour, "on": on, "dashed": dashed, "xyz": packed_points(kept)}
 
 
 def _ellipses(name: str, colour: str, centres: Array, covariances: Array) -> dict[str, Any]:
     P = CHI2_95 * np.stack([covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]], axis=1)
-    return {"name": name, "kind": "ellipses", "colour": colour, "on": True, "xyz": _packed(centres), "cov": _base64(P)}
-
-
-def _space(points: Array) -> Array:
-    return points if points.shape[1] == 3 else np.hstack([points, np.zeros((len(points), 1))])
-
-
-def _packed(points: Array) -> str:
-    return _base64(_space(np.asarray(points)[:, :3]))
-
-
-def _base64(values: Array) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
+    return {
+        "name": name,
+        "kind": "ellipses",
+        "colour": colour,
+        "on": True,
+        "xyz": packed_points(centres),
+        "cov": base64_floats(P),
+    }
 
 
 def _rounded(values: Iterable[float]) -> list[float]:

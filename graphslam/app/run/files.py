@@ -110,6 +110,8 @@ RUN: dict[str, Any] = {
         **{"apart_max": float, "apart_median": float, "apart_max_node": int, "apart_max_time": float},
         "places": [{"loops": ([int], [int]), "nodes": ((int, int), (int, int)), "times": ((float, float),) * 2}],
     },
+    "nees_chart?": str,
+    "gps_innovations?": {"times": [float], "innovations": [[float]], "sigmas": [[float]], "nis": [float]},
     "refine?": {
         "rounds?": [
             {

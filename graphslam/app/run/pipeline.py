@@ -632,6 +632,10 @@ def _judge(
         "graph": graph_facts(back.graph, checks.classes),
         "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
     }
+    if truth is not None:
+        report["nees_chart"] = "group" if refined is not None or back.graph.dim == 3 else solution.chart
+    if checks.gps is not None:
+        report["gps_innovations"] = checks.gps.facts()
     lasting = lasting_facts(back.graph)
     if lasting:
         report["lasting"] = lasting

@@ -29,14 +29,20 @@ const colours = () => { const d = c.getImageData(0, 0, v.width, v.height).data, 
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A run of landmarks with GPS and truth, and two loops in its ledger."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of landmarks with GPS, every second fix withheld, and truth; and two loops in its ledger."""
     log = gs.simulate("landmark-field", preset="quick", seed=3, gps_rate=1.0, gps_sigma=0.3)
     out = tmp_path_factory.mktemp("browser") / "run"
-    gs.run(log, seed=5, out=out, solver="batch", config={"frontend": {"particles": 20}}, progress=False)
+    options = {"gps": {"use": "every-second"}, "frontend": {"particles": 20}}
+    gs.run(log, seed=5, out=out, solver="batch", config=options, progress=False)
     with (out / "events.jsonl").open("a") as stream:
         stream.writelines(json.dumps(d.event()).replace("NaN", "null") + "\n" for d in LOOPS)
-    return make_report(out).html
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> str:
+    return make_report(folder).html
 
 
 @needs_chromium

@@ -15,7 +15,7 @@
       low[k % 3] = Math.min(low[k % 3], layer.xyz[k]);
       high[k % 3] = Math.max(high[k % 3], layer.xyz[k]);
     }
-  const view = { mode: "2d", at: [0, 0, 0], scale: 1, yaw: -0.6, up: 0.6, loop: null, whole: true };
+  const view = { mode: "2d", at: [0, 0, 0], scale: 1, yaw: -0.6, up: 0.6, loop: null, place: null, whole: true };
 
   function fit() {
     view.whole = true;
@@ -48,6 +48,7 @@
     const p = projector();
     for (const layer of data.layers) if (layer.on) paint[layer.kind](layer, p);
     if (view.loop) paintLoop(view.loop, p);
+    if (view.place) paintPlace(view.place, p);
     scaleBar(w, h);
     canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
   }
@@ -104,6 +105,16 @@
     }
     ctx.fillStyle = "#000"; ctx.font = "bold 13px system-ui, sans-serif";
     ctx.fillText("loop " + r.loop, 0.5 * (a[0] + b[0]) + 12, 0.5 * (a[1] + b[1]) - 10);
+  }
+  function paintPlace(place, p) {
+    const q = p(...place.at);
+    for (const [colour, width] of [["#fff", 9], ["#000", 5], ["#F0E442", 2.5]]) {
+      ctx.strokeStyle = colour; ctx.lineWidth = width;
+      ctx.beginPath(); ctx.arc(...q, 9, 0, 7); ctx.stroke();
+    }
+    ctx.fillStyle = "#000"; ctx.font = "bold 13px system-ui, sans-serif";
+    const wide = ctx.measureText(place.text).width, x = Math.max(Math.min(q[0] + 14, canvas.clientWidth - wide - 6), 6);
+    ctx.fillText(place.text, x, Math.max(q[1] - 16, 16));
   }
   function scaleBar(w, h) {
     const wanted = 0.22 * w / view.scale, ten = Math.pow(10, Math.floor(Math.log10(wanted)));
@@ -188,6 +199,17 @@
     row.addEventListener("click", () => show(row));
     row.addEventListener("keydown", (e) => { if (e.key === "Enter") show(row); });
   }
+  canvas.addEventListener("place", (e) => {  // a point of a curve was clicked
+    view.place = e.detail;
+    const [u, v] = projector()(...e.detail.at);
+    if (u < 0 || v < 0 || u > canvas.clientWidth || v > canvas.clientHeight) {
+      view.at = e.detail.at;
+      view.whole = false;
+    }
+    draw();
+    canvas.dataset.place = e.detail.text;
+    document.getElementById("map").scrollIntoView({ block: "start" });
+  });
   new ResizeObserver(() => (view.whole ? fit() : draw())).observe(canvas);
   mode("2d");
 })();

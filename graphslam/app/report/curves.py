@@ -1,0 +1,226 @@
+"""Curves of a report: is the run honest from one pose to the next, and where is it not? Drawn by ``curves.js``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.app.report.folder import ReportFolder
+from graphslam.app.report.packed import base64_floats, packed_points
+from graphslam.app.report.sections import figures_of
+from graphslam.app.run.files import read_gps_residuals
+from graphslam.app.run.verdict import CONFIDENCE, class_rows
+from graphslam.core.errors import GraphSlamError
+from graphslam.core.geometry import Array, arc_length
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.path_consistency import path_consistency
+from graphslam.evaluate.without_truth import two_sided
+from graphslam.io.submap_store import read_truth
+from graphslam.io.tum import read_tum
+from graphslam.maps.global_map import GlobalMap
+from graphslam.plots import style
+
+MOST = 2_000
+"""Points of a curve; of more, the least and the largest of every so many, and both ends."""
+SIGMAS = 2.0
+"""Half width of the bands around errors and innovations."""
+_BOUNDS = f"{100 * CONFIDENCE:g} %"
+_ROW = ("low", "high")
+Rows = npt.NDArray[np.intp]
+
+
+def curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
+    """Panels of a finished run, the most telling first; none where there is nothing to show.
+
+    With truth: NEES by degree of freedom of every pose with the two-sided bounds of a single one, and its errors with
+    ± 2 σ, first base fixed. Withheld fixes against their prediction; without a prediction, distances to the fixes.
+    Without truth also χ² by kind of factor.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``said``, ``unit`` and ``kind``. Of the kinds ``line`` and ``dots``: ``t`` [s] since the path begins,
+        ``s`` [m] travelled, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``honest``, or none; ``bounds``: two
+        numbers, or ``half``: half width of the band at each point; ``cut``: points before which the line breaks. Of the
+        kind ``rows``: ``rows``, each ``name``, ``value``, ``low``, ``high``.
+    """
+    judged = _against_truth(folder, m)
+    panels = [*judged, *_fixes(folder, m.trajectory)]
+    return panels if judged else [*panels, *_kinds(folder)]
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Where and when the points of a panel are."""
+
+    t: Array
+    s: Array
+    xyz: Array
+    piece: npt.NDArray[np.int64]
+    """Points of one piece are joined by a line."""
+
+    @classmethod
+    def of(cls, path: Trajectory, rows: Rows) -> _Axis:
+        """At poses of the path; where one is left out between two, the line breaks."""
+        piece = np.cumsum(np.diff(rows, prepend=rows[:1]) > 1, dtype=np.int64)
+        return cls(path.times[rows] - path.times[0], arc_length(path.positions)[rows], path.positions[rows], piece)
+
+    @classmethod
+    def at(cls, path: Trajectory, times: Array) -> _Axis:
+        """At any times within the path."""
+        t = np.clip(times, path.times[0], path.times[-1])
+        s = np.interp(t, path.times, arc_length(path.positions))
+        xyz = path.interpolate(t)[:, : path.dim] if len(t) else np.zeros((0, path.dim))
+        return cls(times - path.times[0], s, xyz, np.arange(len(times)))
+
+    def panel(
+        self,
+        name: str,
+        said: str,
+        values: Array,
+        *,
+        unit: str = "",
+        kind: str = "line",
+        honest: float | None = None,
+        bounds: tuple[float, float] | None = None,
+        sigmas: Array | None = None,
+        log: bool = False,
+    ) -> dict[str, Any]:
+        keep = extremes(values, MOST)
+        piece = self.piece[keep]
+        out: dict[str, Any] = {
+            **{"name": name, "said": said, "unit": unit, "kind": kind, "colour": style.ESTIMATE, "log": log},
+            **{"honest": honest, "cut": [int(k) for k in np.flatnonzero(np.diff(piece) > 0) + 1]},
+            **{"t": base64_floats(self.t[keep]), "s": base64_floats(self.s[keep])},
+            **{"xyz": packed_points(self.xyz[keep]), "value": base64_floats(values[keep])},
+        }
+        if kind == "dots":
+            del out["cut"]
+        if bounds is not None:
+            out["bounds"] = [round(b, 6) for b in bounds]
+        if sigmas is not None:
+            out["half"] = base64_floats(SIGMAS * sigmas[keep])
+        return out
+
+
+def extremes(values: Array, most: int) -> Rows:
+    """Rows of at most ``most`` of the values ``(n,)``: the ends, and of every so many the least and the largest."""
+    n = len(values)
+    if n <= most:
+        return np.arange(n)
+    edges = np.unique(np.linspace(0, n, (most - 2) // 2 + 1).astype(np.intp))
+    of_each = [(a + int(np.argmin(values[a:b])), a + int(np.argmax(values[a:b]))) for a, b in pairwise(edges)]
+    return np.unique(np.concatenate([np.array([0, n - 1]), np.array(of_each).ravel()])).astype(np.intp)
+
+
+def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
+    """NEES and errors of every pose; nothing where the run was not judged by a truth in the frame of its first base."""
+    file = folder.path / "truth.tum"
+    if not file.is_file():
+        return []
+    try:
+        if read_truth(folder.path) is None:
+            return []
+        made = path_consistency(m.trajectory, read_tum(file, dim=m.dim), chart=chart_of(folder))
+    except GraphSlamError as error:
+        said = " ".join(str(error).replace(f"{folder.path}/", "").split())
+        folder.problems.setdefault("truth.tum", f"gives no curve of NEES: {said}")
+        return []
+    if len(made.rows) < 2:
+        return []
+    axis, ratio = _Axis.of(m.trajectory, made.rows), made.nees / made.dof
+    low, high, _ = two_sided(1.0, made.dof, CONFIDENCE)
+    inside = float(np.mean((ratio >= low) & (ratio <= high)))
+    said = (
+        f"Every pose of the path against the truth, first base fixed; {_BOUNDS} bounds of one pose with "
+        f"{made.dof} degrees of freedom, {low:.3g} to {high:.3g}; {_percent(inside)} of {len(ratio)} poses are inside. "
+        "Neighbours share their errors: they lie in or out together."
+    )
+    if made.certain:
+        said += f" Left out: {made.certain} with a singular covariance, as that of the first base is."
+    panels = [axis.panel("NEES/dof of the path", said, ratio, honest=1.0, bounds=(low, high), log=True)]
+    for k, name in enumerate(made.names):
+        turn = name == "heading"
+        scale = np.rad2deg(1.0) if turn else 1.0
+        errors, sigmas = scale * made.errors[:, k], scale * made.sigmas[:, k]
+        out = float(np.mean(np.abs(errors) > SIGMAS * sigmas))
+        said = f"True less estimated, ± {SIGMAS:g} σ; {_percent(out)} outside (honest: 5 %)."
+        panels.append(
+            axis.panel(f"Error of {name}", said, errors, unit="°" if turn else "m", honest=0.0, sigmas=sigmas)
+        )
+    return panels
+
+
+def chart_of(folder: ReportFolder) -> str:
+    """In which coordinates the NEES of the run is taken; older runs do not say it, and those of most were in this."""
+    return "cartesian" if folder.report.get("nees_chart") == "cartesian" else "group"
+
+
+def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
+    """Withheld fixes against their prediction; where there is none, distances to the fixes."""
+    found = _innovations(folder)
+    if found is not None:
+        times, v, sigma, nis = found
+        d, axis = v.shape[1], _Axis.at(path, times)
+        low, high, _ = two_sided(1.0, d, CONFIDENCE)
+        inside = float(np.mean((nis / d >= low) & (nis / d <= high)))
+        said = (
+            f"Fixes that the graph was not given, against where it predicts them; {_BOUNDS} bounds of one fix, "
+            f"{low:.3g} to {high:.3g}; {_percent(inside)} of {len(nis)} are inside."
+        )
+        if folder.part("refine"):
+            said += " Predicted by the graph, before the refinement."
+        name = "NIS/dof of withheld GPS"
+        out = [axis.panel(name, said, nis / d, kind="dots", honest=1.0, bounds=(low, high), log=True)]
+        for k, of in enumerate("xyz"[:d]):
+            said = f"Fix less prediction along {of} of the GPS frame, ± {SIGMAS:g} σ of both."
+            name, half = f"Withheld GPS, {of}", sigma[:, k]
+            out.append(axis.panel(name, said, v[:, k], unit="m", kind="dots", honest=0.0, sigmas=half))
+        return out
+    for name, said in (("withheld", "the graph was not given them"), ("all", "as the metrics take them")):
+        try:
+            scored = read_gps_residuals(folder.path / f"gps_{name}.npz")
+        except GraphSlamError:
+            continue
+        if len(scored.times):
+            text = f"Fixes to the antenna on the path; {said}. Their prediction has no bounds here."
+            return [_Axis.at(path, scored.times).panel("Distance to GPS", text, scored.errors, unit="m", kind="dots")]
+    return []
+
+
+def _innovations(folder: ReportFolder) -> tuple[Array, Array, Array, Array] | None:
+    """Times, innovations, σ and NIS of withheld fixes; None where the run has none."""
+    found = folder.part("gps_innovations")
+    if not found.get("times"):
+        return None
+    n, wide = len(found["times"]), {len(row) for k in ("innovations", "sigmas") for row in found[k]}
+    if {len(found[k]) for k in ("innovations", "sigmas", "nis")} != {n} or len(wide) != 1 or not wide <= {2, 3}:
+        folder.problems["run.json"] = "innovations of withheld fixes that do not fit each other"
+        return None
+    times, v, sigma, nis = (np.array(found[k], dtype=np.float64) for k in ("times", "innovations", "sigmas", "nis"))
+    return times, v, sigma, nis
+
+
+def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
+    """χ²/dof by kind of factor with its bounds."""
+    rows = [
+        {"name": str(r.get("class")), **{k: round(float(r[k]), 6) for k in _ROW}, "value": _six(r["chi2_per_dof"])}
+        for r in class_rows(figures_of(folder))
+        if all(isinstance(r.get(k), (int, float)) and np.isfinite(r[k]) for k in (*_ROW, "chi2_per_dof"))
+    ]
+    if not rows:
+        return []
+    said = f"At the optimum, with the {_BOUNDS} bounds of honest noise: above them too much is believed."
+    return [{"name": "χ²/dof by kind of factor", "said": said, "unit": "", "kind": "rows", "log": True, "rows": rows}]
+
+
+def _six(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

@@ -1,0 +1,130 @@
+"""Errors and NEES of every pose of a path against the truth, in the chart of the NEES of the whole run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.charts import check_chart
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array, rotation2
+from graphslam.core.se3 import quat_to_matrix
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.consistency import nees, pose_error, vector_pose_error
+from graphslam.evaluate.trajectory_error import associate
+
+SAME_INSTANT = 1e-6
+"""Stamps of truth and path that differ by no more are one [s]: truth is written at the stamps of the path."""
+SINGULAR = 1e-12
+"""Least eigenvalue of the correlations of a pose that is judged: below it some direction of the pose is certain."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathConsistency:
+    """Poses of a path with known truth, in the frame of the first base, which is fixed.
+
+    Parameters
+    ----------
+    rows : (k,)
+        Which poses of the path.
+    errors, sigmas : (k, 3) or (k, 4)
+        True less estimated ``x, y, heading`` or ``x, y, z, heading``, along the axes of the map, and their σ [m, rad].
+    nees : (k,)
+        Of the whole pose.
+    dof : int
+        Of each NEES: 3 or 6.
+    certain : int
+        Poses with truth that are left out because their covariance is singular, as that of the first base is.
+    """
+
+    rows: npt.NDArray[np.intp]
+    errors: Array
+    sigmas: Array
+    nees: Array
+    dof: int
+    certain: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns of :attr:`errors`."""
+        return ("x", "y", "heading") if self.dof == 3 else ("x", "y", "z", "heading")
+
+
+def map_errors(poses: Array, covariances: Array, true_poses: Array, chart: str) -> tuple[Array, Array]:
+    """Errors ``(n, d)`` of poses along the axes of the map, and their covariances ``(n, d, d)``.
+
+    In the group chart, and in space, the error is the right tangent ``Log(T_est⁻¹ T_true)``; in the Cartesian one the
+    difference of the vectors (x, y, θ). Turned to the axes of the map, which changes no NEES, both are
+    ``(x, y, heading)``; in space ``(rotation about x, y, z; x, y, z)``.
+
+    Parameters
+    ----------
+    poses, true_poses : (n, 3) or (n, 7)
+    covariances : (n, 3, 3) or (n, 6, 6)
+        Right tangents.
+    chart : {"group", "cartesian"}
+        Of poses in the plane.
+    """
+    check_chart(chart)
+    if poses.shape[-1] == 3:
+        A = np.zeros((len(poses), 3, 3))
+        A[:, :2, :2], A[:, 2, 2] = rotation2(poses[:, 2]), 1.0
+    else:
+        A = np.zeros((len(poses), 6, 6))
+        A[:, :3, :3] = A[:, 3:, 3:] = quat_to_matrix(poses[:, 3:])
+    if poses.shape[-1] == 3 and chart == "cartesian":
+        e = vector_pose_error(poses, true_poses)
+    else:
+        e = np.einsum("kij,kj->ki", A, pose_error(poses, true_poses))
+    return e, A @ covariances @ np.swapaxes(A, 1, 2)
+
+
+def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> PathConsistency:
+    """Every pose of a path whose truth is known.
+
+    Parameters
+    ----------
+    path : Trajectory
+        With covariances, in the frame of the first base.
+    truth : Trajectory
+        In the same frame, at stamps of the path.
+    chart : {"group", "cartesian"}
+        See :func:`map_errors`.
+
+    Raises
+    ------
+    DataError
+        No covariances, another dimension, or no stamp in common.
+    CovarianceError
+        A covariance that is none.
+    """
+    if path.covariances is None:
+        raise DataError("the path has no covariances", wanted="covariances")
+    if path.dim != truth.dim:
+        raise DataError("path and truth differ in dimension", got=truth.dim, wanted=path.dim)
+    i, rows = associate(truth.times, path.times, max_diff=SAME_INSTANT)
+    if not len(rows):
+        raise DataError("no stamps of path and truth agree", got=f"{len(path)} and {len(truth)} poses")
+    P = path.covariances[rows]
+    judged = _uncertain(P)
+    i, rows, P, certain = i[judged], rows[judged], P[judged], int(np.sum(~judged))
+    e, P = map_errors(path.poses[rows], P, truth.poses[i], chart)
+    shown = [0, 1, 2] if path.dim == 2 else [3, 4, 5, 2]
+    return PathConsistency(
+        rows=rows,
+        errors=e[:, shown],
+        sigmas=np.sqrt(P[:, shown, shown]),
+        nees=nees(e, P),
+        dof=P.shape[-1],
+        certain=certain,
+    )
+
+
+def _uncertain(P: Array) -> npt.NDArray[np.bool_]:
+    """Which covariances leave no direction certain."""
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    some = np.all(sigma > 0.0, axis=1)
+    scale = np.where(some[:, None], sigma, 1.0)
+    return np.asarray(some & (np.linalg.eigvalsh(P / scale[:, :, None] / scale[:, None, :])[:, 0] > SINGULAR))
