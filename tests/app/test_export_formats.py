@@ -68,7 +68,10 @@ def test_autoware_reads_tiles_that_hold_every_point_once(hall: Run, tmp_path: Pa
     assert set(tiles) == {p.name for p in (root / "pointcloud_map.pcd").iterdir()}
     points = []
     for name, corner in tiles.items():
-        cloud = read_cloud(root / "pointcloud_map.pcd" / name).points
+        file = root / "pointcloud_map.pcd" / name
+        entries = [line.split()[0] for line in file.read_bytes().partition(b"DATA")[0].decode().splitlines()[1:]]
+        assert entries == ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS"]
+        cloud = read_cloud(file).points
         assert np.all((cloud[:, :2] >= np.array(corner) - 1e-4) & (cloud[:, :2] <= np.add(corner, size) + 1e-4))
         points.append(cloud)
     # a heading of 90°: the first base looks east, so x is east already
