@@ -131,3 +131,14 @@ def test_a_path_that_turns_otherwise_whatever_the_axes_is_no_word_on_them() -> N
     assert not found.wrong
     assert not found.words()
     assert check_imu_axes(imu, path).turns is None
+
+
+def test_forces_that_one_way_explains_are_a_word_on_the_mounting_whatever_the_path_turns_by() -> None:
+    """The path of a filter that was led by the turned gyro turns by itself, and stays level."""
+    imu, path = drive(tilt=0.05)
+    odd = replace(imu, angular_rate=imu.angular_rate[:, [1, 2, 0]], specific_force=imu.specific_force[:, [1, 2, 0]])
+    yaw = 0.6 * np.sin(0.7 * path.times)
+    level = np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1)
+    found = check_imu_axes(odd, Trajectory(path.times, np.concatenate([path.poses[:, :3], se3.so3_exp(level)], axis=1)))
+    assert found.wrong
+    assert "y reads z" in found.words()

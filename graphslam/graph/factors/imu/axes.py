@@ -161,6 +161,8 @@ def check_imu_axes(
     rows = 3.0 * len(rate)
     s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / window, 1e-12)
     s2_pull = max(float(pull.min()) / rows, force_sigma**2)
+    # forces that one way explains are a word on the mounting even where the path turns by itself
+    unlike &= float(pull.min()) > 0.25 * float(pull[0])
     gyro, pull = (gyro - gyro.min()) / s2_gyro, (pull - pull.min()) / s2_pull
     chi2, sensor = gyro + pull, "both"
     if max(gyro[np.argmin(chi2)], pull[np.argmin(chi2)]) > limit:
