@@ -242,6 +242,13 @@ def refine(
     work = _Work(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
+    if work.cloud.chunks < 2:
+        raise DataError(
+            "the path is too short to refine: no two pieces of it to compare",
+            where=steps.name,
+            got=f"{len(steps)} steps in one piece",
+            wanted="≥ 2 pieces",
+        )
     found = work.run()
     if not few:
         return found

@@ -16,6 +16,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
+from graphslam.refine.nodes import scans_at
 from graphslam.refine.refine import _Work, refine
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
@@ -195,6 +196,9 @@ def test_what_cannot_be_refined_is_refused(drives):
         refine(scans, np.where(np.arange(len(start))[:, None] == 3, np.nan, start))
     with pytest.raises(DataError, match="no beam"):
         refine(replace(scans, returns=np.zeros(len(scans.returns), bool)), start)
+    few = np.arange(4)
+    with pytest.raises(DataError, match="too short to refine"):
+        refine(scans_at(scans, few), start[few])
 
 
 def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
