@@ -306,7 +306,44 @@ class LidarFrontEnd(FrontEnd):
         )
 
 
-class _Unit:
+class _Heard:
+    """A stream beside the scans, taken as it comes.
+
+    Parameters
+    ----------
+    feed : Feed
+    name : str or None
+        None: there is none, and nothing is waited for.
+    """
+
+    def __init__(self, feed: Feed, name: str | None) -> None:
+        self.feed, self.name = feed, name
+        self._heard, self._last = 0, -np.inf
+
+    @property
+    def listener(self) -> Readings | Reckoned | None:
+        """What takes its records."""
+        raise NotImplementedError
+
+    def reaches(self, scan: Stream) -> bool:
+        """Have its records come up to the stamp of a scan?"""
+        return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
+
+    def hear(self, now: float = -np.inf) -> None:
+        """Take the records that have come, and forget those that are of no use any more after the scan before."""
+        if self.name is None or self.listener is None:
+            return
+        n, since, self._last = self.feed.count(self.name), min(self._last, now) - OF_USE, now
+        if n > self._heard:
+            self.listener.more(self._part(self._heard, n), since)
+            self._heard = n
+
+    def _part(self, first: int, last: int) -> Any:
+        assert self.name is not None
+        return self.feed.part(self.name, first, last)
+
+
+class _Unit(_Heard):
     """The IMU of a feed, if there is one, and what of it is known.
 
     Parameters
@@ -317,22 +354,14 @@ class _Unit:
     """
 
     def __init__(self, feed: Feed, name: str | None, config: LidarOdometryConfig) -> None:
-        self.feed, self.name, self.config = feed, name, config
+        super().__init__(feed, name)
+        self.config = config
         self.inertial: Inertial | None = None
-        self._heard = 0
 
-    def reaches(self, scan: Stream) -> bool:
-        """Have its readings come up to the stamp of a scan?"""
-        return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
-
-    def hear(self, now: float = -np.inf) -> None:
-        """Take the readings that have come, and forget those that are of no use any more ``now`` [s]."""
-        if self.name is None or self.inertial is None:
-            return
-        n = self.feed.count(self.name)
-        if n > self._heard:
-            self.inertial.readings.more(self._part(self._heard, n), now - OF_USE)
-            self._heard = n
+    @property
+    def listener(self) -> Readings | None:
+        """The unit's readings."""
+        return None if self.inertial is None else self.inertial.readings
 
     def rehearse(self, clouds: str) -> Iterator[None]:
         """Follow the first scans to learn what the unit does not know; None: more records are wanted.
@@ -379,14 +408,8 @@ class _Unit:
         self.inertial.readings = Readings(log[self.name])
         return tilt_of(self.inertial, times, poses)
 
-    def _part(self, first: int, last: int) -> Imu:
-        assert self.name is not None
-        stream = self.feed.part(self.name, first, last)
-        assert isinstance(stream, Imu)
-        return stream
 
-
-class _Wheels:
+class _Wheels(_Heard):
     """The odometry of a feed, if there is one that is taken.
 
     Parameters
@@ -396,28 +419,13 @@ class _Wheels:
     """
 
     def __init__(self, feed: Feed, name: str | None) -> None:
-        self.feed, self.name = feed, name
+        super().__init__(feed, name)
         self.reckoned = None if name is None else Reckoned(self._part(0, 0))
-        self._heard = 0
 
-    def reaches(self, scan: Stream) -> bool:
-        """Have its records come up to the stamp of a scan?"""
-        return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
-
-    def hear(self, now: float = -np.inf) -> None:
-        """Take the records that have come, and forget those that are of no use any more ``now`` [s]."""
-        if self.name is None or self.reckoned is None:
-            return
-        n = self.feed.count(self.name)
-        if n > self._heard:
-            self.reckoned.more(self._part(self._heard, n), now - OF_USE)
-            self._heard = n
-
-    def _part(self, first: int, last: int) -> Odometry:
-        assert self.name is not None
-        stream = self.feed.part(self.name, first, last)
-        assert isinstance(stream, Odometry)
-        return stream
+    @property
+    def listener(self) -> Reckoned | None:
+        """What tells motions by it."""
+        return self.reckoned
 
 
 def odometry_of(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | None = None) -> LidarOdometry:
@@ -568,17 +576,16 @@ def _findings(
         out.append(Finding("look", "imu-left-aside", text))
     own = kept[int(key > 0) :]
     alone = sum(f.seen.unheld == 6 and not f.seen.bridged for f in own)
-    even = "The path there is that of an even motion, and the covariance as wide as that may be off."
     if report["scans_lost"] > MANY * n + (BEGUN if key == 0 else 0):
         text = (
             f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
             "are not in it. "
         )
         if alone < report["scans_lost"]:
-            but = f", but for {alone} of them, of which it tells nothing" if alone else ""
-            text += f"The path there is that of {wheels}{but}, with a covariance as scans elsewhere found it to be off."
+            text += f"The path there is that of {wheels}, as sure as scans elsewhere found it to be."
+            text += f" For {alone} of them it is that of an even motion, since {wheels} tells nothing." if alone else ""
         else:
-            text += even
+            text += "The path there is that of an even motion, and the covariance as wide as that may be off."
         out.append(Finding("bad" if alone > 0.5 * n else "look", "scans-lost", text))
     if report["scans_unheld"] > 0.5 * n:
         by = "an even motion" if not any(f.seen.bridged for f in own) else wheels

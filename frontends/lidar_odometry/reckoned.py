@@ -15,7 +15,6 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.records import Odometry
-from graphslam.frontends.lidar_odometry.inertial import running
 
 FEWEST = 5
 """Scans over which it is compared before it is doubted, or preferred."""
@@ -37,52 +36,41 @@ class Reckoned:
     """
 
     def __init__(self, odometry: Odometry) -> None:
-        self.times, self.poses = np.zeros(0), np.zeros((0, 7))
+        self.times = np.zeros(0)
+        self.steps = np.zeros((0, 7))
+        """Motion up to each record, from the one before it."""
         self.stated = np.zeros((0, 2))
+        """Variance of its turn and of its shift by axis."""
         self.missed: deque[Array] = deque(maxlen=COMPARED)
         self.more(odometry)
 
     def more(self, odometry: Odometry, since: float = -np.inf) -> None:
         """Records that came after; those before ``since`` [s] are not asked for any more."""
-        if not len(odometry.times):
-            return
-        steps = _in_space(odometry.increments)
-        first = self.poses[-1] if len(self.poses) else np.array([0.0, 0, 0, 0, 0, 0, 1])
-        q = running(steps[:, 3:])[1:] if len(steps) else steps[:, 3:]
-        before = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q[:-1]])
-        way = np.concatenate([np.cumsum(se3.quat_rotate(before, steps[:, :3]), axis=0), q], axis=1)
-        poses = se3.se3_compose(np.broadcast_to(first, way.shape), way)
         d = np.diagonal(odometry.covariances, axis1=1, axis2=2)
         turn, shift = (d[:, :3], d[:, 3:]) if d.shape[1] == 6 else (d[:, 2:], d[:, :2])
-        stated = np.cumsum(np.stack([turn.max(axis=1), shift.max(axis=1)], axis=1), axis=0)
-        stated += self.stated[-1] if len(self.stated) else 0.0
         a = max(int(np.searchsorted(self.times, since)) - 1, 0)
         self.times = np.concatenate([self.times[a:], odometry.times])
-        self.poses = np.concatenate([self.poses[a:], poses])
-        self.stated = np.concatenate([self.stated[a:], stated])
+        self.steps = np.concatenate([self.steps[a:], _in_space(odometry.increments)])
+        self.stated = np.concatenate([self.stated[a:], np.stack([turn.max(axis=1), shift.max(axis=1)], axis=1)])
 
     def motion(self, first: float, last: float) -> tuple[Array, Array] | None:
         """Motion ``(7,)`` between two times, and the stated variance of its turn and shift by axis; None: not known.
 
-        The first and the last record hold for as long as records are apart.
+        The first and the last record hold for one and a half of their own time. Nothing but the records between the two
+        times enters, so that it is the same however records came.
         """
         t = self.times
-        if len(t) < 2:
+        if len(t) < 2 or first < t[0] - 1.5 * (t[1] - t[0]) or last > t[-1] + 1.5 * (t[-1] - t[-2]):
             return None
-        slack = 1.5 * float(np.median(np.diff(t[-20:])))
-        if first < t[0] - slack or last > t[-1] + slack:
-            return None
-        a, b = self._at(first), self._at(last)
-        i, j = np.clip(np.searchsorted(t, [first, last]), 0, len(t) - 1)
-        return np.asarray(se3.se3_between(a, b)), self.stated[j] - self.stated[max(i - 1, 0)]
-
-    def _at(self, time: float) -> Array:
-        t = self.times
-        k = int(np.clip(np.searchsorted(t, time, side="right"), 1, len(t) - 1))
-        span = t[k] - t[k - 1]
-        share = float(np.clip((time - t[k - 1]) / span, 0.0, 1.0)) if span > 0 else 1.0
-        step = se3.se3_log(se3.se3_between(self.poses[k - 1], self.poses[k]))
-        return np.asarray(se3.se3_compose(self.poses[k - 1], se3.se3_exp(share * step)))
+        i, j = np.clip(np.searchsorted(t, [first, last], side="right"), 1, len(t) - 1)
+        begin, end = (float(np.clip((x - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)) for x, k in ((first, i), (last, j)))
+        shares = np.ones(j - i + 1)
+        shares[-1] = end
+        shares[0] -= begin
+        motion = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        for part in se3.se3_exp(shares[:, None] * se3.se3_log(self.steps[i : j + 1])):
+            motion = np.asarray(se3.se3_compose(motion, part))
+        return motion, shares @ self.stated[i : j + 1]
 
     def learn(self, motion: Array, made: Array, even: Array) -> None:
         """A scan was matched: the odometry's motion, the one that was found, and an even one (all ``(7,)``)."""

@@ -16,7 +16,11 @@ from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.slam import Slam
 from graphslam.app.worlds import mesh_world
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
+from graphslam.core.geometry import se2_between
 from graphslam.core.log import SensorLog
+from graphslam.core.plan_view import plan_path
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.records import Odometry
 from graphslam.frontends.lidar_odometry.front_end import FIRST
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -46,6 +50,33 @@ def carried() -> SensorLog:
     return simulate_lidar(mesh_world("building", seed=2), 2, config, most=7.0)
 
 
+def wheeled() -> SensorLog:
+    """With odometry of wheels at 25 Hz beside the lidar, of which some scans see nothing."""
+    log = clouds()
+    assert log.truth is not None
+    truth = plan_path(log.truth.trajectory)
+    times = np.arange(truth.times[0], truth.times[-1], 0.04)
+    poses = truth.interpolate(times)
+    noise = np.random.default_rng(5).normal(size=(len(times), 3)) * [1e-3, 1e-3, 1e-4]
+    steps = np.concatenate([np.zeros((1, 3)), se2_between(poses[:-1], poses[1:])]) + noise
+    wheels = Odometry(
+        times=times, increments=steps, covariances=np.tile(np.diag([1e-6, 1e-6, 1e-8]), (len(times), 1, 1))
+    )
+    seen = log["clouds"]
+    assert isinstance(seen, PointClouds)
+    points = [seen.cloud(k) * (0.01 if k in (9, 10, 11) else 1.0) for k in range(len(seen))]
+    before = [seen.ages(k) for k in range(len(seen))]
+    blind = PointClouds.from_arrays(
+        seen.times,
+        np.concatenate(points),
+        np.cumsum([0, *(len(p) for p in points)]),
+        None if before[0] is None else np.concatenate([a for a in before if a is not None]),
+        origin=seen.origin,
+        T_base_sensor=seen.T_base_sensor,
+    )
+    return replace(log, streams={"clouds": blind, "wheels": wheels})
+
+
 def beams() -> SensorLog:
     whole = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
     begin, _ = whole.interval
@@ -69,9 +100,10 @@ def fed(log: SensorLog, slam: Slam, seed: int = 0) -> None:
         ("rbpf-ekf", landmarks, {**LANDMARKS, "frontend": {"particles": 10}}),
         ("kiss-icp", clouds, CLOUDS),
         ("kiss-icp", carried, CLOUDS),
+        ("kiss-icp", wheeled, CLOUDS),
         ("segslam", beams, BEAMS),
     ],
-    ids=["ekf", "rbpf-ekf", "kiss-icp", "kiss-icp-imu", "segslam"],
+    ids=["ekf", "rbpf-ekf", "kiss-icp", "kiss-icp-imu", "kiss-icp-wheels", "segslam"],
 )
 def test_a_fed_run_is_the_run_over_the_stored_log(
     frontend: str, log: Any, config: dict[str, Any], tmp_path: Path
@@ -90,6 +122,8 @@ def test_a_fed_run_is_the_run_over_the_stored_log(
     assert {"run.json", "config.toml", "graph.g2o", "trajectory.tum"} <= set(a)
     assert set(a) == set(b)
     assert [n for n in a if a[n] != b[n]] == []
+    bridged = sum(s.report.get("scans_bridged", 0) for s in run.submaps)
+    assert (bridged > 0) == (frontend == "kiss-icp" and "wheels" in log.streams)
     if frontend not in ("ekf", "kiss-icp"):
         return
     # the records themselves are those that were given
