@@ -179,45 +179,71 @@ def _eigen(S: F8, V: F8) -> None:
 
 
 @nb.njit(cache=True)
-def _inverse_root(S: F8, times: float, more: float, out: F8) -> None:
-    """``W`` (3, 3), lower, with ``Wᵀ W = (times S + more I)⁻¹``: inverse of the Cholesky factor."""
-    a = np.sqrt(max(times * S[0, 0], 0.0) + more)
-    b = times * S[1, 0] / a
-    c = times * S[2, 0] / a
-    d = np.sqrt(max(times * S[1, 1] - b * b, 0.0) + more)
-    e = (times * S[2, 1] - b * c) / d
-    f = np.sqrt(max(times * S[2, 2] - c * c - e * e, 0.0) + more)
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 / a, 0.0, 0.0
-    out[1, 0], out[1, 1], out[1, 2] = -b / (a * d), 1.0 / d, 0.0
-    out[2, 0], out[2, 1], out[2, 2] = (b * e - c * d) / (a * d * f), -e / (d * f), 1.0 / f
+def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, float]:
+    """Main axes of the points of a cell: variances onto the diagonal of S, directions into columns of V.
+
+    Returns
+    -------
+    k : int
+        Which of them is the smallest.
+    surface : float
+        0 to 1: how far that is the thickness of a surface, variance well below ``flat`` [m²].
+    wide : float
+        0 to 1: how far points spread over two directions. Those in a row, as one line of a scanner leaves them, do not.
+    """
+    n, s = c.number[b], c.scatter[b]
+    S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = s[0], s[1], s[2], s[3], s[4], s[5]
+    S[1, 0], S[2, 0], S[2, 1] = s[1], s[2], s[4]
+    S /= n
+    _eigen(S, V)
+    k = 0
+    for i in range(1, 3):
+        if S[i, i] < S[k, k]:
+            k = i
+    second = min(S[(k + 1) % 3, (k + 1) % 3], S[(k + 2) % 3, (k + 2) % 3])
+    return k, max(1.0 - S[k, k] / flat, 0.0), min(max(second / flat - 0.5, 0.0), 1.0)
 
 
 @nb.njit(cache=True)
-def _tell(c: Cells, b: Any, size: float, least: float, planes: bool) -> None:
-    """Take the points so far for the cell that is matched to."""
-    n = c.number[b]
-    S = np.empty((3, 3))
-    s = c.scatter[b]
-    S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = s[0], s[1], s[2], s[3], s[4], s[5]
-    S[1, 0], S[2, 0], S[2, 1] = s[1], s[2], s[4]
-    root = c.root[b]
-    if planes:
-        # Only across a surface do points hold: along it a cell's centre is where the scans happened to fall. Points in
-        # a row, as one line of a scanner leaves them, tell of no surface.
-        V = np.empty((3, 3))
-        _eigen(S, V)
-        k = 0
-        for i in range(1, 3):
-            if S[i, i] < S[k, k]:
-                k = i
-        across = max(S[k, k] / n, 0.0)
-        second = min(S[(k + 1) % 3, (k + 1) % 3], S[(k + 2) % 3, (k + 2) % 3]) / n
-        flat = (0.12 * size) ** 2
-        weight = max(1.0 - across / flat, 0.0) * min(max(second / flat - 0.5, 0.0), 1.0) / (across + least * least)
-        for i in range(3):
-            root[0, i] = np.sqrt(weight) * V[i, k]
+def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells, float]) -> None:
+    """Take the points so far for the cell that is matched to.
+
+    Only across a surface do points hold: along it a cell's centre is where the scans happened to fall. Points in a row
+    tell of no surface; where the wider cell around them is one, as several lines of a scanner make it, and they lie in
+    it, they are part of it. What is thicker than a surface holds by all of its spread, if not ``planes``.
+    """
+    size, least, planes = how
+    wide, wide_size = around
+    n, root = c.number[b], c.root[b]
+    flat = (0.12 * size) ** 2
+    S, V = np.empty((3, 3)), np.empty((3, 3))
+    k, surface, spread = _spread(c, b, flat, S, V)
+    root[:, :] = 0.0
+    weight = surface * spread
+    across, x, y, z = max(S[k, k], 0.0), V[0, k], V[1, k], V[2, k]
+    if spread < 1.0 and wide_size > size:
+        at = _find(wide, _pack(c.mean[b, 0], c.mean[b, 1], c.mean[b, 2], 1.0 / wide_size))
+        if at >= 0 and wide.number[at] >= LEAST:
+            S2, V2 = np.empty((3, 3)), np.empty((3, 3))
+            j, surface2, spread2 = _spread(wide, at, flat, S2, V2)
+            off = 0.0
+            for i in range(3):
+                off += V2[i, j] * (c.mean[b, i] - wide.mean[at, i])
+            s, u, v, w = c.scatter[b], V2[0, j], V2[1, j], V2[2, j]
+            own = u * u * s[0] + v * v * s[3] + w * w * s[5] + 2.0 * (u * v * s[1] + u * w * s[2] + v * w * s[4])
+            own = max(own / n, 0.0)
+            share = surface2 * spread2 * max(1.0 - (own + off * off) / flat, 0.0)
+            if share > weight:
+                weight, across, x, y, z = share, own, u, v, w
+    if not planes and x == V[0, k] and y == V[1, k] and z == V[2, k]:
+        rest = max(1.0 - 2.0 * surface, 0.0)
+        for q in range(3):
+            deep = np.sqrt((weight + rest if q == k else rest) / (max(S[q, q], 0.0) + least * least))
+            for i in range(3):
+                root[q, i] = deep * V[i, q]
     else:
-        _inverse_root(S, 1.0 / n, least * least, root)
+        deep = np.sqrt(weight / (across + least * least))
+        root[0, 0], root[0, 1], root[0, 2] = deep * x, deep * y, deep * z
     moved = 0.0
     for i in range(3):
         moved = max(moved, abs(c.mean[b, i] - c.centre[b, i]))
@@ -229,10 +255,18 @@ def _tell(c: Cells, b: Any, size: float, least: float, planes: bool) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def add_points(c: Cells, points: F8, scan: int, size: float, least: float, planes: bool) -> int:
-    """Put points of the world into their cells; how many found no room."""
+def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], around: tuple[Cells, float]) -> int:
+    """Put points of the world into their cells; how many found no room.
+
+    Parameters
+    ----------
+    how : (float, float, bool)
+        Edge of a cell [m]; σ added to its own [m]; only surfaces tell.
+    around : (Cells, float)
+        A level of wider cells, which has the points already, and their edge [m]; 0: none.
+    """
     lost = 0
-    inverse = 1.0 / size
+    inverse = 1.0 / how[0]
     touched = np.empty(len(points), np.int64)
     m = 0
     for p in range(len(points)):
@@ -265,7 +299,7 @@ def add_points(c: Cells, points: F8, scan: int, size: float, least: float, plane
         b = touched[k]
         n = c.number[b]
         if n >= LEAST and n >= c.told[b] + max(1, c.told[b] // 4):
-            _tell(c, b, size, least, planes)
+            _tell(c, b, how, around)
     return lost
 
 

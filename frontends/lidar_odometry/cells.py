@@ -28,7 +28,8 @@ class LevelConfig:
         σ that is added to a cell's own [m]: on coarse levels a quarter of the cell, or the weights are 0 before the
         match begins.
     planes : bool
-        Only across surfaces do cells hold a point: along them a cell's centre is where scans happened to fall.
+        Only surfaces hold a point, and what is neither a surface nor a row of points does not; else it does by all of
+        its spread. Across a surface alone a cell holds on every level.
     """
 
     size: float
@@ -81,12 +82,16 @@ class CellMap:
         used = int(self.cells.used[0])
         return np.asarray(self.cells.centre[:used][self.cells.told[:used] > 0])
 
-    def add(self, points: Array, scan: int) -> None:
-        """Put points ``(n, 3)`` of the world into the cells they fall into; ``scan`` is a number that rises."""
+    def add(self, points: Array, scan: int, wide: CellMap | None = None) -> None:
+        """Put points ``(n, 3)`` of the world into the cells they fall into; ``scan`` is a number that rises.
+
+        ``wide`` is a level of wider cells that has them already: points in a row belong to its surfaces.
+        """
         # every point may make a block, and a match asks for as many again
         self.room(2 * len(points))
         c = self.config
-        kernels.add_points(self.cells, points, scan, c.size, c.least, c.planes)
+        around = (self.cells, 0.0) if wide is None else (wide.cells, wide.config.size)
+        kernels.add_points(self.cells, points, scan, (c.size, c.least, c.planes), around)
 
     def room(self, more: int) -> None:
         """Make room for blocks."""
@@ -140,6 +145,11 @@ class CellMap:
             most += done + 1
             done = kernels.descend(self.cells, points, (R, t), start, size, scale, (*still, most), out)
         return _fit(len(points), *out)
+
+    def known(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Which points ``(n, 3)`` of the world have a cell near them that says something."""
+        at = self.nearest(points)
+        return np.asarray((at >= 0) & (np.abs(self.cells.root[at]).max(axis=(1, 2)) > 0.0))
 
     def by_slot(self, points: Array, R: Array, t: Array, scale: float, ends: Array) -> tuple[Array, Array, Array]:
         """See `cell_kernels.information_by_slot`: ``(s, 6, 6)``, ``(6, 6)`` and ``(c, 6)``."""

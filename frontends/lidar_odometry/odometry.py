@@ -55,6 +55,13 @@ LATE = 2.5
 """Time since the last scan, in usual ones, from which a scan is looked for far and wide anyhow."""
 BETTER = 1.2
 """A place found far and wide must overlap so many times as much."""
+NEW = 0.5
+"""Share of the points of a scan without a cell on the finest level from which on the level above speaks for them: what
+lies between the rings of the scans so far is seen by wider cells alone."""
+BEGUN = 3
+"""Scans that surfaces held in every direction before the speed is known …"""
+FASTEST = 10.0
+"""… and its σ until then [m/s]: a car in a town. Rest is the prediction, and stands for what nothing holds."""
 LITTLE = 0.1
 """Share of the points of a scan that have a cell on the finest level below which that level says nothing of the scan.
 The rings of a sparse lidar make no surfaces before several scans are laid on each other: cells of a few chance points
@@ -80,6 +87,8 @@ ACCELERATION = (3.0, 2.0)
 """What speeds may change by, beside what was seen lately [rad/s²], [m/s²]: a hand-held lidar, a car that brakes."""
 LONGEST = 30.0
 """Of a longer time nothing less is known than of this [s]: a kilometre either way."""
+LONG_SWEEP = 10.0
+"""Points are no older than so many times the motion that they are moved by."""
 GIVEN_UP = 10
 """Scans lost in a row after which a new map begins."""
 
@@ -155,8 +164,10 @@ class Raw:
         """In the body at the stamp ``(n, 3)``, where it moved by ``motion`` (7,) evenly in the ``dt`` [s] before."""
         if self.ages is None or dt <= 0:
             return self.points
-        twist = np.asarray(se3.se3_log(motion)) / dt
-        return np.asarray(se3.se3_transform(se3.se3_exp(-self.ages[:, None] * twist), self.points))
+        # times in another unit must not throw points out of the world
+        ages = np.clip(self.ages / dt, -LONG_SWEEP, LONG_SWEEP)
+        steps = -ages[:, None] * np.asarray(se3.se3_log(motion))
+        return np.asarray(se3.se3_transform(se3.se3_exp(steps), self.points))
 
 
 class LidarOdometry:
@@ -205,7 +216,7 @@ class LidarOdometry:
         self.changes: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
         self.missed: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
         self.errors = JointErrors()
-        self.lost, self.loose = 0, 1
+        self.lost, self.loose, self.held = 0, 1, 0
         self.first = 0
         side = range(-SEARCH_SIDE, SEARCH_SIDE + 1)
         self.near_rotations = _rotations(SEARCH_STEP * np.array(list(product(side, side, side)), dtype=np.float64))
@@ -388,6 +399,9 @@ class LidarOdometry:
         self.spread = np.diag([turn2] * 3 + [shift2] * 3)
         # a speed that nothing holds is off for as long as nothing holds it
         Q = self.loose**2 * self.spread
+        if self.held < BEGUN:
+            Q[3:, 3:] += (2 * self.loose - 1) * (FASTEST * dt) ** 2 * np.eye(3)
+        self.held += fit is not None and not seen.unheld
         if reckoned is not None:
             # as far as it is off in one way all along, σ grows with the time: k² − (k − 1)² of it are of this step
             Q = self.spread = (2 * self.loose - 1) * reckoned
@@ -408,7 +422,7 @@ class LidarOdometry:
         R, t = _split(self.pose)
         world = points @ R.T + t
         for level in self.levels:
-            level.add(world, self.scan)
+            level.add(world, self.scan, None if level is self.levels[0] else self.levels[0])
         self.errors.lay(self.scan, alone)
 
     # --- matching ----------------------------------------------------------------------------------------------------
@@ -509,18 +523,30 @@ class LidarOdometry:
         return bool(np.linalg.norm(off[:3]) < NEAR[0] and np.linalg.norm(off[3:]) < NEAR[1])
 
     def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, Fit]:
-        """Gauss–Newton on one level after the other."""
-        R, t = _split(pose.copy())
+        """Gauss–Newton on one level after the other; on coarse ones the start stands along what no surface holds."""
         fit = None
-        last = self.levels[-1]
         for level in levels:
-            some = points if level is last else points[evenly(len(points), COARSE_POINTS)]
-            size = level.config.size
-            # a coarse match is the start of a finer one; where the finest cells tell little yet, its word stands
-            still, prior = (STILL, COARSE) if level is last else ((0.002 * size, 0.01 * size), 1e-3 * np.eye(6))
-            fit = level.descend(some, R, t, SCALE, prior, still, MOST_STEPS)
+            R, t = _split(pose.copy())
+            if level is self.levels[-1]:
+                prior = COARSE + self._coarser(points, R, t)
+                fit = level.descend(points, R, t, SCALE, prior, STILL, MOST_STEPS)
+                pose = np.concatenate([t, se3.matrix_to_quat(R)])
+                continue
+            some, size = points[evenly(len(points), COARSE_POINTS)], level.config.size
+            still = (0.002 * size, 0.01 * size)
+            fit = level.descend(some, R, t, SCALE, 1e-3 * np.eye(6), still, MOST_STEPS)
+            pose, _ = self._hold(np.concatenate([t, se3.matrix_to_quat(R)]), pose, fit)
         assert fit is not None
-        return np.concatenate([t, se3.matrix_to_quat(R)]), fit
+        return pose, fit
+
+    def _coarser(self, points: Array, R: Array, t: Array) -> Array:
+        """Information ``(6, 6)`` that the level above the finest has of points that the finest does not know."""
+        if len(self.levels) < 2:
+            return np.zeros((6, 6))
+        new = ~self.levels[-1].known(points @ R.T + t)
+        if np.mean(new) < NEW:
+            return np.zeros((6, 6))
+        return self.levels[-2].fit(points[new], R, t, SCALE).H
 
     def _search(
         self, points: Array, few: Array, centres: tuple[Array, ...], rotations: Array, best: int, levels: list[CellMap]

@@ -21,19 +21,31 @@ def _room(rng, n=4000):
     return np.concatenate([u, rng.uniform(-1, 1, (n // 8, 3))])
 
 
+def _lined(rng):
+    """A room whose floor and a wall are seen by lines of a scanner, 0.7 m apart."""
+    points = _room(rng)
+    floor = (points[:, 2] < -3.9) | (points[:, 0] > 3.9)
+    points[floor, 1] = 0.7 * np.round(points[floor, 1] / 0.7)
+    return points
+
+
 @pytest.fixture(scope="module", params=[(0.5, 0.05, True), (1.0, 0.25, False)])
 def made(request):
     size, least, planes = request.param
-    points = _room(np.random.default_rng(3))
+    points = _lined(np.random.default_rng(3))
+    wide = CellMap(LevelConfig(2.0, 0.5, False))
+    wide.add(points, 0)
     level = CellMap(LevelConfig(size, least, planes))
-    level.add(points, 0)
+    level.add(points, 0, wide)
     return level, points
 
 
 def test_cells_are_those_of_the_plain_twin(made):
     level, points = made
     c = level.config
-    centres, information = plain_cells(points, c.size, c.least, c.planes)
+    centres, information = plain_cells(points, c.size, c.least, c.planes, 2.0)
+    alone = plain_cells(points, c.size, c.least, c.planes)[1]
+    assert np.count_nonzero(np.abs(information - alone).max(axis=(1, 2)) > 0) > 10  # rows that surfaces are told of
     # the fast ones are told anew only every quarter of their points
     told = level.cells.told[: level.cells.used[0]] > 0
     assert np.count_nonzero(told) == len(centres) == len(level)
@@ -104,6 +116,8 @@ def test_normal_equations_are_those_of_the_plain_twin_and_of_differences(made):
             costs.append(plain_cost(body, se3.quat_to_matrix(moved[3:]), moved[:3], cells, A, SCALE))
         numeric[k] = (costs[0] - costs[1]) / 2e-6
     np.testing.assert_allclose(fit.g, numeric, rtol=1e-5, atol=1e-5 * np.abs(g).max())
+    told = np.linalg.norm(A, axis=(1, 2)) > 0
+    np.testing.assert_array_equal(level.known(np.ascontiguousarray(body @ R.T + t)), told & (at >= 0))
     # what surfaces turned anyhow would say is no less, in any direction
     assert np.linalg.eigvalsh(fit.every - fit.H).min() > -1e-6 * np.abs(fit.every).max()
 

@@ -124,7 +124,52 @@ class _Clouds:
         return None
 
 
-def _corridor(ends):
+def test_a_speed_that_nothing_tells_is_not_known_to_be_none():
+    """Rest is the prediction when a log begins; along an endless corridor the covariance is wide."""
+    for speed in (0.5, 2.0, 8.0):
+        poses, _, joints = follow(_corridor(False, 0.1 * speed), ages=False)
+        off = 0.1 * speed * 9 - poses[9, 0]
+        sigma = np.sqrt(joints[9, 9, 9])
+        assert abs(off) < 3.0 * sigma
+        assert sigma > 5.0  # of 0.9 s at a speed of which nothing is known
+
+
+@pytest.mark.parametrize("speed", [1.0, 6.0, 15.0])
+def test_a_log_may_begin_in_motion_on_open_ground(speed):
+    """Rings on the ground lie where they lay, whatever the speed: rows of points are no word for rest."""
+    caster = _street(np.random.default_rng(3))
+    az, el = np.meshgrid(np.arange(900) * 2 * np.pi / 900, np.deg2rad(np.linspace(-15.0, 15.0, 16)))
+    d = np.column_stack([(np.cos(el) * np.cos(az)).ravel(), (np.cos(el) * np.sin(az)).ravel(), np.sin(el).ravel()])
+    rng, scans = np.random.default_rng(4), []
+    for k in range(15):
+        r = caster.ranges(np.hstack([np.broadcast_to([0.1 * speed * k, 0.0, 1.8], d.shape), d]))
+        met = (r > 0.5) & (r < 80.0)
+        scans.append(d[met] * (r[met] + rng.normal(0, 0.02, met.sum()))[:, None])
+    poses, seen, _ = follow(_Clouds(scans), ages=False)
+    assert all(s.unheld == 0 for s in seen[3:])
+    assert np.abs(poses[:, :3] - np.outer(0.1 * speed * np.arange(15), [1, 0, 0])).max() < 0.06
+
+
+def _street(rng):
+    """Ground, and boxes of 0.3 to 4 m on either side of a road."""
+    v, f = [[-300, -300, 0], [300, -300, 0], [300, 300, 0], [-300, 300, 0]], [(0, 1, 2), (0, 2, 3)]
+    for x in np.arange(-40.0, 80.0, 8.0):
+        for side in (-1, 1):
+            at, half, top = (
+                [x + rng.uniform(-3, 3), side * rng.uniform(5, 12)],
+                rng.uniform(0.3, 2.0, 2),
+                rng.uniform(1, 4),
+            )
+            angle, k = rng.uniform(0, np.pi), len(v)
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            for z in (0, top):
+                v += [[*(at + turn @ (half * c)), z] for c in ([-1, -1], [1, -1], [1, 1], [-1, 1])]
+            sides = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
+            f += [(k + q[0], k + q[i], k + q[i + 1]) for q in sides for i in (1, 2)]
+    return RayCaster(np.array(v, dtype=np.float64), np.array(f))
+
+
+def _corridor(ends, step=0.1):
     """Scans every 0.1 m in a corridor of 2.4 m × 2.6 m, whose ends are out of sight or at -5 and 12 m."""
     x0, x1 = (-5.0, 12.0) if ends else (-500.0, 500.0)
     y0, y1, z0, z1 = -1.2, 1.2, -1.2, 1.4
@@ -136,7 +181,7 @@ def _corridor(ends):
     for k in range(26):
         d = rng.normal(size=(3000, 3))
         d /= np.linalg.norm(d, axis=1)[:, None]
-        r = caster.ranges(np.hstack([np.broadcast_to([0.1 * k, 0.0, 0.0], d.shape), d]))
+        r = caster.ranges(np.hstack([np.broadcast_to([step * k, 0.0, 0.0], d.shape), d]))
         met = r < 25.0
         scans.append(d[met] * (r[met] + rng.normal(0, 0.02, met.sum()))[:, None])
     return _Clouds(scans)
