@@ -21,6 +21,7 @@ from graphslam.evidence.map_server import save_map_server
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_maps import Map, cube, grid_of_map, map_of_grid, random_map, scanned_grid
 from tests.reference.evidence_pool import check_pool
+from tests.reference.map_server import read_map_server
 
 
 def near(rng: np.random.Generator) -> Map:
@@ -234,28 +235,17 @@ def test_a_failed_write_leaves_the_old_file(rng: np.random.Generator, tmp_path: 
 def test_map_server_pair_says_what_the_grid_says(rng: np.random.Generator, tmp_path: Path) -> None:
     grid = scanned_grid(rng, dim=2)
     yaml, image = save_map_server(grid, tmp_path / "floor's plan.yaml")
-    said = dict(line.split(": ", 1) for line in yaml.read_text().splitlines())
-    assert said["image"] == "'floor''s plan.pgm'"
+    cell, said = read_map_server(yaml)
+    assert said["image"] == "floor's plan.pgm"
     assert image.name == "floor's plan.pgm"
     assert said["mode"] == "trinary"
-    magic, size, depth, pixels = image.read_bytes().split(b"\n", 3)
-    width, height = map(int, size.split())
-    assert (magic, depth) == (b"P5", b"255")
-    grey = np.frombuffer(pixels, np.uint8).reshape(height, width)
-    # map_server's own rule: p = (255 - grey) / 255
-    p = (255 - grey.astype(float)) / 255
-    cell = np.where(p > float(said["occupied_thresh"]), 100, np.where(p < float(said["free_thresh"]), 0, -1))
-    x0, y0, yaw = (float(w) for w in said["origin"].strip("[]").split(","))
-    resolution = float(said["resolution"])
-    seen = set()
-    for row in range(height):
-        for column in range(width):
-            point = [x0 + (column + 0.5) * resolution, y0 + (height - row - 0.5) * resolution]
-            value = int(grid.values_at([point])[0])
-            assert cell[row, column] == (-1 if value == UNKNOWN else 100 if value >= 0 else 0)
-            seen.add(int(cell[row, column]))
-    assert seen == {-1, 0, 100}
-    assert yaw == 0.0
+    assert said["origin"][2] == 0.0
+    low, step = np.array(said["origin"][:2]), said["resolution"]
+    rows, columns = np.indices(cell.shape)
+    points = np.stack([low[0] + (columns + 0.5) * step, low[1] + (rows + 0.5) * step], axis=-1)
+    values = grid.values_at(points.reshape(-1, 2)).reshape(cell.shape)
+    np.testing.assert_array_equal(cell, np.where(values == UNKNOWN, -1, np.where(values >= 0, 100, 0)))
+    assert set(np.unique(cell)) == {-1, 0, 100}
 
 
 def test_map_server_refuses_what_is_no_image(tmp_path: Path) -> None:

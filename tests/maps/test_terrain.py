@@ -17,11 +17,12 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.learning import fit_calibration, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
-from graphslam.maps.terrain.plan import CostConfig, cost_map, plan_way, save_cost_map
+from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_way, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
 from graphslam.maps.terrain.tables import BINS, Tables, calibrated, dampened, fixed_tables, noisy_or, read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 from graphslam.sim.street import StreetRobot, draw_street, drive_street
+from tests.reference.map_server import read_map_server
 from tests.reference.plain_terrain import plain_rows
 
 H = 1.1
@@ -470,16 +471,21 @@ def test_cost_maps_are_files_of_a_map_server(tmp_path: Path) -> None:
     p = Pyramid((0.0, 0.0, 1.6, 0.8), DRIVEN, VEHICLE, SENSOR)
     p.add(np.concatenate([row(0, 0.05, STEP, 0, many=5), row(0, 1.45, STEP, 30, many=20)]))
     costs = cost_map(p.classify(), Vehicle(width=0.1))
+    wanted = occupancy_values(costs)
+    assert {-1, 100} < set(np.unique(wanted))
     for mode in ("raw", "scale"):
         yaml, image = save_cost_map(costs, tmp_path / f"{mode}.yaml", mode=mode)
-        data = image.read_bytes()
-        assert data.startswith(b"P5\n16 8\n255\n")
-        pixels = np.frombuffer(data[-128:], np.uint8).reshape(8, 16)[::-1]
-        assert pixels[0, 14] == (100 if mode == "raw" else 0)
-        assert pixels[5, 5] == (255 if mode == "raw" else 205)
-        assert pixels[0, 0] < 10 if mode == "raw" else pixels[0, 0] > 240
-        assert "resolution: 0.100000" in yaml.read_text()
-        assert f"mode: {mode}" in yaml.read_text()
+        assert image.suffix == (".pgm" if mode == "raw" else ".png")
+        cells, said = read_map_server(yaml)
+        np.testing.assert_array_equal(cells, wanted)
+        assert said["mode"] == mode
+        assert said["resolution"] == costs.cell
+        np.testing.assert_allclose(said["origin"], [*costs.origin, 0.0], atol=1e-6)
+    # every value that a cell may have, in either mode
+    every = dataclasses.replace(costs, cost=np.geomspace(1.0, 1e4, costs.cost.size).reshape(costs.cost.shape))
+    for mode in ("raw", "scale"):
+        cells, _ = read_map_server(save_cost_map(every, tmp_path / "every.yaml", mode=mode)[0])
+        np.testing.assert_array_equal(cells, occupancy_values(every))
     with pytest.raises(FormatError, match="mode"):
         save_cost_map(costs, tmp_path / "x.yaml", mode="trinary")
     with pytest.raises(FormatError, match="ending"):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from graphslam.core.atomic import atomic_open
@@ -18,6 +19,8 @@ from graphslam.core.geometry import Array
 from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
 from graphslam.maps.terrain.vehicle import Vehicle
 
+_THRESHOLDS = 0.01, 0.99
+"""Below and above which the map server takes a cell of a ``scale`` map for free and occupied."""
 _LEAVE = 0.5
 """A vehicle that stands in closed cells goes so far to an open one [m]."""
 
@@ -166,18 +169,19 @@ def _way_out(costs: CostMap, a: tuple[int, int]) -> tuple[int, int] | None:
     return None if np.any(costs.lethal[on]) else (int(iy[best]), int(ix[best]))
 
 
-def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "scale") -> tuple[Path, Path]:
-    """Write a cost map as ``path`` (``.yaml``) and the image beside it (``.pgm``), as nav2's map server reads them.
+def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "raw") -> tuple[Path, Path]:
+    """Write a cost map as ``path`` (``.yaml``) and the image beside it, as nav2's map server reads them.
+
+    The server's grid then holds the values of :func:`occupancy_values`, cell by cell.
 
     Parameters
     ----------
     costs : CostMap
     path : path
         Ending in ``.yaml``.
-    mode : {"scale", "raw"}
-        ``scale``: a grey a cost, which the server turns into 0 to 100; unknown cells have the grey 205, which it takes
-        for a cost of its own, because an image without transparency cannot say that nothing is known. ``raw``: the
-        bytes are the values of the server's grid, 0 to 100, and 255, unknown.
+    mode : {"raw", "scale"}
+        ``raw``: a PGM, whose bytes are the values, 0 to 100, and 255, unknown. ``scale``: a PNG, a grey a cost, where
+        what is unknown is transparent; a PGM cannot say that in this mode.
 
     Returns
     -------
@@ -193,22 +197,26 @@ def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "
         raise FormatError("unknown ending of a cost map", where=str(path), got=target.suffix, wanted=".yaml")
     if mode not in ("scale", "raw"):
         raise FormatError("unknown mode of a cost map", where=str(path), got=mode, wanted="scale or raw")
-    values = occupancy_values(costs)
-    if mode == "raw":
-        pixels = np.where(values < 0, 255, values).astype(np.uint8)
-    else:
-        pixels = np.where(values < 0, 205, np.round(254.0 * (1.0 - values / 100.0))).astype(np.uint8)
-    rows = np.ascontiguousarray(pixels[::-1])  # the first row of an image is its top
-    image = target.with_suffix(".pgm")
+    values = occupancy_values(costs)[::-1]  # the first row of an image is its top
+    image = target.with_suffix(".pgm" if mode == "raw" else ".png")
+    low, high = _THRESHOLDS
     with atomic_open(image) as stream:
-        stream.write(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii"))
-        stream.write(rows.tobytes())
+        if mode == "raw":
+            stream.write(f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode("ascii"))
+            stream.write(np.where(values < 0, 255, values).astype(np.uint8).tobytes())
+        else:
+            occupied = low + (high - low) * values / 100.0
+            occupied[values == 0], occupied[values == 100] = 0.0, 1.0
+            grey = np.round(255.0 * (1.0 - occupied))
+            Image.fromarray(np.stack([grey, np.where(values < 0, 0, 255)], axis=-1).astype(np.uint8)).save(
+                stream, "PNG"
+            )
     x, y = (float(v) for v in costs.origin)
     name = image.name.replace("'", "''")
     with atomic_open(target, "w") as stream:
         stream.write(
             f"image: '{name}'\nmode: {mode}\nresolution: {costs.cell:.6f}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
-            "negate: 0\noccupied_thresh: 0.99\nfree_thresh: 0.01\n"
+            f"negate: 0\noccupied_thresh: {high}\nfree_thresh: {low}\n"
         )
     return target, image
 
