@@ -145,6 +145,7 @@ def test_detectors_are_those_of_the_plain_twin() -> None:
     f = Figures(
         c.smooth, c.window, math.tan(VEHICLE.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach,
         math.tan(VEHICLE.max_slope + math.radians(5.0)), VEHICLE.clearance, VEHICLE.height, c.above_limit,
+        VEHICLE.climbable_step, VEHICLE.width,
     )  # fmt: skip
     wanted = plain_rows(lines, edges, cells, f, c.nearest)
     assert np.array_equal(made[np.lexsort(made.T[::-1])], wanted)
@@ -159,6 +160,33 @@ def row(band: int, x: float, channel: int, value: int, many: int = 1) -> Array:
 def at(p: Pyramid, x: float) -> float:
     found = p.classify()
     return float(found.probability[math.floor((0.05 - found.origin[1]) / 0.1), math.floor((x - found.origin[0]) / 0.1)])
+
+
+def missing(points: Array, foot: float = 0.0, height: float = 1.77) -> list[int]:
+    """Depths [cm] that the statements of missing support of one line give; points are places and heights."""
+    line = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
+    lines = ScanLines(line[None], np.array([[0.0, 0.0, foot + height]]), np.array([foot]))
+    rows = np.concatenate(list(observe(lines, SENSOR.band_edges(), np.array(CELLS), VEHICLE)))
+    return [int(v) for v in rows[(rows[:, 4] == SUPPORT) & (rows[:, 5] > 0), 5]]
+
+
+def test_a_fall_begins_on_ground_that_the_vehicle_can_be_on() -> None:
+    road = np.column_stack([np.arange(4.1, 9.0, 0.1), np.zeros(49)])
+    # the lowest beam meets the road 4.1 m away; one on the bumper of a car is nearer and comes later in the line
+    bumper = np.array([[3.9, 0.35], [3.9, 0.45], [3.9, 0.55]])
+    assert not missing(np.concatenate([road[:6], bumper, road[6:]]))
+    # a hedge of 0.5 m that is led up in small steps, and the road behind it
+    hedge = np.column_stack([np.arange(4.7, 5.2, 0.1), [0.05, 0.1, 0.16, 0.22, 0.24]])
+    behind = road[road[:, 0] > 5.6]
+    assert not missing(np.concatenate([road[:6], hedge, behind]))
+    # a terrace of the same height that is as wide as the vehicle, and a drop behind it
+    wide = np.column_stack([np.arange(5.2, 6.3, 0.1), np.full(11, 0.24)])
+    low = np.column_stack([np.arange(7.4, 8.5, 0.1), np.full(11, -0.5)])
+    assert max(missing(np.concatenate([road[:6], hedge, wide, low]))) > 30
+    # level road, and a fall of less than the vehicle climbs, or of more
+    for depth, told in ((0.04, False), (0.5, True)):
+        floor = np.column_stack([np.arange(6.3, 8.0, 0.1), np.full(17, -depth)])
+        assert bool(missing(np.concatenate([road[:15], floor]))) is told
 
 
 @pytest.mark.parametrize("channel", [STEP, SUPPORT])

@@ -55,11 +55,14 @@ class PlainLine:
         place, height, slope, hidden = 0.0, self.foot, 0.0, False
         anchor = (0.0, self.foot)
         first = run = side = 0
+        base: tuple[float, float, float] | None = None  # of a climb: place and height before it, and where it ended
         for i in range(len(s)):
-            before.append((place, height, slope, hidden))
+            stood = (place, height) if base is None else base[:2]
+            before.append((*stood, slope, hidden))
             way = s[i] - place
             off = z[i] - (height + slope * way)
-            near = -0.05 < way < 2.0 * f.memory and abs(off) < f.residual + f.residual_rate * max(way, 0.0)
+            led = way > -0.05 and (way < 2.0 * f.memory or not any(on))
+            near = led and abs(off) < f.residual + f.residual_rate * max(way, 0.0)
             grown = False
             if near:
                 run = 0
@@ -83,6 +86,14 @@ class PlainLine:
             on[i] = 2 if grown else 1
             if near and abs(way) < 0.03:
                 continue
+            if base is None:
+                within = [j for j in range(i) if on[j] and all(s[i] - s[q] <= f.window for q in range(j, i))]
+                points = [(place, height), *((s[j], z[j]) for j in within)]
+                at, low = max(points, key=lambda q: z[i] - q[1] - f.slack * (s[i] - q[0]))
+                if z[i] - low - f.slack * (s[i] - at) > f.climb:
+                    base = (at, low, s[i])
+            elif z[i] - base[1] - f.slack * (s[i] - base[0]) <= f.climb or s[i] - base[2] >= f.width:
+                base = None
             place, height, hidden = s[i], z[i], False
             while first < i and (not on[first] or s[i] - s[first] >= 0.5):
                 if on[first]:
@@ -128,7 +139,7 @@ class PlainLine:
             place, height, _, hidden = before[i]
             o = self.origin
             depth = height - f.slack * (s[i] - place) - p[i][2]
-            if on[i] != 1 and depth > 0 and not hidden and o[2] > height > p[i][2]:
+            if on[i] != 1 and depth > f.climb and not hidden and o[2] > height > p[i][2]:
                 pierced = s[i] * (o[2] - height) / (o[2] - p[i][2])
                 if pierced < s[i] - 0.1 and pierced - place < f.memory:
                     at = pierced

@@ -45,6 +45,8 @@ class Figures(NamedTuple):
     clearance: float
     height: float
     above_limit: float
+    climb: float
+    width: float
 
 
 @kernel()
@@ -102,20 +104,27 @@ def follow_ground(s, z, n, foot, f, ground, chain):
     """Which points ``ground (n,)`` are on the ground, 1 where it led there and 2 on another level, and what each found
     before it: ``chain (n, 4)``.
 
-    ``chain``: place and height of the last ground point before, the slope of the ground there, and 1 where something
-    stands in between. A point is on the ground if it lies where the ground leads within ``residual + residual_rate ·
-    way``; a level that goes on for three points above (at most ``clearance``) or six below becomes the ground.
+    ``chain``: place and height of the last ground point before on which the vehicle can be, the slope of the ground
+    there, and 1 where something stands in between. Where the line climbs by more than the vehicle does, it cannot be on
+    what is narrower than it: a rail, a hedge, a bumper. There the last point is that before the climb. A point is on
+    the ground if it lies where the ground leads within ``residual + residual_rate · way``; a level that goes on for
+    three points above (at most ``clearance``) or six below becomes the ground.
     """
     last_s, last_z, slope = 0.0, foot, 0.0
     from_s, from_z = 0.0, foot  # of the slope: half a metre back
     first = 0  # of the ground points that the slope may be taken from
-    run, side, blocked = 0, 0, 0.0
+    run, side, blocked, found = 0, 0, 0.0, False
+    raised, base_s, base_z, from_raised = False, 0.0, foot, 0.0
     for i in range(n):
         chain[i, 0], chain[i, 1], chain[i, 2], chain[i, 3] = last_s, last_z, slope, blocked
+        if raised:
+            chain[i, 0], chain[i, 1] = base_s, base_z
         ground[i] = 0
         way = s[i] - last_s
         off = z[i] - (last_z + slope * way)
-        if way > -0.05 and abs(off) < f.residual + f.residual_rate * max(way, 0.0) and way < 2.0 * f.memory:
+        # the lowest beam may meet the ground far from the sensor: there the ground is known first
+        near = way < 2.0 * f.memory or not found
+        if way > -0.05 and abs(off) < f.residual + f.residual_rate * max(way, 0.0) and near:
             accept = 1
             run = 0
         else:
@@ -140,9 +149,22 @@ def follow_ground(s, z, n, foot, f, ground, chain):
             first = i - run + 1
             from_s, from_z, slope = s[first], z[first], 0.0
             run = 0
-        ground[i] = accept
+        ground[i], found = accept, True
         if accept == 1 and abs(way) < 0.03:
             continue  # the foot of a wall is not climbed point by point
+        if raised:
+            on_it = z[i] - base_z - f.slack * (s[i] - base_s) > f.climb
+            raised = on_it and s[i] - from_raised < f.width
+        else:
+            # the lowest of the ground that the line climbs from within a step's window, or the point before
+            low_s, low_z = last_s, last_z
+            for j in range(i - 1, -1, -1):
+                if s[i] - s[j] > f.window:
+                    break
+                if ground[j] and z[j] + f.slack * (s[i] - s[j]) < low_z + f.slack * (s[i] - low_s):
+                    low_s, low_z = s[j], z[j]
+            if z[i] - low_z - f.slack * (s[i] - low_s) > f.climb:
+                raised, base_s, base_z, from_raised = True, low_s, low_z, s[i]
         last_s, last_z, blocked = s[i], z[i], 0.0
         while first < i and (not ground[first] or s[i] - s[first] >= 0.5):
             if ground[first] and s[i] - s[first] >= 0.5:
@@ -204,10 +226,10 @@ def observe_line(line, points, origin, foot, lattice, f, out):
             if height[i] <= f.above_limit:
                 put_row(out, (line, channel), 1, where, lattice)
         # Missing support: the beam went below the ground before it came back, and what it met lies deeper than the
-        # steepest ground that may be driven leads to. So there is a fall somewhere on the way.
+        # steepest ground that may be driven leads to, and by more than the vehicle climbs: there is a fall on the way.
         last_s, last_z, _, blocked = chain[i]
         depth = last_z - f.slack * (s[i] - last_s) - p[i, 2]
-        if ground[i] != 1 and depth > 0.0 and blocked == 0.0 and origin[2] > last_z > p[i, 2]:
+        if ground[i] != 1 and depth > f.climb and blocked == 0.0 and origin[2] > last_z > p[i, 2]:
             pierced = s[i] * (origin[2] - last_z) / (origin[2] - p[i, 2])
             if s[i] > pierced + 0.1 and pierced - last_s < f.memory:
                 end, at = min(s[i], pierced + f.support_reach), pierced

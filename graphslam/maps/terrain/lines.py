@@ -198,7 +198,8 @@ def observe(
     edges, cells : (b,)
         Ranges at which the bands end, and widths of their cells [m].
     vehicle : Vehicle
-        Its clearance and height tell steps, obstacles and what is above reach apart; its slope is no step.
+        Its clearance and height tell steps, obstacles and what is above reach apart; its slope is no step. A fall
+        begins on ground that it can be on, not on what it does not climb and is narrower than it.
     config : DetectorConfig, optional
 
     Yields
@@ -210,6 +211,7 @@ def observe(
     figures = Figures(
         *(c.smooth, c.window, math.tan(vehicle.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach),
         *(math.tan(min(vehicle.max_slope + math.radians(5.0), 1.2)), vehicle.clearance, vehicle.height, c.above_limit),
+        *(vehicle.climbable_step, vehicle.width),
     )
     lattice = Lattice(np.ascontiguousarray(edges, np.float64), np.ascontiguousarray(cells, np.float64), c.nearest)
     per_line = 8 * lines.points.shape[1] + 4 * int(lattice.edges[-1] / lattice.cells[0])
