@@ -174,7 +174,7 @@ def test_a_fall_begins_on_ground_that_the_vehicle_can_be_on() -> None:
     road = np.column_stack([np.arange(4.1, 9.0, 0.1), np.zeros(49)])
     # the lowest beam meets the road 4.1 m away; one on the bumper of a car is nearer and comes later in the line
     bumper = np.array([[3.9, 0.35], [3.9, 0.45], [3.9, 0.55]])
-    assert not missing(np.concatenate([road[:6], bumper, road[6:]]))
+    assert not missing(np.concatenate([road[:4], bumper, road[4:]]))
     # a hedge of 0.5 m that is led up in small steps, and the road behind it
     hedge = np.column_stack([np.arange(4.7, 5.2, 0.1), [0.05, 0.1, 0.16, 0.22, 0.24]])
     behind = road[road[:, 0] > 5.6]
@@ -184,8 +184,8 @@ def test_a_fall_begins_on_ground_that_the_vehicle_can_be_on() -> None:
     low = np.column_stack([np.arange(7.4, 8.5, 0.1), np.full(11, -0.5)])
     assert max(missing(np.concatenate([road[:6], hedge, wide, low]))) > 30
     # level road, and a fall of less than the vehicle climbs, or of more
-    for depth, told in ((0.04, False), (0.5, True)):
-        floor = np.column_stack([np.arange(6.3, 8.0, 0.1), np.full(17, -depth)])
+    for depth, told in ((0.08, False), (0.5, True)):
+        floor = np.column_stack([np.arange(5.62, 7.3, 0.1), np.full(17, -depth)])
         assert bool(missing(np.concatenate([road[:15], floor]))) is told
 
 
