@@ -20,7 +20,7 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.run import Run
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import log_of_run
 from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
@@ -28,7 +28,7 @@ from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of
 from graphslam.backend.refining import Refined, refine_run
 from graphslam.backend.streams import ImuPart
 from graphslam.core.config import build
-from graphslam.core.errors import ConfigError, DataError, MissingDataError, RunFolderError
+from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
 from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
@@ -39,7 +39,6 @@ from graphslam.evidence.formats import load_npz
 from graphslam.frontends.segslam.front_end import SegSlam
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
-from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.io.tum import write_tum
 from graphslam.loops.candidates import FRONT_END
@@ -165,10 +164,7 @@ def clearest_of_topologies(
     said = values["run"]
     if said["frontend"] != SegSlam.name:
         raise ConfigError(f"front end {said['frontend']!r} tells one topology; only {SegSlam.name!r} tells several")
-    source = load_log_source(said["source"] if log is None else log)
-    digest = log_digest(source)
-    if said.get("log", digest) != digest:
-        raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
+    source = log_of_run(said, log)
     front: Any = make_front_end(SegSlam.name, values["frontend"])
     config, streams = _graph_options(run)
     reach = sensor_reach(values)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.errors import MissingDataError
+from graphslam.core.errors import DataError, GraphSlamError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.io.catalog import load
+from graphslam.io.log_digest import log_digest
 
 
 def load_log_source(source: str | Path | SensorLog, *, reader: str | None = None, **options: Any) -> SensorLog:
@@ -21,3 +23,37 @@ def load_log_source(source: str | Path | SensorLog, *, reader: str | None = None
         wanted = "a log of sensor streams" + (f"; this is for `graphslam {verb} {source}`" if verb else "")
         raise MissingDataError(f"{source} holds no sensor log", got=kind, wanted=wanted)
     return log
+
+
+def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = None) -> SensorLog:
+    """The log of a run, read once more.
+
+    Parameters
+    ----------
+    said : mapping
+        What the run's ``config.toml`` says of it: ``source``, as it was given, and the digest ``log``.
+    log : str, path or SensorLog, optional
+        Where the log is now. Default: where it was; a relative path begins where the command is started.
+
+    Raises
+    ------
+    MissingDataError
+        It is not there any more.
+    DataError
+        Another log than that of the run.
+    """
+    try:
+        source = load_log_source(said["source"] if log is None else log)
+    except GraphSlamError as error:
+        if log is not None or Path(said["source"]).exists():
+            raise
+        raise MissingDataError(
+            "the log of the run cannot be read from here",
+            where=said["source"],
+            got="no data set or path of this name",
+            wanted="the folder in which the run was started, or where the log is now (--log, log=…)",
+        ) from error
+    digest = log_digest(source)
+    if said.get("log", digest) != digest:
+        raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
+    return source

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
 from graphslam.app.run.run import Run
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import log_of_run
 from graphslam.core import se3
 from graphslam.core.atomic import read_json, read_npz, write_npz
 from graphslam.core.errors import DataError, FormatError, MissingDataError, RunFolderError
@@ -25,7 +25,6 @@ from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.log_digest import log_digest
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
@@ -152,10 +151,7 @@ def scans_of_run(
     if run.map.dim != 3:
         raise DataError(f"{what} is read along a path in space", got="a run in the plane", wanted="a run in space")
     said = read_options(run.folder)["run"]
-    source = load_log_source(said["source"] if log is None else log)
-    digest = log_digest(source)
-    if said.get("log", digest) != digest:
-        raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
+    source = log_of_run(said, log)
     name = stream or source.of_type(PointClouds) or source.of_type(RangeScans)
     scans = source.streams.get(name) if name else None
     if name is None or not isinstance(scans, PointClouds | RangeScans):

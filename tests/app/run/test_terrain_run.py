@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.source import log_of_run
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, read_terrain_file, write_terrain
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
@@ -150,3 +151,12 @@ def test_points_are_moved_by_a_matrix_as_by_the_quaternion() -> None:
     T = se3.se3_exp(rng.standard_normal(6))
     points = rng.standard_normal((50, 3))
     assert np.allclose(se3.se3_move(T, points), se3.se3_transform(T[None], points), atol=1e-12)
+
+
+def test_a_log_that_is_not_where_it_was_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError, match=r"drive.*cannot be read from here.*the folder in which the run"):
+        log_of_run({"source": "drive/of/somebody"})
+    (tmp_path / "empty.log").write_text("")
+    with pytest.raises(GraphSlamError) as caught:
+        log_of_run({"source": str(tmp_path / "empty.log")})
+    assert "cannot be read from here" not in str(caught.value)  # what is there has an error of its own
