@@ -105,6 +105,17 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
     return out
 
 
+def belongs(points: Array, moved: Array, config: MovingConfig | None = None) -> Mask:
+    """Which points ``(n, 3)`` belong to what moved: those as near in the plane to one of its ``(m, 3)`` as company is.
+
+    So what moved is left out down to the ground, where :func:`moving_points` cannot tell it from the ground.
+    """
+    reach = (config or MovingConfig()).company_radius
+    if not len(moved) or not len(points):
+        return np.zeros(len(points), np.bool_)
+    return np.asarray(cKDTree(moved[:, :2]).query(points[:, :2], distance_upper_bound=reach)[0] < reach)
+
+
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
     """The submaps with clouds and grids made without the points that moved; the others as they are."""
     out = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
+from graphslam.evidence.shelved import load_shelved
+from graphslam.io.submap_store import read_submaps
+from graphslam.maps.moving import belongs, moving_points
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
@@ -58,6 +62,8 @@ class RunTerrain:
         Places of the nodes in the level frame [m].
     missing : int
         Scans in which the ground was looked for and not found: the height of their neighbours was taken.
+    moved : int
+        Points of the scans that were left out, because something that moved was there.
     read_s, seconds : float
         CPU time to read the lines into pieces, and to make the map of the pieces.
     scans, lines : int
@@ -69,6 +75,7 @@ class RunTerrain:
     rotation: Array
     path: Array
     missing: int
+    moved: int
     read_s: float
     seconds: float
     scans: int
@@ -85,6 +92,7 @@ class RunTerrain:
             "scans": self.scans,
             "lines": self.lines,
             "scans_without_ground": self.missing,
+            "points_moved": self.moved,
             "pieces": len(self.layer.pieces),
             "rotation_level_run": self.rotation.tolist(),
             "sensor": {**asdict(sensor), "band_edges": sensor.band_edges().tolist()},
@@ -137,7 +145,7 @@ def terrain_of_run(
     """
     name, scans = scans_of_run(run, log, stream, what="terrain")
     return read_terrain(
-        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
+        scans, run.map.trajectory, run.map.node_times, run.map.node_poses, moved=_moved(run),
         stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
     )  # fmt: skip
 
@@ -168,6 +176,7 @@ def read_terrain(
     node_times: Array,
     node_poses: Array,
     *,
+    moved: Mapping[int, Array] | None = None,
     stream: str = "scans",
     vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
@@ -183,6 +192,9 @@ def read_terrain(
         ``T_world_base`` in space; the z axis of the world points upwards within 20°.
     node_times, node_poses : (k,), (k, 7)
         In time order; a scan goes with the last node before it.
+    moved : mapping, optional
+        By number of a node: points ``(m, 3)`` of things that moved while it was made, in the world. Clouds of that
+        time are read without what stands where they are.
     stream, vehicle, sensor_height, tables, progress
         See :func:`terrain_of_run`.
 
@@ -214,7 +226,13 @@ def read_terrain(
     owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(poses) - 1)
     begin, count = time.process_time(), 0
     nodes = np.unique(owner)
-    turns = _Turns(scans, at, level, height, sensor_height is None) if isinstance(scans, PointClouds) else None
+    turns = None
+    if isinstance(scans, PointClouds):
+        places = {k: np.asarray(se3.se3_transform(turn, p)) for k, p in (moved or {}).items()}
+        # the scan at a node is in the submap that ends there
+        ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
+        gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
+        turns = _Turns(scans, at, level, height, sensor_height is None, gone)
     for node in tqdm(nodes.tolist(), desc="terrain", unit="node", disable=not progress):
         mine = at[owner == node]
         if turns is not None:
@@ -227,8 +245,9 @@ def read_terrain(
     read_s = time.process_time() - begin
     begin = time.process_time()
     found = layer.classify()
-    seconds, missing = time.process_time() - begin, turns.missing if turns else 0
-    return RunTerrain(layer, found, rotation, poses[:, :3], missing, read_s, seconds, len(at), count, stream)
+    seconds = time.process_time() - begin
+    missing, left_out = (turns.missing, turns.left_out) if turns else (0, 0)
+    return RunTerrain(layer, found, rotation, poses[:, :3], missing, left_out, read_s, seconds, len(at), count, stream)
 
 
 def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
@@ -262,6 +281,19 @@ def _ground_of_clouds(
     return level_rotation(up), about, _beam_step(*posed[len(posed) // 2])
 
 
+def _moved(run: Run) -> dict[int, Array]:
+    """Points of things that moved, in the world, by node of a run whose submaps have grids and clouds."""
+    if run.folder is None or not any(s.cloud is not None for s in run.submaps):
+        return {}
+    submaps = read_submaps(run.folder, load_grid=load_shelved)
+    bases = np.asarray(run.map.node_poses)[: len(submaps)]
+    return {
+        k: np.asarray(se3.se3_transform(bases[k], s.cloud.points[mask]))
+        for k, (s, mask) in enumerate(zip(submaps, moving_points(submaps, bases)))
+        if s.cloud is not None and mask.any()
+    }
+
+
 class _Turns:
     """Lines of clouds, each decoded once: the height above the ground is the median of some scans around.
 
@@ -276,15 +308,25 @@ class _Turns:
         Of the scanner above the ground, about [m].
     look : bool
         Find it in the scans themselves.
+    gone : list of k (m, 3) or None
+        Points of things that moved while each scan was made, in the level frame.
     """
 
-    def __init__(self, scans: PointClouds, at: Ints, level: Trajectory, height: float, look: bool) -> None:
-        self.scans, self.level, self.height, self.look = scans, level, height, look
+    def __init__(
+        self,
+        scans: PointClouds,
+        at: Ints,
+        level: Trajectory,
+        height: float,
+        look: bool,
+        gone: Sequence[Array | None],
+    ) -> None:
+        self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, gone
         self.coming = deque(at.tolist())
         self.read: dict[int, tuple[Array, Array]] = {}
         self.below: dict[int, float] = {}
         self.place = {k: i for i, k in enumerate(at.tolist())}
-        self.missing = 0
+        self.missing = self.left_out = 0
 
     def lines(self, k: int) -> ScanLines:
         """Of one scan."""
@@ -299,7 +341,12 @@ class _Turns:
         return lines_of_clouds(points, origin, float(origin[2] - height))
 
     def _decode(self, k: int) -> None:
-        points, origin = self.read[k] = _posed(self.scans, k, self.level)
+        points, origin = _posed(self.scans, k, self.level)
+        gone = self.gone[self.place[k]]
+        if gone is not None:
+            moved = belongs(points, gone)
+            points, self.left_out = points[~moved], self.left_out + int(np.count_nonzero(moved))
+        self.read[k] = points, origin
         if self.look and self.place[k] % _LOOK == 0:
             plane = ground_plane(points[::_EVERY_POINT], origin, np.array([0.0, 0.0, 1.0]), self.height)
             if plane is None:

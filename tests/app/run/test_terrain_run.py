@@ -74,6 +74,25 @@ def test_curb_box_and_street_in_a_frame_that_leans(made: tuple[RunTerrain, Point
     assert TerrainClass.HOLE not in classes_at(found, 6.0, -4.0)  # behind the box
 
 
+def test_what_moved_is_left_out_of_the_scans_that_saw_it_there(
+    made: tuple[RunTerrain, PointClouds, Trajectory],
+) -> None:
+    still, scans, path = made
+    x, y = np.meshgrid(np.arange(5.0, 7.1, 0.3), np.arange(-3.5, -1.4, 0.3))
+    box = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.5)])
+    box = se3.se3_move(np.concatenate([np.zeros(3), se3.matrix_to_quat(still.rotation.T)]), box)  # frame of the path
+    for nodes in ((0,), (0, 1, 2)):
+        moved = dict.fromkeys(nodes, box)
+        found = read_terrain(scans, path, path.times[::3], path.poses[::3], moved=moved, progress=False)
+        classes = classes_at(found, 6.0, -2.5)
+        assert (TerrainClass.OBSTACLE in classes) is (len(nodes) == 1)
+        assert found.moved > 0
+        assert found.facts()["points_moved"] == found.moved
+        for at in (4.0, 7.0):
+            assert TerrainClass.STEP in classes_at(found, at, CURB_Y)  # the rest is as it was
+    assert still.moved == 0
+
+
 def test_clouds_are_decoded_once_and_those_that_tell_where_up_is_twice(
     made: tuple[RunTerrain, PointClouds, Trajectory], monkeypatch: pytest.MonkeyPatch
 ) -> None:
