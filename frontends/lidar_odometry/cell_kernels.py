@@ -220,7 +220,7 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
     k, surface, spread = _spread(c, b, flat, S, V)
     root[:, :] = 0.0
     weight = surface * spread
-    across, x, y, z = max(S[k, k], 0.0), V[0, k], V[1, k], V[2, k]
+    across, x, y, z, alone = max(S[k, k], 0.0), V[0, k], V[1, k], V[2, k], True
     if spread < 1.0 and wide_size > size:
         at = _find(wide, _pack(c.mean[b, 0], c.mean[b, 1], c.mean[b, 2], 1.0 / wide_size))
         if at >= 0 and wide.number[at] >= LEAST:
@@ -234,8 +234,8 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
             own = max(own / n, 0.0)
             share = surface2 * spread2 * max(1.0 - (own + off * off) / flat, 0.0)
             if share > weight:
-                weight, across, x, y, z = share, own, u, v, w
-    if not planes and x == V[0, k] and y == V[1, k] and z == V[2, k]:
+                weight, across, x, y, z, alone = share, own, u, v, w, False
+    if alone and not planes:
         rest = max(1.0 - 2.0 * surface, 0.0)
         for q in range(3):
             deep = np.sqrt((weight + rest if q == k else rest) / (max(S[q, q], 0.0) + least * least))

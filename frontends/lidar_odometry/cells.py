@@ -28,8 +28,8 @@ class LevelConfig:
         σ that is added to a cell's own [m]: on coarse levels a quarter of the cell, or the weights are 0 before the
         match begins.
     planes : bool
-        Only surfaces hold a point, and what is neither a surface nor a row of points does not; else it does by all of
-        its spread. Across a surface alone a cell holds on every level.
+        Only surfaces hold a point. Without it, what is thicker than a surface holds it, too, by all of its spread. On
+        every level a surface holds a point across itself alone, and a row of points only as a part of a wider surface.
     """
 
     size: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -306,7 +307,7 @@ class LidarFrontEnd(FrontEnd):
         )
 
 
-class _Heard:
+class _Heard(ABC):
     """A stream beside the scans, taken as it comes.
 
     Parameters
@@ -321,9 +322,9 @@ class _Heard:
         self._heard, self._last = 0, -np.inf
 
     @property
+    @abstractmethod
     def listener(self) -> Readings | Reckoned | None:
         """What takes its records."""
-        raise NotImplementedError
 
     def reaches(self, scan: Stream) -> bool:
         """Have its records come up to the stamp of a scan?"""

@@ -400,7 +400,9 @@ class LidarOdometry:
         # a speed that nothing holds is off for as long as nothing holds it
         Q = self.loose**2 * self.spread
         if self.held < BEGUN:
-            Q[3:, 3:] += (2 * self.loose - 1) * (FASTEST * dt) ** 2 * np.eye(3)
+            # one speed all along: k² − (k − 1)² of its way's variance are of this step, also in what a refinement gets
+            unknown = np.diag([0.0] * 3 + [(2 * self.loose - 1) * (FASTEST * dt) ** 2] * 3)
+            Q, self.spread = Q + unknown, self.spread + unknown
         self.held += fit is not None and not seen.unheld
         if reckoned is not None:
             # as far as it is off in one way all along, σ grows with the time: k² − (k − 1)² of it are of this step

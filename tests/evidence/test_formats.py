@@ -238,6 +238,7 @@ def test_map_server_pair_says_what_the_grid_says(rng: np.random.Generator, tmp_p
     cell, said = read_map_server(yaml)
     assert said["image"] == "floor's plan.pgm"
     assert image.name == "floor's plan.pgm"
+    assert image.read_bytes().startswith(b"P5\n%d %d\n255\n" % cell.shape[::-1])
     assert said["mode"] == "trinary"
     assert said["origin"][2] == 0.0
     low, step = np.array(said["origin"][:2]), said["resolution"]

@@ -18,9 +18,11 @@ def read_map_server(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     assert set(said) <= KEYS
     assert len([float(v) for v in said["origin"]]) == 3
     low, high, mode = said["free_thresh"], said["occupied_thresh"], said.get("mode", "trinary")
-    assert 0.0 <= low < high <= 1.0
+    assert 0.0 < low < high < 1.0
     assert said["resolution"] > 0.0
-    image = Image.open(path.parent / said["image"])
+    file = path.parent / said["image"]
+    assert file.read_bytes().startswith(b"P5\n" if file.suffix == ".pgm" else b"\x89PNG")
+    image = Image.open(file)
     data = np.asarray(image, dtype=float)
     alpha = data[..., -1] if image.mode in ("LA", "RGBA") else np.full(data.shape[:2], 255.0)
     grey = data if data.ndim == 2 else data[..., :1].mean(axis=-1)

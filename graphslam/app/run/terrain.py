@@ -145,7 +145,8 @@ def terrain_of_run(
     """
     name, scans = scans_of_run(run, log, stream, what="terrain")
     return read_terrain(
-        scans, run.map.trajectory, run.map.node_times, run.map.node_poses, moved=_moved(run),
+        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
+        moved=_moved(run) if isinstance(scans, PointClouds) else None,
         stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
     )  # fmt: skip
 

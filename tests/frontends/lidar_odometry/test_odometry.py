@@ -132,6 +132,13 @@ def test_a_speed_that_nothing_tells_is_not_known_to_be_none():
         sigma = np.sqrt(joints[9, 9, 9])
         assert abs(off) < 3.0 * sigma
         assert sigma > 5.0  # of 0.9 s at a speed of which nothing is known
+    # the single steps, which a refinement gets, say no more
+    odometry, steps = LidarOdometry(LidarOdometryConfig()), []
+    clouds = _corridor(False, 0.8)
+    for k in range(10):
+        odometry.step(clouds.cloud(k), float(clouds.times[k]))
+        steps.append(odometry.spread[3, 3])
+    assert np.sqrt(sum(steps)) > 5.0
 
 
 @pytest.mark.parametrize("speed", [1.0, 6.0, 15.0])
