@@ -18,6 +18,7 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 from scipy.spatial import cKDTree
 
 from graphslam.core import se3
@@ -52,9 +53,11 @@ class MovingConfig:
     """Points that moved must have so many others …"""
     company_radius: float = 0.6
     """… so near [m]."""
+    thing: float = 2.5
+    """What belongs to a thing is looked for so far from points that moved [m]: half the length of a car."""
 
     def __post_init__(self) -> None:
-        for name in ("reach", "ground_cell", "company_radius"):
+        for name in ("reach", "ground_cell", "company_radius", "thing"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"moving: {name} = {getattr(self, name)}; wanted > 0")
         if self.neighbours < 1 or not 1 <= self.least_free <= 2 * self.neighbours or self.company < 0:
@@ -105,15 +108,62 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
     return out
 
 
-def belongs(points: Array, moved: Array, config: MovingConfig | None = None) -> Mask:
-    """Which points ``(n, 3)`` belong to what moved: those as near in the plane to one of its ``(m, 3)`` as company is.
+class MovedThings:
+    """The things that points are on which are known to have moved, in other scans of the same time.
 
-    So what moved is left out down to the ground, where :func:`moving_points` cannot tell it from the ground.
+    :func:`moving_points` knows some points of a thing, and not its foot, which looks like the ground. What belongs to
+    them is as near to one of them in the plane as company is. What stands together above the ground, most of it so
+    near, is one thing, and belongs to them as a whole, with what is so near to it.
+
+    Parameters
+    ----------
+    moved : (m, 3)
+        Points that moved, in a frame whose z axis points upwards [m].
+    config : MovingConfig, optional
     """
-    reach = (config or MovingConfig()).company_radius
-    if not len(moved) or not len(points):
-        return np.zeros(len(points), np.bool_)
-    return np.asarray(cKDTree(moved[:, :2]).query(points[:, :2], distance_upper_bound=reach)[0] < reach)
+
+    def __init__(self, moved: Array, config: MovingConfig | None = None) -> None:
+        self.config = c = config or MovingConfig()
+        self.moved = np.asarray(moved, dtype=np.float64)[:, :2]
+        self.cell = c.company_radius / 4.0
+        if not len(self.moved):
+            return
+        margin = c.thing + c.company_radius
+        self.first = np.floor((self.moved.min(axis=0) - margin) / self.cell).astype(np.int64)
+        size = np.floor((self.moved.max(axis=0) + margin) / self.cell).astype(np.int64) - self.first + 1
+        away = np.ones(size, np.bool_)
+        away[tuple((np.floor(self.moved / self.cell).astype(np.int64) - self.first).T)] = False
+        distance = distance_transform_edt(away, sampling=self.cell)
+        self.near, self.around = distance < c.company_radius, distance < c.thing
+
+    def __len__(self) -> int:
+        return len(self.moved)
+
+    def parts(self, points: Array) -> Mask:
+        """Which points ``(n, 3)`` of a scan belong to these things; near to them means to within a quarter."""
+        out = np.zeros(len(points), np.bool_)
+        if not len(self) or not len(points):
+            return out
+        c = self.config
+        cell = np.floor(points[:, :2] / self.cell).astype(np.int64) - self.first
+        rows = np.flatnonzero(np.all((cell >= 0) & (cell < self.near.shape), axis=1))
+        rows = rows[self.around[cell[rows, 0], cell[rows, 1]]]
+        near = self.near[cell[rows, 0], cell[rows, 1]]
+        out[rows[near]] = True
+        if not near.any():
+            return out
+        stands = cell[rows[~_ground(points[rows], points[rows], c)]]
+        raised = np.zeros(self.near.shape, np.bool_)
+        raised[stands[:, 0], stands[:, 1]] = True
+        things, many = label(binary_dilation(raised, np.ones((3, 3))), np.ones((3, 3)))  # over gaps of three cells
+        things[~raised] = 0
+        share = mean(self.near, things, np.arange(1, many + 1))
+        whole = np.argwhere(np.concatenate([[False], np.asarray(share) > 0.5])[things])
+        if len(whole):
+            ask = rows[~near]
+            reach = c.company_radius / self.cell
+            out[ask] = cKDTree(whole).query(cell[ask], distance_upper_bound=reach)[0] < reach
+        return out
 
 
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:

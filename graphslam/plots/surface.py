@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgba
 
 from graphslam.core.geometry import Array
 from graphslam.plots import style
@@ -23,6 +23,14 @@ def vertex_colours(values: Array, palette: str = "viridis") -> npt.NDArray[np.ui
     share = np.clip((np.nan_to_num(values) - low) / max(float(high - low), 1e-12), 0.0, 1.0)
     out = np.asarray(255.0 * np.asarray(matplotlib.colormaps[palette](share))).astype(np.uint8)
     out[~np.isfinite(values)] = (128, 128, 128, 255)
+    return out
+
+
+def session_colours(session: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    """Colours ``(v, 4)`` of sessions, as their paths have them; grey where there is none (−1)."""
+    cycle = np.array([to_rgba(c) for c in style.CYCLE])
+    out = np.asarray(255.0 * cycle[session % len(cycle)]).astype(np.uint8)
+    out[session < 0] = (128, 128, 128, 255)
     return out
 
 

@@ -130,6 +130,7 @@ def test_detectors_are_those_of_the_plain_twin() -> None:
         ([], [(-1.0, 0.0), (2.4, 0.15), (6.0, -0.4)]),
         ([(3.0, 5.0, 0.0, 1.4), (2.0, 2.05, 1.2, 1.25)], [(-1.0, 0.0), (1.5, -0.5), (2.2, 0.0)]),
         ([(1.2, 1.25, 2.4, 2.5)], [(-1.0, 0.0), *((2.0 + 0.28 * k, 0.17 * (k + 1)) for k in range(8))]),
+        ([(0.3, 1.6, 0.0, 0.14)], [(-1.0, 0.0), (2.2, -0.3)]),
     ]
     points = []
     for solids, floor in scenes:
@@ -137,6 +138,8 @@ def test_detectors_are_those_of_the_plain_twin() -> None:
             line = profile_line(solids, floor)
             line[:, 2] += sigma * rng.standard_normal(len(line))
             line[rng.random(len(line)) < 2.0 * sigma] = np.nan
+            ghosts = rng.random(len(line)) < sigma  # reflected: farther along their beams, so below the ground
+            line[ghosts] = [0.0, 0.05, H] + 1.5 * (line[ghosts] - [0.0, 0.05, H])
             points.append(line)
     lines = lines_of(np.array(points), 0.01)
     edges, cells = SENSOR.band_edges(), np.array(CELLS)
@@ -187,6 +190,27 @@ def test_a_fall_begins_on_ground_that_the_vehicle_can_be_on() -> None:
     for depth, told in ((0.08, False), (0.5, True)):
         floor = np.column_stack([np.arange(5.62, 7.3, 0.1), np.full(17, -depth)])
         assert bool(missing(np.concatenate([road[:15], floor]))) is told
+    # the lowest beams of a scanner meet a bumper, and nothing is seen of the road before it
+    first = np.array([[3.6, 0.24], [3.7, 0.25], [3.8, 0.25]])
+    behind = np.column_stack([np.linspace(4.8, 6.0, 13), np.zeros(13)])
+    assert not missing(np.concatenate([first, behind]))
+    # the road is as high there, and goes on for the width of the vehicle: what is behind it is a fall
+    hill = np.column_stack([np.linspace(3.6, 4.6, 11), np.full(11, 0.25)])
+    low = np.column_stack([np.linspace(6.0, 7.0, 11), np.full(11, -0.4)])
+    assert max(missing(np.concatenate([hill, low]))) > 20
+
+
+def test_no_beam_passes_below_ground_that_higher_beams_of_its_line_met() -> None:
+    road = np.column_stack([np.arange(4.1, 9.0, 0.1), np.zeros(49)])
+    # a mirror image of the road, 0.9 m below it; the beams above it met the road before that place
+    mirrored = np.array([[6.6, -0.9]])
+    assert not missing(np.concatenate([road[:5], mirrored, road[5:]]))
+    # the far wall of a pit: no ground is met nearer than it
+    wall = np.array([[5.6, -0.5], [5.6, -0.3], [5.6, -0.1]])
+    assert max(missing(np.concatenate([road[:5], wall, road[road[:, 0] > 5.6]]))) > 5
+    # the bottom of a ditch goes on below the place of its near edge, and its ground is no road
+    floor = np.column_stack([np.linspace(5.6, 6.6, 11), np.full(11, -0.6)])
+    assert max(missing(np.concatenate([road[:5], floor]))) > 30
 
 
 @pytest.mark.parametrize("channel", [STEP, SUPPORT])

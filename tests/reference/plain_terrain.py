@@ -83,10 +83,13 @@ class PlainLine:
                 for j in range(first, i):
                     on[j] = 2
                 anchor, slope, run = (s[first], z[first]), 0.0, 0
+            unseen = not any(on)
             on[i] = 2 if grown else 1
             if near and abs(way) < 0.03:
                 continue
-            if base is None:
+            if unseen and z[i] - self.foot > f.climb:
+                base = (s[i], self.foot, s[i])
+            elif base is None:
                 within = [j for j in range(i) if on[j] and all(s[i] - s[q] <= f.window for q in range(j, i))]
                 points = [(place, height), *((s[j], z[j]) for j in within)]
                 at, low = max(points, key=lambda q: z[i] - q[1] - f.slack * (s[i] - q[0]))
@@ -141,7 +144,11 @@ class PlainLine:
             depth = height - f.slack * (s[i] - place) - p[i][2]
             if on[i] != 1 and depth > f.climb and not hidden and o[2] > height > p[i][2]:
                 pierced = s[i] * (o[2] - height) / (o[2] - p[i][2])
-                if pierced < s[i] - 0.1 and pierced - place < f.memory:
+                level = [
+                    s[j] for j in range(i + 1, len(s)) if on[j] and z[j] > height - f.slack * (s[j] - place) - f.climb
+                ]
+                below = any(pierced + 0.1 < r < s[i] - 0.1 for r in level)
+                if pierced < s[i] - 0.1 and pierced - place < f.memory and not below:
                     at = pierced
                     while at <= min(s[i], pierced + f.support_reach):
                         share = at / s[i]

@@ -51,7 +51,9 @@ def make_map(
         help="Only the surface, as PLY, GLB and OBJ. The log of the run is read once more along its solved path.",
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
-    colour: str = typer.Option("height", help="With --surface: height, piece (node it hangs on), sigma, or terrain."),
+    colour: str = typer.Option(
+        "height", help="With --surface: height, piece (node it hangs on), session, sigma, or terrain."
+    ),
     sensor_height: float | None = typer.Option(
         None, help="With --terrain: height of the scanner above the ground [m]. Default: found from the ground itself."
     ),

@@ -30,6 +30,13 @@ def merge(
         25.0, help="Sightings with a larger χ² (2 degrees of freedom) become separate landmarks. 0: never."
     ),
     tolerance: float = typer.Option(0.5, help="Largest distance of matching landmarks after alignment [m]."),
+    surface: bool = typer.Option(
+        False,
+        "--surface",
+        help="Dense submaps in space: write the surface of all sessions, too. Their logs are read again.",
+    ),
+    voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
+    colour: str = typer.Option("session", help="With --surface: session, height, piece, or sigma."),
     out: Path = typer.Option(..., help="Folder for the merged map."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
@@ -37,8 +44,12 @@ def merge(
     """Merge runs of several robots or days into one map, which is solved as one problem."""
     from graphslam.app.sessions.merge import merge as merge_runs
     from graphslam.app.sessions.merge_align import By
+    from graphslam.maps.surface.piece import SurfaceConfig
 
-    merged = merge_runs(runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out)
+    merged = merge_runs(
+        runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out,
+        surface=SurfaceConfig(voxel=voxel) if surface else None, colour=colour,
+    )  # fmt: skip
     rows = merged.metrics.to_dict("records")
     where = f"report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}"
     text = f"{table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: {where}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,55 @@ from graphslam.maps.terrain.lines import lines_of_scans
 from graphslam.maps.terrain.pyramid import ClassGrid
 
 FORMAT = "graphslam.surface/1"
-COLOURS = ("height", "piece", "sigma", "terrain")
-"""What a surface may be coloured by: height, the node it hangs on, σ of its place that comes of that node, class of
-terrain below it."""
+COLOURS = ("height", "piece", "session", "sigma", "terrain")
+"""What a surface may be coloured by: height, the node it hangs on, the session of that node, σ of its place that comes
+of it, class of terrain below it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScannedPath:
+    """Scans along a solved path.
+
+    Parameters
+    ----------
+    scans : PointClouds or RangeScans
+    path : Trajectory
+        ``T_world_base`` in space.
+    node_times, node_poses : (k,), (k, 7)
+        In time order; a scan goes with the last node before it.
+    node_covariances : (k, 6, 6), optional
+        In the right tangent of each node.
+    stream : str
+    """
+
+    scans: PointClouds | RangeScans
+    path: Trajectory
+    node_times: Array
+    node_poses: Array
+    node_covariances: Array | None = None
+    stream: str = "scans"
+
+    def inside(self) -> npt.NDArray[np.int64]:
+        """Numbers of the scans that lie within the path in time.
+
+        Raises
+        ------
+        DataError
+            None does.
+        """
+        times = self.scans.times
+        inside = (times >= self.path.times[0]) & (times <= self.path.times[-1])
+        if isinstance(self.scans, RangeScans):
+            inside &= times + self.scans.beam_times.max() <= self.path.times[-1]
+        at = np.flatnonzero(inside)
+        if not len(at):
+            raise DataError("no scan lies within the solved path in time", where=self.stream)
+        return at
+
+    def nodes_of(self, at: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Node that each of these scans goes with."""
+        node = np.searchsorted(self.node_times, self.scans.times[at], side="right") - 1
+        return np.clip(node, 0, len(self.node_poses) - 1)
 
 
 @dataclass(frozen=True)
@@ -44,7 +90,9 @@ class RunSurface:
         A piece for each node of the graph.
     mesh : Mesh
     owner : (v,)
-        Node that each vertex hangs on; −1 none.
+        Node that each vertex hangs on, those of all sessions counted on; −1 none.
+    session : (v,)
+        Session of that node, in the order of the paths; −1 none.
     sigma : (v,)
         σ of its place that comes of the pose of that node [m]; NaN where it is not known.
     scans : int
@@ -56,6 +104,7 @@ class RunSurface:
     layer: SurfaceLayer
     mesh: Mesh
     owner: npt.NDArray[np.int64]
+    session: npt.NDArray[np.int64]
     sigma: Array
     scans: int
     stream: str
@@ -69,6 +118,7 @@ class RunSurface:
             "format": FORMAT,
             "stream": self.stream,
             "scans": self.scans,
+            "sessions": int(self.session.max(initial=-1)) + 1,
             "pieces": len(self.layer.pieces),
             "bricks": len(self.layer),
             "vertices": len(self.mesh.vertices),
@@ -84,7 +134,7 @@ class RunSurface:
 
     def colours(self, by: str, terrain: ClassGrid | None = None) -> npt.NDArray[np.uint8]:
         """Colours ``(v, 4)`` of the vertices by one of :data:`COLOURS`; by ``terrain`` needs the terrain of the run."""
-        from graphslam.plots.surface import vertex_colours
+        from graphslam.plots.surface import session_colours, vertex_colours
         from graphslam.plots.terrain import class_colours
 
         if by == "terrain":
@@ -93,6 +143,8 @@ class RunSurface:
             return class_colours(terrain.at(self.mesh.vertices))
         if by == "piece":  # neighbours along the path differ
             return vertex_colours(np.asarray((7.0 * self.owner) % 20.0, dtype=np.float64), "tab20")
+        if by == "session":
+            return session_colours(self.session)
         if by not in COLOURS:
             raise UnknownNameError("colour of a surface", by, COLOURS)
         return vertex_colours(self.mesh.vertices[:, 2] if by == "height" else self.sigma)
@@ -108,66 +160,61 @@ def surface_of_run(
 ) -> RunSurface:
     """Read the log of a run once more, along its solved path; for the errors see
     :func:`graphslam.app.run.terrain.terrain_of_run`."""
+    return read_surface([scanned_path(run, log=log, stream=stream)], config=config, progress=progress)
+
+
+def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None, stream: str | None = None) -> ScannedPath:
+    """The scans of a run along its solved path; for the errors see
+    :func:`graphslam.app.run.terrain.terrain_of_run`."""
     name, scans = scans_of_run(run, log, stream, what="a surface")
-    return read_surface(
-        scans, run.map.trajectory, run.map.node_times, run.map.node_poses, run.map.node_covariances,
-        stream=name, config=config, progress=progress,
+    m = run.map
+    return ScannedPath(
+        scans=scans, path=m.trajectory, node_times=m.node_times, node_poses=m.node_poses,
+        node_covariances=m.node_covariances, stream=name,
     )  # fmt: skip
 
 
 def read_surface(
-    scans: PointClouds | RangeScans,
-    path: Trajectory,
-    node_times: Array,
-    node_poses: Array,
-    node_covariances: Array | None = None,
-    *,
-    stream: str = "scans",
-    config: SurfaceConfig | None = None,
-    progress: bool = True,
+    paths: Sequence[ScannedPath], *, config: SurfaceConfig | None = None, progress: bool = True
 ) -> RunSurface:
-    """The surface of scans along a path, a piece for each node.
+    """The surface of scans along paths in one frame, a piece for each node.
 
     Parameters
     ----------
-    scans : PointClouds or RangeScans
-    path : Trajectory
-        ``T_world_base`` in space.
-    node_times, node_poses : (k,), (k, 7)
-        In time order; a scan goes with the last node before it.
-    node_covariances : (k, 6, 6), optional
-        In the right tangent of each node.
-    stream, config, progress
-        See :func:`surface_of_run`.
+    paths : sequence of ScannedPath
+        One for each session.
+    config : SurfaceConfig, optional
+    progress : bool
 
     Raises
     ------
     DataError
-        No scan within the path, or no surface in the scans.
+        No scan within a path, or no surface in the scans.
     """
-    inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
-    if isinstance(scans, RangeScans):
-        inside &= scans.times + scans.beam_times.max() <= path.times[-1]
-    at = np.flatnonzero(inside)
-    if not len(at):
-        raise DataError("no scan lies within the solved path in time", where=stream)
     layer = SurfaceLayer(config)
-    owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(node_poses) - 1)
+    covariances: dict[PieceId, Array] = {}
+    scans, first = 0, np.cumsum([0, *(len(p.node_poses) for p in paths)])
     begin = time.process_time()
-    for node in tqdm(np.unique(owner).tolist(), desc="surface", unit="node", disable=not progress):
-        layer.read(node, _scans(scans, at[owner == node], path), node_poses[node])
+    for start, p in zip(first.tolist(), paths):
+        at = p.inside()
+        owner = p.nodes_of(at)
+        scans += len(at)
+        for node in tqdm(np.unique(owner).tolist(), desc="surface", unit="node", disable=not progress):
+            layer.read(start + node, _scans(p.scans, at[owner == node], p.path), p.node_poses[node])
+            if p.node_covariances is not None:
+                covariances[start + node] = p.node_covariances[node]
     read_s = time.process_time() - begin
+    streams = ", ".join(dict.fromkeys(p.stream for p in paths))
     begin = time.process_time()
     mesh = zero_set(layer.bricks(), layer.config.voxel)
     if not len(mesh.triangles):
-        raise DataError("the scans show no surface", where=stream, wanted="points that lie densely beside each other")
+        raise DataError("the scans show no surface", where=streams, wanted="points that lie densely beside each other")
     seconds = time.process_time() - begin
-    nodes = np.array([*layer.pieces, -1])
-    covariances: dict[PieceId, Array] = {}
-    if node_covariances is not None:
-        covariances |= {k: node_covariances[k] for k in np.unique(owner).tolist()}
-    sigma = position_sigma(mesh, layer, covariances)
-    return RunSurface(layer, mesh, nodes[owners(mesh, layer)], sigma, len(at), stream, read_s, seconds)
+    nodes = np.array([*layer.pieces, -1])[owners(mesh, layer)]
+    session = np.where(nodes >= 0, np.searchsorted(first, nodes, side="right") - 1, -1)
+    return RunSurface(
+        layer, mesh, nodes, session, position_sigma(mesh, layer, covariances), scans, streams, read_s, seconds
+    )
 
 
 def _scans(scans: PointClouds | RangeScans, at: npt.NDArray[np.int64], path: Trajectory) -> Iterator[Scan]:
@@ -200,13 +247,16 @@ def write_surface(
 
 
 def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
-    """Pictures from aslant: by height, and by σ of its place where that is known."""
+    """Pictures from aslant: by height, by session where there are several, and by σ of its place where it is known."""
     from graphslam.plots.save import save
     from graphslam.plots.surface import plot_surface
 
     v, t = made.mesh.vertices, made.mesh.triangles
     ax = plot_surface(v, t, v[:, 2], label="height [m]", title=f"{name}: surface")
     out = [save(ax, figures / "surface.png")]
+    if np.any(made.session > 0):
+        ax = plot_surface(v, t, (made.session + 1).astype(np.float64), label="session", title=f"{name}: who saw it")
+        out.append(save(ax, figures / "surface_sessions.png"))
     if np.any(np.isfinite(made.sigma)):
         ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the place [mm]", title=f"{name}: how sure the surface is")
         out.append(save(ax, figures / "surface_sigma.png"))

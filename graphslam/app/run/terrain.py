@@ -28,7 +28,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.shelved import load_shelved
 from graphslam.io.submap_store import read_submaps
-from graphslam.maps.moving import belongs, moving_points
+from graphslam.maps.moving import MovedThings, moving_points
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
@@ -229,7 +229,7 @@ def read_terrain(
     nodes = np.unique(owner)
     turns = None
     if isinstance(scans, PointClouds):
-        places = {k: np.asarray(se3.se3_transform(turn, p)) for k, p in (moved or {}).items()}
+        places = {k: MovedThings(np.asarray(se3.se3_transform(turn, p))) for k, p in (moved or {}).items()}
         # the scan at a node is in the submap that ends there
         ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
         gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
@@ -309,8 +309,8 @@ class _Turns:
         Of the scanner above the ground, about [m].
     look : bool
         Find it in the scans themselves.
-    gone : list of k (m, 3) or None
-        Points of things that moved while each scan was made, in the level frame.
+    gone : list of k MovedThings or None
+        What moved while each scan was made, in the level frame.
     """
 
     def __init__(
@@ -320,7 +320,7 @@ class _Turns:
         level: Trajectory,
         height: float,
         look: bool,
-        gone: Sequence[Array | None],
+        gone: Sequence[MovedThings | None],
     ) -> None:
         self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, gone
         self.coming = deque(at.tolist())
@@ -345,7 +345,7 @@ class _Turns:
         points, origin = _posed(self.scans, k, self.level)
         gone = self.gone[self.place[k]]
         if gone is not None:
-            moved = belongs(points, gone)
+            moved = gone.parts(points)
             points, self.left_out = points[~moved], self.left_out + int(np.count_nonzero(moved))
         self.read[k] = points, origin
         if self.look and self.place[k] % _LOOK == 0:

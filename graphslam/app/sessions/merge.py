@@ -29,6 +29,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.loops.sessions import Alignment
 from graphslam.maps.global_map import GlobalMap
+from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
@@ -36,6 +37,7 @@ logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 IDENTITY_GATE = 25.0
 MERGE_GATE = 11.8
+SESSION_COLOURS = ("session", "height", "piece", "sigma")
 
 
 def merge(
@@ -47,6 +49,8 @@ def merge(
     tolerance: float = 0.5,
     out: str | Path | None = None,
     anew: bool = False,
+    surface: SurfaceConfig | None = None,
+    colour: str = "session",
 ) -> MergedMap | MergedSubmaps:
     """Merge runs into one map: align them by common landmarks, then solve all their submaps together.
 
@@ -71,6 +75,11 @@ def merge(
         Folder for the merged map.
     anew : bool
         ``out`` may hold a merged map already: then this is its new state.
+    surface : SurfaceConfig, optional
+        Runs of dense submaps in space: write the surface of all sessions into ``out`` as well; their logs are read once
+        more (:func:`graphslam.app.sessions.merge_surface.surface_of_sessions`).
+    colour : {"session", "height", "piece", "sigma"}
+        Of that surface.
 
     Returns
     -------
@@ -95,13 +104,21 @@ def merge(
     opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
     if len(opened) < 2:
         raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
+    if surface is not None and (out is None or colour not in SESSION_COLOURS):
+        raise ConfigError(f"a surface of sessions, out = {out}, colour = {colour!r}; wanted a folder to write it to and"
+                          f" one of the colours {', '.join(SESSION_COLOURS)}")  # fmt: skip
     if out is None:
         return _merged(opened, by, solver, identity_gate, tolerance)
     from graphslam.app.sessions.merge_outputs import merged_folder, write_merged
 
     with merged_folder(out, anew=anew) as folder:
         merged = _merged(opened, by, solver, identity_gate, tolerance)
-        write_merged(folder, merged)
+        made = None
+        if surface is not None:
+            from graphslam.app.sessions.merge_surface import surface_of_sessions
+
+            made = surface_of_sessions(merged, config=surface)
+        write_merged(folder, merged, surface=made, colour=colour)
     return merged
 
 

@@ -13,6 +13,7 @@ from graphslam.app.folders.lock import locked, make_folder
 from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
 from graphslam.app.run.outputs import graph_facts, landmarks_csv
+from graphslam.app.run.surface import RunSurface, draw_surface, write_surface
 from graphslam.app.sessions.merge_dense import MergedSubmaps
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
@@ -59,17 +60,22 @@ def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
         yield folder
 
 
-def write_merged(path: Path, merged: MergedMap | MergedSubmaps) -> None:
+def write_merged(
+    path: Path, merged: MergedMap | MergedSubmaps, *, surface: RunSurface | None = None, colour: str = "session"
+) -> None:
     """Write a merge, by landmarks or of dense submaps, as a new state of its folder.
 
     ``merged.npz``, ``landmarks.csv`` of one by landmarks, one ``trajectory_<session>.tum`` each, metrics, events, a
-    picture, ``merge.json``.
+    picture, ``merge.json``; and the files of the surface of all sessions, if it was made.
     """
     with new_generation(path) as new:
         if isinstance(merged, MergedMap):
             _write_landmarks(new, merged)
         else:
             _write_dense(new, merged)
+        if surface is not None:
+            write_surface(new, surface, colour=colour)
+            draw_surface(surface, new.figures, name=" and ".join(s.name for s in merged.sessions))
         _finish(new, merged)
 
 

@@ -1,10 +1,11 @@
 """The study ``terrain``: which obstacles, edges and holes a vehicle sees, from how far, and what it sees wrongly.
 
 Every run draws a street for each kind of target and drives towards it (world ``panning``), or past it with the laser
-fixed (``fixed``), or stands 30 s at 9 m before a curb and then drives (``standing``). Four maps read the same lines:
+fixed (``fixed``), or stands 30 s at 9 m before a curb and then drives (``standing``). Five maps read the same lines:
 
 * ``multigrid``: a map a range band, learnt weights; the finest that knows a cell wins;
 * ``single-learnt``: one grid of 0.2 m, the same learnt weights, all ranges added;
+* ``single-fine``: one grid of 0.1 m, as fine as the finest band, with the weights that were learnt for 0.2 m;
 * ``single-octomap``: one grid of 0.2 m, +0.85 for a hit (a step or a depth of 6 cm, or something hanging), −0.4 for a
   miss, hazard above 0;
 * ``single-equal``: the same with ±0.4.

@@ -1,4 +1,4 @@
-"""One trial of the study of the terrain: drives towards every kind of target, and what four maps say on the way."""
+"""One trial of the study of the terrain: drives towards every kind of target, and what five maps say on the way."""
 
 from __future__ import annotations
 
@@ -36,6 +36,8 @@ DISTANCES = (7.5, 5.25, 3.5, 2.25)
 """From the sensor to the target where the maps are asked [m]."""
 SINGLE = (0.2, 0.2, 0.2, 0.2)
 """Cells of the maps of a single resolution [m]."""
+FINE = (0.1, 0.1, 0.1, 0.1)
+"""… and of one as fine as the finest band [m]."""
 WEIGHTS = {"single-octomap": (0.85, 0.4), "single-equal": (0.4, 0.4)}
 """Log-odds of a hit and of a miss of the maps with fixed weights; not clamped, decided at 0."""
 HIT_CM = 6
@@ -116,11 +118,11 @@ class FixedGrid:
         ny, nx = self.shape
         total = (weights[0] * self.hits - weights[1] * self.misses).reshape(ny, nx)
         known = (self.hits + self.misses).reshape(ny, nx) > 0
-        return Verdict(_finer(total > 0.0), _finer(known))
+        k = round(SINGLE[0] / CELLS[0])
+        return Verdict(_finer(total > 0.0, k), _finer(known, k))
 
 
-def _finer(a: Mask) -> Mask:
-    k = round(SINGLE[0] / CELLS[0])
+def _finer(a: Mask, k: int) -> Mask:
     return a.repeat(k, axis=0).repeat(k, axis=1)
 
 
@@ -186,6 +188,7 @@ def run_terrain_trial(config: TerrainTrialConfig, seed: int) -> Iterator[Measure
             lines = lines_of_scans(drive.scans, drive.believed, c.robot.height)
             multi = Pyramid(BOX, tables, c.vehicle, c.sensor)
             single = Pyramid(BOX, tables, c.vehicle, c.sensor, SINGLE)
+            fine = Pyramid(BOX, tables, c.vehicle, c.sensor, FINE)
             fixed = FixedGrid(single)
             asked = (
                 [(len(lines), aside)] if aside is not None else list(zip(snapshots(drive, c.distances), c.distances))
@@ -201,18 +204,20 @@ def run_terrain_trial(config: TerrainTrialConfig, seed: int) -> Iterator[Measure
                 rows = statements(part, single)
                 single.add(rows)
                 fixed.add(rows)
+                fine.add(statements(part, fine))
                 done = upto
                 found = multi.classify()
                 verdicts = {
                     "multigrid": verdict_of(found, tables.threshold),
                     "single-learnt": _single(single.classify(), tables.threshold, found),
+                    "single-fine": _single(fine.classify(), tables.threshold, found),
                     **{name: fixed.verdict(w) for name, w in WEIGHTS.items()},
                 }
                 for name, v in verdicts.items():
                     yield from _judged(name, v, street, target, distance, truth, c)
                     if c.laser == "panning":
                         _count(sums, name, v, target, street.target_at - distance, truth)
-    for name in ("multigrid", "single-learnt", *WEIGHTS):
+    for name in ("multigrid", "single-learnt", "single-fine", *WEIGHTS):
         for ring in RINGS:
             for kind in ("false", "false_open"):
                 of = sums.get((name, f"{kind}_of_{ring}", -1), 0.0)
@@ -243,7 +248,7 @@ def _single(found: TerrainMap, threshold: float, like: TerrainMap) -> Verdict:
     v = verdict_of(found, threshold)
     k = round(found.cell / like.cell)
     p = found.probability.repeat(k, axis=0).repeat(k, axis=1)
-    return Verdict(_finer(v.hazard), _finer(v.known), p, np.full(p.shape, k))
+    return Verdict(_finer(v.hazard, k), _finer(v.known, k), p, np.full(p.shape, k))
 
 
 def _judged(

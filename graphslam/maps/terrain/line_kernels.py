@@ -106,7 +106,8 @@ def follow_ground(s, z, n, foot, f, ground, chain):
 
     ``chain``: place and height of the last ground point before on which the vehicle can be, the slope of the ground
     there, and 1 where something stands in between. Where the line climbs by more than the vehicle does, it cannot be on
-    what is narrower than it: a rail, a hedge, a bumper. There the last point is that before the climb. A point is on
+    what is narrower than it: a rail, a hedge, a bumper. There the last point is that before the climb; where the first
+    ground that is seen lies higher than the foot by so much, it is at that place, as high as the foot. A point is on
     the ground if it lies where the ground leads within ``residual + residual_rate · way``; a level that goes on for
     three points above (at most ``clearance``) or six below becomes the ground.
     """
@@ -149,10 +150,14 @@ def follow_ground(s, z, n, foot, f, ground, chain):
             first = i - run + 1
             from_s, from_z, slope = s[first], z[first], 0.0
             run = 0
+        first_seen = not found
         ground[i], found = accept, True
         if accept == 1 and abs(way) < 0.03:
             continue  # the foot of a wall is not climbed point by point
-        if raised:
+        if first_seen and z[i] - foot > f.climb:
+            # nothing was seen of the way up to here: a slope, or a bumper before the lowest beam
+            raised, base_s, base_z, from_raised = True, s[i], foot, s[i]
+        elif raised:
             on_it = z[i] - base_z - f.slack * (s[i] - base_s) > f.climb
             raised = on_it and s[i] - from_raised < f.width
         else:
@@ -195,6 +200,19 @@ def heights_above(s, z, n, ground, reach, out):
 
 
 @kernel()
+def passed_below(s, z, n, i, edge, ground, f):
+    """Whether the beam to point i passed below ground that a higher beam of its line met: then it was reflected.
+
+    ``edge``: range at which it went below the ground; place and height of the last ground before.
+    """
+    pierced, last_s, last_z = edge
+    for j in range(i + 1, n):
+        if ground[j] and pierced + 0.1 < s[j] < s[i] - 0.1 and z[j] > last_z - f.slack * (s[j] - last_s) - f.climb:
+            return True
+    return False
+
+
+@kernel()
 def observe_line(line, points, origin, foot, lattice, f, out):
     """Statements of one line; ``out``: see `put_row`."""
     m = points.shape[0]
@@ -231,7 +249,8 @@ def observe_line(line, points, origin, foot, lattice, f, out):
         depth = last_z - f.slack * (s[i] - last_s) - p[i, 2]
         if ground[i] != 1 and depth > f.climb and blocked == 0.0 and origin[2] > last_z > p[i, 2]:
             pierced = s[i] * (origin[2] - last_z) / (origin[2] - p[i, 2])
-            if s[i] > pierced + 0.1 and pierced - last_s < f.memory:
+            there = pierced - last_s < f.memory and s[i] > pierced + 0.1
+            if there and not passed_below(s, z, n, i, (pierced, last_s, last_z), ground, f):
                 end, at = min(s[i], pierced + f.support_reach), pierced
                 value = min(round(100.0 * depth), 1000)
                 while at <= end:

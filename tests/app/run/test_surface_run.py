@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.app.run.surface import RunSurface, draw_surface, read_surface, write_surface
+from graphslam.app.run.surface import RunSurface, ScannedPath, draw_surface, read_surface, write_surface
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
@@ -42,7 +42,8 @@ def made() -> tuple[RunSurface, PointClouds, Trajectory]:
     path = Trajectory(times, poses)
     S = np.stack([k * 1e-6 * np.eye(6) for k in (1.0, 4.0, 9.0)])
     config = SurfaceConfig(voxel=0.1)
-    return read_surface(scans, path, times[::3], poses[::3], S, config=config, progress=False), scans, path
+    p = ScannedPath(scans=scans, path=path, node_times=times[::3], node_poses=poses[::3], node_covariances=S)
+    return read_surface([p], config=config, progress=False), scans, path
 
 
 def test_a_room_has_its_walls(made: tuple[RunSurface, PointClouds, Trajectory]) -> None:
@@ -82,8 +83,28 @@ def test_what_is_written(made: tuple[RunSurface, PointClouds, Trajectory], tmp_p
 def test_no_scan_on_the_path(made: tuple[RunSurface, PointClouds, Trajectory]) -> None:
     _, scans, path = made
     late = Trajectory(path.times + 100.0, path.poses)
+    none = ScannedPath(scans=scans, path=late, node_times=late.times[:1], node_poses=late.poses[:1])
     with pytest.raises(DataError, match="within the solved path"):
-        read_surface(scans, late, late.times[:1], late.poses[:1], progress=False)
+        read_surface([none], progress=False)
+
+
+def test_sessions_in_one_frame_make_one_surface(made: tuple[RunSurface, PointClouds, Trajectory]) -> None:
+    alone, scans, path = made
+    here = ScannedPath(scans=scans, path=path, node_times=path.times[::3], node_poses=path.poses[::3])
+    split = [
+        ScannedPath(
+            scans=scans, path=path.take(part), node_times=path.times[part][::3], node_poses=path.poses[part][::3]
+        )
+        for part in (slice(0, 3), slice(3, None))
+    ]
+    two = read_surface(split, config=alone.layer.config, progress=False)
+    assert two.facts()["sessions"] == 2
+    assert read_surface([here], config=alone.layer.config, progress=False).facts()["sessions"] == 1
+    assert set(two.session.tolist()) <= {-1, 0, 1}
+    assert np.array_equal(two.mesh.vertices, alone.mesh.vertices)  # the same pieces at the same poses
+    assert np.array_equal(two.session[two.owner >= 0], np.minimum(two.owner[two.owner >= 0], 1))
+    colours = two.colours("session")
+    assert len(np.unique(colours[two.session >= 0], axis=0)) == 2
 
 
 def test_a_surface_is_made_alone(tmp_path: Path) -> None:

@@ -10,20 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 import graphslam
 from graphslam.app.cli import app
+from graphslam.app.folders.generations import outputs
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import open_run
+from graphslam.app.run.surface import scanned_path
 from graphslam.app.sessions.dense import session_of
 from graphslam.app.sessions.localise import localise
+from graphslam.app.sessions.merge_surface import surface_of_sessions
 from graphslam.backend.sessions import attach, put
 from graphslam.core import se3
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, DataError, RunFolderError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog, Truth
+from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -31,6 +36,7 @@ from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.session_ties import TieConfig, TwoSessions
+from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
@@ -67,7 +73,29 @@ def log_of(d: HallDrive, name: str, seed: int) -> SensorLog:
     z = z + 0.05 * rng.standard_normal(z.shape)
     gps = Gps(times=d.path.times, positions=z, sigma=np.full(len(z), 0.05), lever=np.zeros(3))
     truth = Truth(own, landmark_ids=np.zeros(0, dtype=np.int64), landmarks=np.zeros((0, 3)))
-    return SensorLog(name=name, streams={"gps": gps}, truth=truth, meta={"T_world_frame": frame.tolist()})
+    seen = {} if any(m.cloud is None for m in d.submaps) else {"scanner": scans_of(d)}
+    return SensorLog(name=name, streams={"gps": gps, **seen}, truth=truth, meta={"T_world_frame": frame.tolist()})
+
+
+def scans_of(d: HallDrive) -> PointClouds:
+    """The scans that the clouds of a drive were made of, each in its own frame."""
+    times, points = [], []
+    for m in d.submaps:
+        assert m.cloud is not None
+        assert m.trajectory is not None
+        for k in range(int(m.cloud.scan.max()) + 1):
+            own = se3.se3_inverse(m.trajectory.poses[k])
+            times.append(float(m.trajectory.times[k]))
+            points.append(se3.se3_transform(own, m.cloud.points[m.cloud.scan == k]))
+    first = np.unique(times, return_index=True)[1]  # two submaps share the scan at their border
+    points = [points[k] for k in first]
+    return PointClouds.from_arrays(np.array(times)[first], np.concatenate(points), np.cumsum([0, *map(len, points)]))
+
+
+def scanned_from(logs: list[tuple[Any, SensorLog]]) -> Any:
+    """`scanned_path` of runs whose logs are in memory."""
+    known = {str(run.folder): log for run, log in logs}
+    return lambda run, log=None: scanned_path(run, log=log or known[str(run.folder)])
 
 
 def solved(d: HallDrive, name: str, out: Path, *, gps: str = "none", seed: int = 0) -> Any:
@@ -132,6 +160,27 @@ def test_drives_of_clouds_become_one_map(tmp_path: Path) -> None:
     e = se3.se3_log(se3.se3_between(s.T_world_base, truth_between(drives)))
     assert e @ np.linalg.solve(s.covariance, e) < CHI2_6
     assert np.linalg.norm(e[3:]) < 0.5
+    # the surface of both in one frame: walls of the two lie on each other
+    logs = [log_of(d, n, 0) for n, d in zip(("there", "back"), drives)]
+    found = surface_of_sessions(m, logs=logs, config=SurfaceConfig(voxel=0.3), progress=False)
+    assert found.facts()["sessions"] == 2
+    assert all(np.count_nonzero(found.session == k) > 500 for k in (0, 1))
+    assert np.isfinite(found.sigma[found.session >= 0]).all()
+    one, other = (found.mesh.vertices[found.session == k] for k in (0, 1))
+    near = cKDTree(one).query(other)[0]
+    assert np.mean(near < 0.6) > 0.1  # they drove through the same part of the hall
+    with pytest.raises(ConfigError, match="1 logs of 2 sessions"):
+        surface_of_sessions(m, logs=logs[:1])
+    # written with the merge, if asked for
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("graphslam.app.sessions.merge_surface.scanned_path", scanned_from(list(zip(runs, logs))))
+        graphslam.merge(runs, out=tmp_path / "both", surface=SurfaceConfig(voxel=0.3))
+    facts = json.loads((outputs(tmp_path / "both") / "surface.json").read_text())
+    assert facts["sessions"] == 2
+    assert facts["colour"] == "session"
+    assert (outputs(tmp_path / "both") / "figures" / "surface_sessions.png").is_file()
+    with pytest.raises(ConfigError, match="taste"):
+        graphslam.merge(runs, out=tmp_path / "third", surface=SurfaceConfig(), colour="taste")
 
 
 def test_isam2_comes_to_the_same_optimum(runs: list[Any], merged: Any) -> None:
