@@ -42,9 +42,9 @@ MIN_HITS = 3
 # name -> (front end, options beside the common ones); one that joins by the true identities is `known`
 LOCAL: dict[str, tuple[str, Options]] = {
     "known": ("rbpf-ekf", {"association": "known", "particles": 40}),
-    "ekf-nn": ("ekf", {"association": "nearest"}),
-    "ekf-jcbb": ("ekf", {"association": "jcbb"}),
-    "ekf-jcbb-smoothed": ("ekf", {"association": "jcbb", "handover": "smoothed"}),
+    "ekf-nn": ("ekf", {"association": "nearest", "handover": "filter"}),
+    "ekf-jcbb": ("ekf", {"association": "jcbb", "handover": "filter"}),
+    "ekf-jcbb-smoothed": ("ekf", {"association": "jcbb"}),
     "rbpf-40": ("rbpf-ekf", {"particles": 40}),
     "rbpf-100": ("rbpf-ekf", {"particles": 100}),
     "rbpf1-40": ("rbpf-ekf", {"particles": 40, "proposal": "1.0"}),

@@ -95,7 +95,7 @@ class _Trial:
             ("local-paper-inflated", "rbpf-ekf", {**paper, "moment_inflation": True}),
         ):
             yield from self.judge.local(name, self._submaps(front_end, options))
-        ekf, seconds = clock("local-ekf", partial(self._submaps, "ekf", {}))
+        ekf, seconds = clock("local-ekf", partial(self._submaps, "ekf", {"handover": "filter"}))
         yield seconds
         yield from self._joined("ekf", ekf, CLASSICAL)
         rbpf, seconds = clock("local-paper", partial(self._submaps, "rbpf-ekf", paper))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.studies.charts import ChartConfig, draw_log
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, CovarianceError, GeometryError, MissingDataError
 from graphslam.core.geometry import tangent_to_vector_covariance
@@ -65,6 +66,24 @@ def test_local_maps_with_the_stated_sensor_pay_for_linearisation_and_smoothing_r
     assert 0.85 < smoothed_pose < 1.15
     assert 1.02 < joint / smoothed < 1.08
     assert pose > smoothed_pose
+
+
+def test_where_ranges_are_sure_and_bearings_are_not_the_filter_believes_itself_too_much_and_the_default_does_not():
+    """6 cm / 3.5°: a sighting at 20 m is an arc of 2 m, of which one linearisation makes a straight line."""
+    maps = StoppingConfig(num_features=10**6, time_max=1e6, max_scans=10**6, max_distance=35.0)
+    per_dof = {}
+    for name, options in (("default", {}), ("filter", {"handover": "filter"})):
+        nees = dof = 0.0
+        for seed in range(8):
+            robot = ChartConfig(odometry=(0.03, 0.02, 0.5), sensor=(0.06, 3.5), seconds=150.0)
+            log = draw_log(robot, SeedTree(seed).child("arcs"))
+            front = Ekf(EkfConfig(association="known", max_range=25.0, stopping=maps, **options))
+            found = submaps_consistency(front.submaps(log, seed=SEED), log.truth)["exit"]
+            nees, dof = nees + found.nees.sum(), dof + found.dof.sum()
+        per_dof[name] = nees / dof
+    assert dof / 3 >= 70
+    assert 0.8 < per_dof["default"] < 1.3  # 95 % bounds of honest ones: 0.82 to 1.20
+    assert per_dof["filter"] > 3.0
 
 
 def test_front_ends_are_registered_with_presets_for_the_simulated_world(world):
