@@ -16,7 +16,7 @@ from graphslam.core.random import SeedTree
 from graphslam.sim.clutter import KeepClear, scatter
 from graphslam.sim.mesh import MeshBuilder, Rectangle
 from graphslam.sim.route import plan_route
-from graphslam.sim.world import World, describe_route
+from graphslam.sim.world import World, describe_route, layout_number
 
 STOREY = 3.6
 _LEVELS = 3
@@ -29,6 +29,7 @@ _SEAT = 0.05
 _HALL = 7.0  # half its width
 _CORRIDOR = 1.4  # half its width
 _ROOM_DEPTH = 5.0
+_SHORTEST = 2.0  # of a room, along its corridor
 _END_LENGTH, _END_HALF = 9.0, 4.6  # of the room at the end of a corridor
 _ROUND = 1.8, 2.6  # the way round it: distance from its front and rear wall, half width
 _DOOR, _END_DOOR, _DOOR_HEIGHT = 0.95, 1.5, 2.1
@@ -76,11 +77,13 @@ _LEGS = (
 )  # fmt: skip
 
 
-def building(*, seed: int = 0) -> World:
+def building(layout: str = "usual", *, seed: int = 0) -> World:
     """The building world.
 
     Parameters
     ----------
+    layout : str
+        Of rooms and doors: "usual", or "drawn-17" by that number; corridors, stairs and way stay.
     seed : int
         Moves crates, boards and barrels; walls, doors and way stay.
     """
@@ -88,7 +91,7 @@ def building(*, seed: int = 0) -> World:
     _floors(mesh)
     _halls(mesh)
     _stairwell(mesh)
-    fixed = SeedTree(0).child("building")  # not the world's seed: rooms never change
+    fixed = SeedTree(layout_number(layout)).child("building")  # not the world's seed: rooms stay
     for leg in _LEGS:
         _corridor(mesh, leg, fixed.child("rooms", leg.level, leg.turns).generator())
     waypoints = np.array(_waypoints())
@@ -185,7 +188,7 @@ def _corridor(mesh: MeshBuilder, leg: _Leg, rng: np.random.Generator) -> None:
     for side in (-1.0, 1.0):
         edges = [_HALL]
         while leg.end - edges[-1] > 7.0:
-            edges.append(edges[-1] + rng.uniform(3.2, 5.2))
+            edges.append(min(edges[-1] + rng.uniform(3.2, 5.2), leg.end - _SHORTEST))
         edges.append(leg.end)
         doors = []
         for a, b in pairwise(edges):

@@ -31,7 +31,7 @@ def garage(layout: str = "A", *, seed: int = 0) -> World:
     Parameters
     ----------
     layout : str
-        "A", "B" or "C"; "D" is kept for tests that nothing was tuned on.
+        "A", "B" or "C"; "D" is kept for tests that nothing was tuned on; "drawn-17" is drawn by that number.
     seed : int
         Moves parked cars and clutter; building and way stay.
 
@@ -90,10 +90,6 @@ def _placed(points: Array, g: GarageLayout) -> Array:
     return np.column_stack([x, y, z])
 
 
-def _pillars(g: GarageLayout) -> Array:
-    return np.arange(g.first, g.length - 1.0, g.pitch)
-
-
 def _ramp_rectangle(g: GarageLayout, margin: float = 0.0) -> Rectangle:
     foot, top, y = g.ramp
     half = g.ramp_width / 2 + margin
@@ -121,7 +117,7 @@ def _levels(mesh: MeshBuilder, g: GarageLayout) -> None:
     half = _PILLAR / 2
     for level in (0, 1):
         floor, ceiling = level * STOREY, (level + 1) * STOREY - SLAB
-        for x in _pillars(g):
+        for x in g.columns:
             for y in g.rows:
                 mesh.box((x - half, y - half, floor), (x + half, y + half, ceiling))
             # a beam of the lower level would hang in the robot's way where the ramp comes through the ceiling
@@ -181,7 +177,7 @@ def _surroundings(mesh: MeshBuilder, g: GarageLayout) -> None:
 
 def _bays(g: GarageLayout) -> Array:
     """Parking bays ``(n, 3)``: three between two pillars, none in the cross aisles or where the ramp is."""
-    pillars, width = _pillars(g), (g.pitch - _PILLAR) / 3
+    pillars, width = g.columns, (g.pitch - _PILLAR) / 3
     # one way of giving the ramp room: its rectangle with a car's half length
     x0, y0, x1, y1 = _ramp_rectangle(g, 2.4)
     bays = []

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
 
 from graphslam.core.errors import UnknownNameError
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+from graphslam.sim.route import plan_route
+from graphslam.sim.world import DRAWN, layout_number
 
 STOREY = 3.2
 """From floor to floor [m]."""
@@ -12,6 +19,8 @@ SLAB = 0.3
 CORNER_RADIUS = 3.0
 RETRACED = 28.0
 """The first stretch of the way, driven again at its end [m]."""
+ROOM = 1.0
+"""From the way to the middle of a pillar, at least, where a plan is drawn [m]."""
 _ROAD_RUN = 23.5
 """Plan length of the outdoor ramp [m]."""
 
@@ -69,6 +78,11 @@ class GarageLayout:
     cores: tuple[tuple[float, float, float, float], ...]
     mirrored: bool = False
     turned: bool = False
+
+    @property
+    def columns(self) -> Array:
+        """x of the pillars of every row [m]."""
+        return np.arange(self.first, self.length - 1.0, self.pitch)
 
     @property
     def road_top(self) -> float:
@@ -140,7 +154,36 @@ LAYOUTS = {
 
 
 def garage_layout(name: str) -> GarageLayout:
-    """The layout of that name."""
+    """The layout of that name, or the one that is drawn by the number in ``drawn-17``."""
+    if number := layout_number(name):
+        return drawn_layout(number)
     if name not in LAYOUTS:
-        raise UnknownNameError("garage layout", name, LAYOUTS)
+        raise UnknownNameError("garage layout", name, (*LAYOUTS, f"{DRAWN}N"))
     return LAYOUTS[name]
+
+
+def drawn_layout(number: int) -> GarageLayout:
+    """A garage drawn by a number: one of the four plans stretched in both directions, its pillars, road and yard at
+    other places, mirrored and turned by chance."""
+    rng = SeedTree(number).child("garage-layout").generator()
+    while True:
+        g = LAYOUTS[str(rng.choice(list(LAYOUTS)))]
+        along, across = rng.uniform(0.95, 1.25), rng.uniform(1.0, 1.2)
+        xs = {name: float(along * getattr(g, name)) for name in ("length", "west", "east", "turn")}
+        ys = {name: float(across * getattr(g, name)) for name in ("width", "low_aisle", "first_aisle", "last_aisle")}
+        found = replace(
+            g, name=f"{DRAWN}{number}", **xs, **ys,
+            pitch=float(rng.uniform(6.0, 9.0)), first=float(rng.uniform(2.0, 4.0)),
+            rows=tuple(float(across * y) for y in g.rows), bays=tuple(float(across * y) for y in g.bays),
+            ramp=(float(along * g.ramp[0]), float(along * g.ramp[1]), float(across * g.ramp[2])),
+            road=float(g.road - rng.uniform(0.0, 1.5)), yard=float(g.yard - rng.uniform(0.0, 1.5)),
+            cores=tuple((along * a, across * b, along * c, across * d) for a, b, c, d in g.cores),
+            mirrored=bool(rng.random() < 0.5), turned=bool(rng.random() < 0.5),
+        )  # fmt: skip
+        end = found.waypoints()[-1][1]
+        if not found.yard + CORNER_RADIUS + 1.0 < end < found.low_aisle:
+            continue  # the way ends on the straight that it began with
+        way = plan_route(np.array(found.waypoints()), CORNER_RADIUS, where=found.name)
+        pillars = np.array([(x, y) for x in found.columns for y in found.rows])
+        if float(cKDTree(pillars).query(way.positions(way.every(0.1))[:, :2])[0].min()) > ROOM:
+            return found

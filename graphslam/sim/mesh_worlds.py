@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass
 
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
-from graphslam.sim.world import World
+from graphslam.sim.world import DRAWN, World, layout_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,8 @@ class MeshWorld:
     module, function : str
         What builds it; imported when used.
     layouts : tuple of str
-        Buildings to choose from, the default first; empty where there is one only.
+        Buildings to choose from, the default first; empty where there is one only. Where there are any, others are
+        drawn: ``drawn-17`` by that number.
     """
 
     module: str
@@ -27,10 +28,10 @@ class MeshWorld:
 
     def build(self, name: str, layout: str | None, seed: int) -> World:
         """The world; the seed moves what can be moved in it."""
-        if layout is not None and layout not in self.layouts:
+        if layout is not None and layout not in self.layouts and not (self.layouts and layout_number(layout)):
             if not self.layouts:
                 raise ConfigError(f"world {name!r} has one layout only: leave {layout!r} out")
-            raise UnknownNameError(f"layout of world {name!r}", layout, self.layouts)
+            raise UnknownNameError(f"layout of world {name!r}", layout, (*self.layouts, f"{DRAWN}N"))
         try:
             make = getattr(importlib.import_module(self.module), self.function)
         except ImportError as error:
@@ -42,7 +43,7 @@ class MeshWorld:
 MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
     "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
-    "building": MeshWorld("graphslam.sim.building", "building"),
+    "building": MeshWorld("graphslam.sim.building", "building", ("usual",)),
     "court": MeshWorld("graphslam.sim.court", "court"),
 }
 
@@ -55,7 +56,8 @@ def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
     name : str
         ``garage``, ``mine`` or ``building``.
     layout : str, optional
-        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round.
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. Of these and of the
+        building: ``drawn-17``, drawn by that number.
     seed : int
         Of what can be moved in it.
 

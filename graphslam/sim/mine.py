@@ -16,7 +16,7 @@ from graphslam.sim.clutter import KeepClear
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.route import Route, plan_route
 from graphslam.sim.tunnels import Gallery, Rock, rock_field, surface_nets
-from graphslam.sim.world import World, describe_route
+from graphslam.sim.world import World, describe_route, layout_number
 
 _RADIUS = 2.5
 _SPEED = 0.75
@@ -89,15 +89,16 @@ def mine(layout: str = "once", *, seed: int = 0) -> World:
 
     Parameters
     ----------
-    layout : {"once", "twice"}
-        How often the tour is made, in one drive.
+    layout : {"once", "twice"} or "drawn-17"
+        How often the tour is made, in one drive; or once, between walls that are drawn by that number.
     seed : int
         Moves timber, crates and fallen rock; galleries and way stay.
     """
-    tour = _TOURS[layout]
+    number = layout_number(layout)
+    tour = _TOURS["once" if number else layout]
     galleries = [g for name in _GALLERIES for g in _pieces(name)]
     stubs = [_stub(*s) for s in _STUBS]
-    rng = SeedTree(0).child("mine", "rock").generator()  # not the world's seed: walls never change
+    rng = SeedTree(number).child("mine", "rock").generator()  # not the world's seed: walls stay
     rock = Rock()
     field, low = rock_field(galleries + stubs, rock, rng)
     mesh = MeshBuilder()

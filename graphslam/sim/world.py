@@ -13,6 +13,16 @@ from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.sim.route import Route, plan_route
 
+DRAWN = "drawn-"
+"""Begin of the names of layouts that are drawn; the rest is their number, from 1 on."""
+
+
+def layout_number(layout: str) -> int:
+    """The number of a layout that is drawn, such as ``drawn-17``; 0 of every other."""
+    number = layout.removeprefix(DRAWN)
+    return int(number) if layout.startswith(DRAWN) and number.isdecimal() else 0
+
+
 # An earlier visit is followed while the place on it moves by no more than this from one point to the next [m].
 _JUMP = 3.0
 

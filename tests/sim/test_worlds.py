@@ -10,6 +10,8 @@ import pytest
 from graphslam.core.errors import GeometryError, UnknownNameError
 from graphslam.sim.building import building
 from graphslam.sim.garage import garage
+from graphslam.sim.garage_layouts import garage_layout
+from graphslam.sim.mesh_worlds import mesh_world
 from graphslam.sim.mine import mine
 from graphslam.sim.route import plan_route
 from graphslam.sim.tunnels import surface_nets
@@ -145,6 +147,34 @@ def test_garage_layouts_differ() -> None:
     turned = [np.sign(w.route().curvature).sum() for w in (a, b, c)]
     assert turned[0] * turned[1] < 0  # mirrored: left turns for right ones
     assert len({round(np.ptp(w.waypoints[:, 0])) for w in (a, b, c)}) == 3
+
+
+@pytest.mark.parametrize("number", [1, 7, 22])
+def test_garages_that_are_drawn_are_garages(number: int) -> None:
+    name = f"garage-drawn-{number}"
+    w, route = world(name), world(name).route()
+    assert 270.0 < route.length < 400.0
+    assert np.abs(np.rad2deg(np.arctan(route.slopes(route.starts[:-1])))).max() < 9.0
+    assert clearance(name) >= 0.35
+    assert len(w.meta["revisits"]) == 1
+    assert w.meta["cars"] > 20
+    assert np.array_equal(w.vertices, world.__wrapped__(name).vertices)
+    assert np.array_equal(w.waypoints, world(name, 1).waypoints)
+
+
+def test_layouts_are_drawn_by_their_number() -> None:
+    numbers = range(1, 25)
+    plans = [garage_layout(f"drawn-{n}") for n in numbers]
+    assert len({(p.length, p.width, p.pitch) for p in plans}) == len(plans)
+    assert {p.mirrored for p in plans} == {p.turned for p in plans} == {False, True}
+    assert garage_layout("drawn-3") == plans[2]
+    for name in ("drawn-0", "drawn--1", "drawn-x", "E"):
+        with pytest.raises(UnknownNameError, match="layout"):
+            mesh_world("garage", layout=name)
+    for kind in ("mine", "building"):  # other walls along the same way
+        usual, drawn = mesh_world(kind), mesh_world(kind, layout="drawn-2")
+        assert np.array_equal(usual.waypoints, drawn.waypoints)
+        assert len(walls(usual) & walls(drawn)) < 0.9 * len(walls(usual))
 
 
 def test_garage_drives_through_both_levels_and_retraces_its_start() -> None:

@@ -220,7 +220,8 @@ def simulate(
     out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),
     layout: str | None = typer.Option(
-        None, help="Layout of the garage: A, B, C or D; of the mine: once or twice round."
+        None,
+        help="Layout of the garage: A, B, C or D; of the mine: once or twice round. drawn-17: drawn by that number.",
     ),
     preset: str | None = typer.Option(
         None,

@@ -44,7 +44,7 @@ class ExitsTrialConfig:
     """A robot, and what is run on its logs."""
 
     grid: GridTrialConfig
-    """Filters, and world; the garage's layout is drawn."""
+    """Filters, and world."""
     robot: int = 1
     """Which robot is drawn."""
 
@@ -70,14 +70,13 @@ def run_exits_trial(config: ExitsTrialConfig, seed: int) -> list[Measurement]:
     """All figures of one run."""
     grid = config.grid
     robot, speed = drawn_robot(config.robot, grid.crawler)
-    layout = None if grid.world == "court" else str(SeedTree(seed).child("layout").generator().choice(list("ABCD")))
     steps = replace(grid.steps, noise=told(robot))
     with one_blas_thread():
-        return list(GridTrial(replace(grid, crawler=robot, speed=speed, layout=layout, steps=steps), seed).run())
+        return list(GridTrial(replace(grid, crawler=robot, speed=speed, steps=steps), seed).run())
 
 
 _GARAGE = GridTrialConfig(
-    world="garage", layout="B", algorithms=("rbpf-20", "segslam-20"), figures=("matches", "exits"), steps=LEVEL,
+    world="garage", layout="drawn", algorithms=("rbpf-20", "segslam-20"), figures=("matches", "exits"), steps=LEVEL,
     crawler=crawler_preset("light"),
 )  # fmt: skip
 WORLDS = {f"robot-{n}": ExitsTrialConfig(grid=_GARAGE, robot=n) for n in range(7)}

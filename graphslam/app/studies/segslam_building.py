@@ -32,17 +32,16 @@ _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")
 # Twice the default of new ground: segments end in rooms and halls more often than half-way along a corridor, and what
 # is driven back along is in the map that the body works in. Chosen in worlds that the study does not use.
 SEGSLAM = SegSlamConfig(segmentation=SegmentationConfig(max_length=120.0))
-WORLDS = {
-    "building": GridTrialConfig(
-        world="building",
-        algorithms=_ALGORITHMS,
-        figures=_FIGURES,
-        samples=20,
-        placements=4,
-        segslam=SEGSLAM,
-        steps=LEVEL,
-    )
-}
+_BUILDING = GridTrialConfig(
+    world="building",
+    algorithms=_ALGORITHMS,
+    figures=_FIGURES,
+    samples=20,
+    placements=4,
+    segslam=SEGSLAM,
+    steps=LEVEL,
+)
+WORLDS = {"building": _BUILDING, "building-drawn": replace(_BUILDING, layout="drawn")}
 QUICK_WORLDS = {
     "court-quick": replace(
         QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-5"), figures=_FIGURES, samples=3, placements=2

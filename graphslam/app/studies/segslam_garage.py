@@ -1,7 +1,7 @@
 """The study ``segslam-garage``: does a loop through two levels close, with how many particles, at what price?
 
-Worlds: the garages ``garage-A`` to ``garage-D`` (nothing was tuned on the last). Parked cars, clutter and
-every sensor error are drawn anew in each run.
+Worlds: the garages ``garage-A`` to ``garage-D`` (nothing was tuned on the last), and ``garage-drawn``, whose plan is
+drawn anew in each run. Parked cars, clutter and every sensor error are drawn in all of them.
 
 Algorithms: ``dead-reckoning``; ``rbpf-N``, one filter over the whole log; ``segslam-N``. N particles; the same steps,
 beams, noise and weights for both.
@@ -56,7 +56,7 @@ WORLDS = {
     f"garage-{layout}": GridTrialConfig(
         world="garage", layout=layout, algorithms=_algorithms(NUMBERS), figures=_FIGURES, steps=LEVEL
     )
-    for layout in ("A", "B", "C", "D")
+    for layout in ("A", "B", "C", "D", "drawn")
 }
 QUICK_WORLDS = {
     "court-quick": replace(QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-1", "segslam-5"), figures=_FIGURES)

@@ -31,7 +31,8 @@ _FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
 # Galleries do not lie above each other, so that heights may drift: at 6 mrad of gravity 2.4 m on the first loop.
 SEGSLAM = SegSlamConfig(winnowing=WinnowConfig(height_per_metre=7e-3))
-WORLDS = {"mine": GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)}
+_MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
+WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
 QUICK_WORLDS = {
     "court-quick": replace(QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-5"), figures=_FIGURES),
 }

@@ -276,7 +276,7 @@ def entropy_table(table: pd.DataFrame, champion: str = "segslam-40") -> pd.DataF
                 ratio, low, high = ratio_of_means(pair[:, 0], pair[:, 1], _rng("entropy"))
                 row |= {"ratio": ratio, "ratio_low": low, "ratio_high": high}
                 row["champion_lower_in"] = int(np.sum(pair[:, 0] < pair[:, 1]))
-        if name.startswith("rbpf") and world == "building":
+        if name.startswith("rbpf") and world.startswith("building"):
             row["paper_ratio"] = PAPER_ENTROPY["segslam-40"] / PAPER_ENTROPY["rbpf"]
         out.append(row)
     return pd.DataFrame(out)

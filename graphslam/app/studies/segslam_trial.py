@@ -44,7 +44,7 @@ from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
-from graphslam.sim.world import World
+from graphslam.sim.world import DRAWN, World
 
 Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path", "climbs"]
 DEAD_RECKONING = "dead-reckoning"
@@ -82,7 +82,7 @@ class GridTrialConfig:
     world: str
     """``garage``, ``mine``, ``building``; ``court``, the small one."""
     layout: str | None = None
-    """Of the garage."""
+    """Of the world; ``drawn``: drawn anew in each run."""
     algorithms: tuple[str, ...] = (DEAD_RECKONING,)
     """In the order in which they run."""
     figures: tuple[Figure, ...] = ()
@@ -116,7 +116,10 @@ class GridTrialConfig:
 
     def make_world(self, seed: int) -> World:
         """The world of a seed, which moves what can be moved in it."""
-        made = court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=self.layout, seed=seed)
+        layout = self.layout
+        if layout == "drawn":
+            layout = f"{DRAWN}{1 + int(SeedTree(seed).child('layout').generator().integers(10**9))}"
+        made = court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=layout, seed=seed)
         return replace(made, speed=self.speed * made.speed)
 
 

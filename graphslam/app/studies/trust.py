@@ -44,7 +44,7 @@ SAID = {
 """How the line ``trust`` of a verdict begins."""
 WRONG = 1.5
 """NEES/n from which on a map must not be called consistent or pessimistic."""
-WORLDS_DRAWN = range(500, 620)
+WORLDS_DRAWN = range(500, 560)
 """Worlds of the study. Of those before some were looked at while rules and defaults were made: they judge no more."""
 
 
@@ -192,5 +192,5 @@ STUDY = TrustStudy(
     "what a run without truth says of its covariances, beside what is true, in worlds that are drawn",
     FULL,
     QUICK,
-    trials=2,
+    trials=10,
 )

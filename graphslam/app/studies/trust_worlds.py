@@ -43,6 +43,8 @@ class TrustWorld:
         As stated, and the size of the errors, white or lasting [m].
     gps_time : float
         For which lasting errors last [s].
+    number : int
+        Of the world: routes and errors of worlds of one seed differ by it.
     """
 
     robot: ChartConfig = field(default_factory=ChartConfig)
@@ -54,6 +56,7 @@ class TrustWorld:
     gps: str = "none"
     gps_sigma: float = 1.0
     gps_time: float = 60.0
+    number: int = 0
 
     @property
     def clean(self) -> bool:
@@ -102,7 +105,9 @@ def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
     clean = number % 2 == 0
     gps = GPS_KINDS[int(rng.integers(3 if clean else 6))]
     sigma = between(0.03, 0.08) if gps == "rtk" else between(0.5, 2.0)
-    world = TrustWorld(robot=robot, front_end=front_end, gps=gps, gps_sigma=sigma, gps_time=between(20.0, 90.0))
+    world = TrustWorld(
+        robot=robot, front_end=front_end, gps=gps, gps_sigma=sigma, gps_time=between(20.0, 90.0), number=number
+    )
     if clean:
         return world
     wrong = rng.permutation(5)[: int(rng.integers(1, 3))].tolist()
@@ -135,7 +140,7 @@ def lasting(rng: np.random.Generator, n: int, dt: float, time: float, width: int
 
 def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
     """A log of a world with its truth; it states what the data sheets say."""
-    true = w.understated
+    true, seed = w.understated, seed.child("world", w.number)
     c = w.robot
     (x, y, heading), (ranges, bearings) = c.odometry, c.sensor
     noisy = replace(c, odometry=(true * x, true * y, true * heading), sensor=(true * ranges, true * bearings))

@@ -86,12 +86,12 @@ def test_they_are_studies_that_can_be_sent_elsewhere(name: str) -> None:
 
 
 def test_the_garage_is_compared_at_the_papers_numbers_of_particles() -> None:
-    assert GARAGE.worlds(False) == ("garage-A", "garage-B", "garage-C", "garage-D")
+    assert GARAGE.worlds(False) == ("garage-A", "garage-B", "garage-C", "garage-D", "garage-drawn")
     for world in GARAGE.worlds(False):
         names = GARAGE.full[world].algorithms
         for family in ("rbpf", "segslam"):
             assert [family_of(a)[1] for a in names if family_of(a)[0] == family] == [1, 5, 10, 20, 40, 100]
-    assert {GARAGE.full[w].layout for w in GARAGE.worlds(False)} == {"A", "B", "C", "D"}
+    assert {GARAGE.full[w].layout for w in GARAGE.worlds(False)} == {"A", "B", "C", "D", "drawn"}
 
 
 def test_names_of_algorithms() -> None:
