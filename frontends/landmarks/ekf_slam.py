@@ -195,6 +195,8 @@ class _Run:
                 "chi2_range": float(s.parts[1]),
                 "chi2_bearing": float(s.parts[2]),
                 "converged": s.converged,
+                "nonlinearity": s.nonlinearity() / len(s.gaussian.mean),
+                "unknowns": len(s.gaussian.mean),
             },
             None if way is None else fix_points(s, way),
         )

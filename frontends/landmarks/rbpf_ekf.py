@@ -196,6 +196,8 @@ class RbpfEkf(FrontEnd):
             "chi2_range": float(smoothed.parts[1]),
             "chi2_bearing": float(smoothed.parts[2]),
             "converged": smoothed.converged,
+            "nonlinearity": smoothed.nonlinearity() / len(smoothed.gaussian.mean),
+            "unknowns": len(smoothed.gaussian.mean),
         }
         report["flag"] = flag(report, c.particles)
         handed = {"smoothed": smoothed.gaussian, "moments": made.moments, "pooled": made.pooled}[c.handover]

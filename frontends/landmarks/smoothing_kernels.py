@@ -378,6 +378,54 @@ def path_covariances(poses, landmarks, evidence, at, G0, G1):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def bends(poses, landmarks, evidence):
+    """What curvature adds to ranges and bearings on average, by the covariance of each landmark as its sensor has it.
+
+    The line of sight q, in the frame of the pose, moves by ``F`` times the errors of pose and landmark; with its
+    covariance ``Q = F Σ Fᵀ`` a range is ``tr(n nᵀ Q) / 2 r`` larger on average than at the mean, n across the line of
+    sight u, and a bearing off by ``-uᵀ Q n / r²``. A turn of everything changes neither.
+
+    Returns
+    -------
+    mean : (q, 2)
+        Of the change of range and bearing.
+    """
+    T = len(poses)
+    ob_pose, ob_lm, ob, sensor = evidence.ob_pose, evidence.ob_lm, evidence.ob, evidence.sensor
+    Ainv, B, C, joint = _at_optimum(poses, landmarks, evidence)
+    Sl, S, X = joint[3:, 3:].copy(), joint[:3, :3].copy(), joint[:3, 3:].copy()
+    mean = np.zeros((len(ob), 2))
+    order = np.argsort(ob_pose, kind="mergesort")
+    h, F, P = np.empty(12), np.zeros((2, 5)), np.empty((5, 5))
+    F[0, 0] = F[1, 1] = -1.0
+    o = len(order) - 1
+    for k in range(T - 1, -1, -1):
+        if k < T - 1:  # as in smoothed_covariances
+            D, G = Ainv[k] @ B[k], Ainv[k] @ C[k]
+            Xk = -(D @ X + G @ Sl)
+            Sk1 = -(D @ S + G @ X.T)
+            Sk = Ainv[k] - Sk1 @ D.T - Xk @ G.T
+            S, X = 0.5 * (Sk + Sk.T), Xk
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        F[0, 3], F[0, 4], F[1, 3], F[1, 4] = c, s, -s, c
+        P[:3, :3] = S
+        while o >= 0 and ob_pose[order[o]] == k:
+            i = order[o]
+            j = ob_lm[i]
+            observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
+            r = max(h[0], math.sqrt(ob[i, 2]))  # nearer than its σ a range tells no place
+            ux, uy = -h[2], -h[3]
+            F[0, 2], F[1, 2] = r * uy + sensor[1], -r * ux - sensor[0]
+            P[:3, 3:], P[3:, 3:] = X[:, 2 * j : 2 * j + 2], Sl[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
+            P[3:, :3] = P[:3, 3:].T
+            Q = F @ P @ F.T
+            mean[i, 0] = (uy * uy * Q[0, 0] - 2.0 * ux * uy * Q[0, 1] + ux * ux * Q[1, 1]) / (2.0 * r)
+            mean[i, 1] = (ux * uy * (Q[0, 0] - Q[1, 1]) + (uy * uy - ux * ux) * Q[0, 1]) / (r * r)
+            o -= 1
+    return mean
+
+
+@numba.njit(cache=True, error_model="numpy")
 def responses(poses, landmarks, evidence, along, seen):
     """How the optimum moves with constants that all residuals know, and what the residuals say of these.
 

@@ -18,6 +18,8 @@ from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 from graphslam.frontends.landmarks.filter import ParticleSet
 from graphslam.frontends.landmarks.smoothing_kernels import (
     Evidence,
+    bends,
+    responses,
     smooth_kernel,
     smoothed_covariances,
     smoothing_cost,
@@ -225,6 +227,22 @@ class Smoothed:
     converged: bool
     landmarks: Array
     evidence: Evidence
+
+    def nonlinearity(self) -> float:
+        """Distance², under the own covariance, by which curvature moves the optimum from the mean; 0 if all is linear.
+
+        A sighting holds a landmark on an arc, a Gaussian holds it on the tangent. Where bearings are vague beside the
+        ranges, arcs bend by more than what the map claims to know across them. It is the squared norm of the bias of
+        nonlinear least squares (Box 1971), with the curvature of ranges and bearings alone.
+        """
+        if not len(self.landmarks):
+            return 0.0
+        odometry = np.zeros((len(self.poses), 3, 1))
+        mean = bends(self.poses, self.landmarks, self.evidence)
+        moved, shifted, _, _ = responses(self.poses, self.landmarks, self.evidence, odometry, mean[:, :, None])
+        by = moved[-1, :, 0]
+        step = np.concatenate([rotation2(self.poses[-1, 2]) @ by[:2], by[2:], shifted[:, 0]])
+        return float(step @ np.linalg.solve(self.gaussian.covariance, step))
 
 
 def smooth(

@@ -66,8 +66,8 @@ def simulate(
         confuse an association. Of the point field: ``flight``, ``drift``, ``quick``. Of the campus: ``full``,
         ``three-blocks``, ``block``, ``quick``. Of the robot in the other worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
-        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a garage, or
-        walls of the mine or of the building, drawn by that number.
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a plan
+        of the garage, or walls of the mine or of the building, drawn by that number.
     world_seed : int, optional
         Of what can be moved in a world of triangles, and of the campus, where it shall not be ``seed``.
     progress : bool

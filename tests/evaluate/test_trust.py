@@ -11,7 +11,17 @@ from scipy import stats
 from graphslam.app.run.verdict import Figures, stated
 from graphslam.core.records import Gps
 from graphslam.evaluate.systematic import sums
-from graphslam.evaluate.trust import Evidence, by_score, by_size, of_systematic, rows_as_json, rows_of_json, trust
+from graphslam.evaluate.trust import (
+    BENT,
+    Evidence,
+    by_score,
+    by_size,
+    nonlinearity,
+    of_systematic,
+    rows_as_json,
+    rows_of_json,
+    trust,
+)
 from graphslam.evaluate.whiteness import whiteness
 from graphslam.evaluate.without_truth import LASTING, class_consistency
 from graphslam.graph.gps import GpsConfig
@@ -120,6 +130,22 @@ SMALL = by_size("fixes", "fixes", 0.13, 400.0)
 )  # fmt: skip
 def test_the_word(rows: list[Evidence], fixes: bool, word: str) -> None:
     assert trust(rows, fixes=fixes).word == word
+
+
+def test_maps_that_bend_are_promised_nothing() -> None:
+    assert trust(HONEST, fixes=True, nonlinearity=0.9 * BENT).word == "consistent"
+    found = trust(HONEST, fixes=True, nonlinearity=1.1 * BENT)
+    assert found.word == "undecided"
+    assert found.bent
+    assert not found.missing
+    assert trust([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * BENT).word == "undecided"
+    # what the log itself contradicts comes first
+    wrong = by_size("map", "map", 1.3, 2000.0)
+    assert trust(wrong, fixes=False, nonlinearity=1.1 * BENT).word == "over-confident"
+    # a mean over unknowns, of the submaps that say it
+    reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
+    assert nonlinearity(reports) == pytest.approx(0.0175)
+    assert nonlinearity([{}]) == 0.0
 
 
 def test_honest_runs_are_seldom_called_wrong(rng):

@@ -18,7 +18,7 @@ from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.stream_checks import Noticed
-from graphslam.evaluate.trust import LEVEL, Evidence, Trust, rows_of_json, trust
+from graphslam.evaluate.trust import BENT, LEVEL, Evidence, Trust, rows_of_json, trust
 from graphslam.evaluate.without_truth import LASTING, two_sided
 from graphslam.maps.contradictions import LOOK
 
@@ -362,7 +362,8 @@ def judged_trust(figures: Figures) -> Trust | None:
         return None
     rows = rows_of_json(figures.report.get("evidence"))
     fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
-    return trust(rows, fixes=fixes)
+    bend: Any = figures.report.get("nonlinearity")
+    return trust(rows, fixes=fixes, nonlinearity=float(bend) if number(bend) else 0.0)
 
 
 def _trust(figures: Figures) -> list[Finding]:
@@ -379,10 +380,17 @@ def _trust(figures: Figures) -> list[Finding]:
         return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
     if found.word == "undecided":
         held = f" What is known: {said}." if said else ""
-        text = (
-            "Whether the covariances can be believed cannot be decided from this log: nothing in it could have seen "
-            f"that errors of {' and of '.join(found.missing)} are larger than stated.{held}"
-        )
+        causes = []
+        if found.missing:
+            errors = " and of ".join(found.missing)
+            causes.append(f"nothing in it could have seen that errors of {errors} are larger than stated")
+        if found.bent:
+            causes.append(
+                "bearings are so vague beside the ranges that a landmark may be anywhere on an arc, and no Gaussian "
+                f"describes that (squared shift by curvature per unknown {figures.report['nonlinearity']:.2g}, from "
+                f"{BENT:g} on maps are surer of themselves than they should be)"
+            )
+        text = f"Whether the covariances can be believed cannot be decided from this log: {'; '.join(causes)}.{held}"
         if figures.part("refine"):
             text += " The refined path takes its noise from its own residuals, which therefore do not judge it."
         return [Finding("", "trust", text)]

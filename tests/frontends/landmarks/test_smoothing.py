@@ -7,6 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, wrap_angle
+from graphslam.evaluate.trust import BENT
+from graphslam.frontends.landmarks.smoothing_kernels import bends
 from graphslam.frontends.landmarks.summarise import smooth
 from tests.reference.fastslam import measure
 
@@ -88,6 +90,48 @@ def test_a_landmark_under_the_sensor_is_not_placed_by_its_bearing(off):
     assert np.all(a <= 1.05 * b)  # each where its own optimum is
     # one sighting has its range, and where it is nearer than that no more than as much across
     assert np.all(a > 0.4 * np.minimum(b, R[0]))
+
+
+def test_bends_are_what_samples_of_the_relative_place_show():
+    """Twin: the relative place of each sighting is drawn from its dense covariance, and seen."""
+    truth, landmarks, u, k, j, z = drive(np.random.default_rng(4), T=8, L=4)
+    s = smooth(truth, landmarks, u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR)
+    p, l, T = s.poses, s.landmarks, len(truth)
+    n = 3 * T + 2 * len(l)
+    f = lambda v: dense_residual(v, p, l, u, k, j, z)  # noqa: E731
+    J = np.array([(f(1e-6 * e) - f(-1e-6 * e)) / 2e-6 for e in np.eye(n)]).T
+    C = np.linalg.inv(J.T @ J)
+
+    def place(v, o):  # of the landmark in the frame of its sensor
+        at = se2_compose(se2_compose(p[k[o]], v[3 * k[o] : 3 * k[o] + 3]), SENSOR)
+        d = l[j[o]] + v[3 * T + 2 * j[o] :][:2] - at[:2]
+        c, sn = np.cos(at[2]), np.sin(at[2])
+        return np.array([c * d[0] + sn * d[1], -sn * d[0] + c * d[1]])
+
+    found, rng = bends(p, l, s.evidence), np.random.default_rng(5)
+    for o in range(0, len(k), 5):
+        F = np.array([(place(1e-6 * e, o) - place(-1e-6 * e, o)) / 2e-6 for e in np.eye(n)]).T
+        step = rng.multivariate_normal(np.zeros(2), F @ C @ F.T, 200_000)
+        q = place(np.zeros(n), o)
+        both = np.stack([q + step, q - step])  # first orders cancel
+        r, b = np.linalg.norm(both, axis=2), np.arctan2(both[..., 1], both[..., 0])
+        by = np.column_stack([r.mean(axis=0) - np.linalg.norm(q), wrap_angle(b - np.arctan2(q[1], q[0])).mean(axis=0)])
+        error = by.std(axis=0) / np.sqrt(len(by))
+        np.testing.assert_array_less(np.abs(found[o] - by.mean(axis=0)), 5.0 * error + 0.01 * np.abs(found[o]))
+        assert found[o, 0] > 10.0 * error[0]  # the samples do tell it from nothing
+
+
+def test_maps_bend_where_bearings_are_vague_beside_ranges():
+    """Nearly nothing is left of it where ranges are vague and bearings sure."""
+    truth, landmarks, u, k, j, _ = drive(np.random.default_rng(6))
+    args = (u, np.tile(Q, (len(truth), 1, 1)), k, j)
+    exact = np.array([measure(truth[a], SENSOR, landmarks[b]) for a, b in zip(k, j)])
+    vague = np.column_stack([exact, np.tile([0.02**2, 0.1**2], (len(k), 1))])
+    sure = np.column_stack([exact, np.tile([0.3**2, 0.01**2], (len(k), 1))])
+    maps = [smooth(truth, landmarks, *args, v, SENSOR) for v in (vague, sure)]
+    per = [s.nonlinearity() / len(s.gaussian.mean) for s in maps]
+    assert per[0] > BENT
+    assert per[1] < 0.01 * per[0]
 
 
 def test_covariance_is_confirmed_by_monte_carlo():
