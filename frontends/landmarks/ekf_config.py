@@ -90,8 +90,8 @@ class EkfConfig(EkfFilterConfig):
     """Smoothed hand-over: after a Huber pass, observations with d² above this are dropped and counted; 0 = keep all."""
     handover: Literal["smoothed", "filter"] = "smoothed"
     """``smoothed``: Gauss-Newton under the filter's association, Laplace covariance; ``filter``: the EKF's own
-    Gaussian, as the paper has it. Each sighting is linearised once there: where ranges are far surer than bearings (5 cm, 3°),
-    its covariances are too small by a factor of up to ten."""
+    Gaussian, as the paper has it. Each sighting is linearised once there: where ranges are far surer than bearings
+    (5 cm, 3°), its covariances are too small by a factor of up to ten."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """When a submap ends."""
 
