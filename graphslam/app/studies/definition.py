@@ -78,7 +78,7 @@ def find_study(name: str) -> StudyDefinition:
     Examples
     --------
     >>> gs.find_study("segslam-garage").worlds(quick=False)
-    ('garage-A', 'garage-B', 'garage-C', 'garage-D')
+    ('garage-A', 'garage-B', 'garage-C', 'garage-D', 'garage-drawn')
     """
     target = STUDIES.get(name, name)
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", target):
