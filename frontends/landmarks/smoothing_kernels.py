@@ -298,6 +298,18 @@ def _at_optimum(poses, landmarks, evidence):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _pose_before(Ainv, B, C, Sl, S, X):
+    """One step of the backward recursion: covariance of pose k, and with the landmarks, from those of pose k + 1."""
+    # pose k given the rest: -Ainv (B ξ_{k+1} + C l), conditional covariance Ainv
+    F = Ainv @ B
+    G = Ainv @ C
+    Xk = -(F @ X + G @ Sl)
+    Sk1 = -(F @ S + G @ X.T)  # cov(ξ_k, ξ_{k+1})
+    Sk = Ainv - Sk1 @ F.T - Xk @ G.T
+    return 0.5 * (Sk + Sk.T), Xk
+
+
+@numba.njit(cache=True, error_model="numpy")
 def smoothed_covariances(poses, landmarks, evidence):
     """Laplace covariances at the optimum, Gauss-Newton Hessian.
 
@@ -312,14 +324,7 @@ def smoothed_covariances(poses, landmarks, evidence):
     S = joint[:3, :3].copy()  # covariance of pose k+1
     X = joint[:3, 3:].copy()  # its cross-covariance with the landmarks
     for k in range(T - 2, -1, -1):
-        # pose k given the rest: -Ainv (B ξ_{k+1} + C l), conditional covariance Ainv
-        F = Ainv[k] @ B[k]
-        G = Ainv[k] @ C[k]
-        Xk = -(F @ X + G @ Sl)
-        Sk1 = -(F @ S + G @ X.T)  # cov(ξ_k, ξ_{k+1})
-        Sk = Ainv[k] - Sk1 @ F.T - Xk @ G.T
-        S = 0.5 * (Sk + Sk.T)
-        X = Xk
+        S, X = _pose_before(Ainv[k], B[k], C[k], Sl, S, X)
         marginal[k] = S
     return joint, marginal
 
@@ -400,12 +405,8 @@ def bends(poses, landmarks, evidence):
     F[0, 0] = F[1, 1] = -1.0
     o = len(order) - 1
     for k in range(T - 1, -1, -1):
-        if k < T - 1:  # as in smoothed_covariances
-            D, G = Ainv[k] @ B[k], Ainv[k] @ C[k]
-            Xk = -(D @ X + G @ Sl)
-            Sk1 = -(D @ S + G @ X.T)
-            Sk = Ainv[k] - Sk1 @ D.T - Xk @ G.T
-            S, X = 0.5 * (Sk + Sk.T), Xk
+        if k < T - 1:
+            S, X = _pose_before(Ainv[k], B[k], C[k], Sl, S, X)
         c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
         F[0, 3], F[0, 4], F[1, 3], F[1, 4] = c, s, -s, c
         P[:3, :3] = S

@@ -16,8 +16,8 @@ from graphslam.evaluate.trust import (
     Evidence,
     by_score,
     by_size,
-    nonlinearity,
     of_systematic,
+    pooled_nonlinearity,
     rows_as_json,
     rows_of_json,
     trust,
@@ -144,8 +144,8 @@ def test_maps_that_bend_are_promised_nothing() -> None:
     assert trust(wrong, fixes=False, nonlinearity=1.1 * BENT).word == "over-confident"
     # a mean over unknowns, of the submaps that say it
     reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
-    assert nonlinearity(reports) == pytest.approx(0.0175)
-    assert nonlinearity([{}]) == 0.0
+    assert pooled_nonlinearity(reports) == pytest.approx(0.0175)
+    assert pooled_nonlinearity([{}]) == 0.0
 
 
 def test_honest_runs_are_seldom_called_wrong(rng):

@@ -81,7 +81,7 @@ from graphslam.evaluate.refined import (
 from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.evaluate.trust import nonlinearity, rows_as_json
+from graphslam.evaluate.trust import pooled_nonlinearity, rows_as_json
 from graphslam.evidence.shelved import load_shelved
 from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
@@ -631,7 +631,7 @@ def _judge(
         "converged": solution.converged,
         "graph": graph_facts(back.graph, checks.classes),
         "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
-        "nonlinearity": nonlinearity([s.report for s in submaps]) if refined is None else 0.0,
+        "nonlinearity": pooled_nonlinearity([s.report for s in submaps]) if refined is None else 0.0,
     }
     if truth is not None:
         report["nees_chart"] = "group" if refined is not None or back.graph.dim == 3 else solution.chart
