@@ -23,7 +23,7 @@ export OMP_WAIT_POLICY ?= passive
 setup: $(STAMP)
 
 # What runs, draws and simulates: the demo needs no more.
-$(BASE): pyproject.toml setup.py
+$(BASE): pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing graphslam into $(VENV) (0.6 GB, half a minute or more the first time)"
 	@$(PIP) --upgrade pip

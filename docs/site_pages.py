@@ -101,15 +101,15 @@ says otherwise. What goes wrong is a `GraphSlamError`, or a [child](errors.md) o
 
 
 FRONT_ENDS = {
-    "FrontEnd": "graphslam.frontends.base",
-    "RbpfEkf": "graphslam.frontends.landmarks.rbpf_ekf",
-    "RbpfEkfConfig": "graphslam.frontends.landmarks.config",
-    "SegSlam": "graphslam.frontends.segslam.front_end",
-    "SegSlamConfig": "graphslam.frontends.segslam.config",
-    "GridFilterConfig": "graphslam.frontends.grid.config",
-    "StepConfig": "graphslam.frontends.odometry.step_config",
-    "LidarFrontEnd": "graphslam.frontends.lidar_odometry.front_end",
-    "ScanWindow": "graphslam.frontends.scan_window.front_end",
+    "FrontEnd": "graphslam_frontends.base",
+    "RbpfEkf": "graphslam_frontends.landmarks.rbpf_ekf",
+    "RbpfEkfConfig": "graphslam_frontends.landmarks.config",
+    "SegSlam": "graphslam_frontends.segslam.front_end",
+    "SegSlamConfig": "graphslam_frontends.segslam.config",
+    "GridFilterConfig": "graphslam_frontends.grid.config",
+    "StepConfig": "graphslam_frontends.odometry.step_config",
+    "LidarFrontEnd": "graphslam_frontends.lidar_odometry.front_end",
+    "ScanWindow": "graphslam_frontends.scan_window.front_end",
     "BackEndConfig": "graphslam.backend.config",
 }
 

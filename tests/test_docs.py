@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from graphslam.backend.config import BackEndConfig
-from graphslam.frontends.landmarks.config import RbpfEkfConfig
+from graphslam_frontends.landmarks.config import RbpfEkfConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(p.name for p in (ROOT / "docs").glob("*.md"))

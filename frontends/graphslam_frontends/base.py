@@ -10,10 +10,10 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import Submap
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.steps import Steps
 
 Watch: TypeAlias = Callable[[Any], None]
-"""Takes the progress of a front end, of its own kind (``segslam``: `graphslam.frontends.segslam.progress.Progress`)."""
+"""Takes the progress of a front end, of its own kind (``segslam``: `graphslam_frontends.segslam.progress.Progress`)."""
 
 
 @runtime_checkable

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.odometry.scan_use import checked_steps
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.odometry.scan_use import checked_steps
+from graphslam_frontends.odometry.steps import Steps
 
 
 @dataclass(frozen=True, slots=True)

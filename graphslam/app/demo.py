@@ -17,9 +17,9 @@ from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.segslam.progress import Progress
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
+from graphslam_frontends.segslam.progress import Progress
 
 logger = logging.getLogger(__name__)
 

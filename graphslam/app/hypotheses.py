@@ -36,7 +36,6 @@ from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
-from graphslam.frontends.segslam.front_end import SegSlam
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import read_submaps
@@ -51,6 +50,7 @@ from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import REACH_MARGIN, MapConfig, RunMap, make_run_map, solved_poses
 from graphslam.refine.config import RefineConfig
+from graphslam_frontends.segslam.front_end import SegSlam
 
 logger = logging.getLogger(__name__)
 MOST = 16

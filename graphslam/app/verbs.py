@@ -34,14 +34,14 @@ from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import make_steps
 from graphslam.join import registry as joining
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import make_steps
 
 __all__ = [
     *(
@@ -193,7 +193,7 @@ def refine_path(
         Of the base, where the refinement begins; gravity-aligned in space. By default the odometry of the log.
     steps : StepConfig or mapping, optional
         How the log becomes steps. By default what the preset of the log for ``segslam`` says of it, or else
-        :class:`~graphslam.frontends.odometry.step_config.StepConfig`.
+        :class:`~graphslam_frontends.odometry.step_config.StepConfig`.
     config : RefineConfig, optional
 
     Returns

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-@nb.njit(cache=True)
+@njit
 def _mahalanobis(vx: float, vy: float, a: float, b: float, c: float) -> tuple[float, float]:
     """``vᵀ [[a, b], [b, c]]⁻¹ v`` and the determinant."""
     det = a * c - b * b
@@ -45,7 +46,7 @@ class Accepted(NamedTuple):
     """(k,): ``Σ (d² + ln det)``."""
 
 
-@nb.njit(cache=True)
+@njit
 def joint_compatibility(
     pairings: Pairings, seeds: Index, gate: float, joint_limit: Array, persistent: bool, accepted: Accepted
 ) -> None:

@@ -23,12 +23,6 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.segslam.config import HandoverConfig
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segmap import SegMap
-from graphslam.frontends.segslam.segment import KINDS, MATCH
-from graphslam.frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.loops.candidates import TIE
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.graph_loops import GraphLoops
@@ -41,6 +35,12 @@ from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.segslam.config import HandoverConfig
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segmap import SegMap
+from graphslam_frontends.segslam.segment import KINDS, MATCH
+from graphslam_frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
 
 
 def built(

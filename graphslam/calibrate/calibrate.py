@@ -12,9 +12,9 @@ from graphslam.calibrate.windows import Seen
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LaserScans
-from graphslam.frontends.landmarks.prepare import landmark_stream
-from graphslam.frontends.odometry.recorded import RecordedErrors
-from graphslam.frontends.odometry.steps import make_steps
+from graphslam_frontends.landmarks.prepare import landmark_stream
+from graphslam_frontends.odometry.recorded import RecordedErrors
+from graphslam_frontends.odometry.steps import make_steps
 
 
 def calibrate_streams(

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, Stream, VelocityControls
-from graphslam.frontends.odometry.motion import MotionNoise, motion_stream, steering_odometry, velocity_odometry
+from graphslam_frontends.odometry.motion import MotionNoise, motion_stream, steering_odometry, velocity_odometry
 
 _LEAST = (1e-9, 1e-10)
 _MOVING = 1e-9

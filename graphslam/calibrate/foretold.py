@@ -17,7 +17,7 @@ from graphslam.calibrate.estimate import Calibration, Prediction
 from graphslam.calibrate.landmarks import smoothing_of, trimmed
 from graphslam.calibrate.smoothing import Ints, Smoothing, Window, keep_sightings
 from graphslam.calibrate.windows import Seen, make_window
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.odometry.motion import MotionNoise
 
 TRIM = 4.0
 """Sightings that are more σ off, by the larger of what is stated and what was found, count for neither."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 
-import numba
 import numpy as np
+
+from graphslam.core.jit import njit
 
 YAW_BIAS, DISTANCE_SCALE, TURN_PER_METRE, TURN_SCALE, RANGE_SCALE, RANGE_OFFSET, SENSOR_YAW = range(7)
 CONSTANTS = 7
@@ -40,13 +41,13 @@ _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
 _FAR = 1e-8  # information of where a landmark is before it is seen [1/m²]
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def wrap(a):
     """Angle in (-π, π]."""
     return math.pi - (math.pi - a) % (2.0 * math.pi)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _add(row, n, blocks):
     """Add one whitened residual row: blocks of this pose, the next one, and ``n`` border columns."""
     jp, jn, cols, vals = row
@@ -71,7 +72,7 @@ def _add(row, n, blocks):
                 S[a, b] += vals[i] * vals[j]
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _leave(at, active, A, C, S, gone):
     """Eliminate a border column that one pose alone still knows; its row goes to ``gone``. Returns the pivot."""
     D, m = C.shape
@@ -99,7 +100,7 @@ def _leave(at, active, A, C, S, gone):
     return pivot
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
     """Linearise a window, and eliminate its poses and nuisances onto the constants.
 
@@ -365,7 +366,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
     return logdet, volume
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def substitute(work, dg, d_poses, d_nuisance):
     """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
     L, X, C, _, _, gone, pivots, order, when, at = work
@@ -401,7 +402,7 @@ def substitute(work, dg, d_poses, d_nuisance):
             last -= 1
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def compose_steps(increments, start, poses):
     """Chain increments ``(n, >= 3)`` from ``start`` into ``poses`` (n, >= 3); row 0 of the increments is not read."""
     poses[0, 0], poses[0, 1], poses[0, 2] = start[0], start[1], start[2]

@@ -20,10 +20,10 @@ from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.frontends.odometry.steps import Steps
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import register
 from graphslam.registration.target import Target
+from graphslam_frontends.odometry.steps import Steps
 
 KEY = (0.4, 0.3)
 """A scan so far from the last key scan, or turned so far, is a key scan [m, rad]."""

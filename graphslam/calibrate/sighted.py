@@ -20,7 +20,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.records import SteeringControls
-from graphslam.frontends.odometry.motion import MotionNoise, motion_stream
+from graphslam_frontends.odometry.motion import MotionNoise, motion_stream
 
 SHORT, LONG = 15.0, 60.0
 """Lengths of the windows [s]."""

@@ -14,7 +14,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
-from graphslam.frontends.odometry.motion import Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoning, motion_stream
 
 LONGEST = 1.0
 """A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""

@@ -11,7 +11,7 @@ from graphslam.core.plan_view import plan_path
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry import motion
+from graphslam_frontends.odometry import motion
 
 
 def dead_reckoning(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:

@@ -15,18 +15,18 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.grid.motion import move, tilted
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.segslam.config import HandoverConfig
-from graphslam.frontends.segslam.covariance import Nees, exit_nees
-from graphslam.frontends.segslam.paths import concatenate
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
-from graphslam.frontends.segslam.segmap import MATCH, SegMap
-from graphslam.frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 from graphslam.maps.entropy import Clarity, clarity_of, placements
 from graphslam.sim.route import Route
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.motion import move, tilted
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam.config import HandoverConfig
+from graphslam_frontends.segslam.covariance import Nees, exit_nees
+from graphslam_frontends.segslam.paths import concatenate
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
+from graphslam_frontends.segslam.segmap import MATCH, SegMap
+from graphslam_frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
 
 Ints = npt.NDArray[np.int64]
 

@@ -10,7 +10,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans
-from graphslam.frontends.odometry.deskew import repeated_clouds, repeated_scans
+from graphslam_frontends.odometry.deskew import repeated_clouds, repeated_scans
 
 Scanner = LaserScans | RangeScans | PointClouds
 Mask = npt.NDArray[np.bool_]

@@ -14,7 +14,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array, se2_compose, se2_transform, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, Odometry
-from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning, motion_stream
 
 CHORD = 10.0
 """Length of the chords that are compared, in σ of a fix."""

@@ -13,8 +13,8 @@ from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, VelocityControls
-from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
-from graphslam.frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_frontends.odometry.recorded import chain
 
 Ints = npt.NDArray[np.int64]
 

@@ -13,7 +13,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
-from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
 
 APART = 1.0
 """Sightings of a landmark are compared over at least this time [s], in which a robot moves by more than the noise."""

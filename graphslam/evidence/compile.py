@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from graphslam.core.jit import without_garbage_collection
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.compact import compact
 from graphslam.evidence.first_use import COMPILING, start_compiling
 from graphslam.evidence.formats import to_dense
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.kernels import without_garbage_collection
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.octomap import read_octomap, write_octomap
 

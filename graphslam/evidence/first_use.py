@@ -1,6 +1,6 @@
 """Says that kernels are being compiled, the one time they are.
 
-Compiled code is kept on disk beside the package (or where ``NUMBA_CACHE_DIR`` says), so only the first use on a machine
+Compiled code is kept on disk (:func:`graphslam.core.jit.compiled_folder`), so only the first use on a machine
 waits; a first use that waits in silence looks like a hang.
 """
 

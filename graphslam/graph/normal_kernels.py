@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-@nb.njit(cache=True)
+@njit
 def arc_terms(d: float) -> tuple[float, float, float]:
     """``a``, ``b``, ``da/dd`` of ``V(d)⁻¹ = a I - b S`` (:mod:`graphslam.core.charts`)."""
     h = 0.5 * d
@@ -58,7 +59,7 @@ class SubmapBlocks(NamedTuple):
     """(S,)"""
 
 
-@nb.njit(cache=True)
+@njit
 def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: bool, out: SubmapBlocks) -> None:
     """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
 
@@ -171,7 +172,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
             g[g0 + c] = v
 
 
-@nb.njit(cache=True)
+@njit
 def scatter_dense(columns: Index, offset: Index, H: Array, H_offset: Index, A: Array) -> None:
     """Add every block ``H_s`` into ``A[columns_s, columns_s]``; a column of -1 belongs to the fixed first base."""
     for s in range(offset.shape[0] - 1):

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.graph.normal_kernels import arc_terms
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ class BlockMap(NamedTuple):
     value: Array
 
 
-@nb.njit(cache=True)
+@njit
 def join_blocks(
     known: BlockMap, new: BlockMap, image: Index, start: int, rounding: float, pull: Array
 ) -> tuple[Array, Index, Index, Index, Index, Array, Array, bool]:
@@ -235,7 +235,7 @@ def join_blocks(
     return out, new_width, new_ptr, new_idx[:e].copy(), new_block[:e].copy(), new_value[:k].copy(), gradient, news
 
 
-@nb.njit(cache=True)
+@njit
 def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
     """``H(X)``: the nodes of map B ``(n_b,)`` as seen from node ``start`` of the joined map at its ``values`` ``(n,)``.
 
@@ -269,7 +269,7 @@ def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: 
     return out
 
 
-@nb.njit(cache=True)
+@njit
 def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
     """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
 
@@ -408,7 +408,7 @@ def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
     return BlockMap(x, width, new_ptr, new_idx, new_block, out), gradient
 
 
-@nb.njit(cache=True)
+@njit
 def cut_into_blocks(A: Array, width: Index) -> Array:
     """A dense matrix ``(n, n)`` as row-major blocks, one row of nodes after the other ``(n²,)``."""
     out = np.empty(A.size)
@@ -425,7 +425,7 @@ def cut_into_blocks(A: Array, width: Index) -> Array:
     return out
 
 
-@nb.njit(cache=True)
+@njit
 def both_ways(width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array) -> tuple[Index, Array]:
     """Blocks that are stored once for each pair (``flip`` = 1: with the neighbour's rows) as blocks stored both ways.
 

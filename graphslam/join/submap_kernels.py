@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.graph.normal_kernels import arc_terms
 
 Array = npt.NDArray[np.float64]
@@ -20,7 +20,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-@nb.njit(cache=True)
+@njit
 def adjacency(N: int, entry_ptr: Index, entry_node: Index) -> tuple[Index, Index]:
     """Neighbours ``(N + 1,), (nb,)`` of every node, itself first: all that stands in one submap or starts it."""
     m = len(entry_ptr) - 1
@@ -72,7 +72,7 @@ def adjacency(N: int, entry_ptr: Index, entry_node: Index) -> tuple[Index, Index
     return ptr, idx
 
 
-@nb.njit(cache=True)
+@njit
 def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[Index, Index, int]:
     """Room for the block of every pair, stored once, with the rows of the node that is eliminated first.
 
@@ -104,7 +104,7 @@ def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[
     return block, flip, at
 
 
-@nb.njit(cache=True)
+@njit
 def entry_slots(
     N: int, entry_ptr: Index, entry_node: Index, pair_ptr: Index, ptr: Index, idx: Index, block: Index, flip: Index
 ) -> Index:
@@ -130,7 +130,7 @@ def entry_slots(
     return slot
 
 
-@nb.njit(cache=True)
+@njit
 def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array) -> None:
     """Residual ``H(X) - z`` of all submaps, one after the other in the order of their means (eq. 15)."""
     at = 0
@@ -154,7 +154,7 @@ def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: I
                 at += 1
 
 
-@nb.njit(cache=True)
+@njit
 def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
     """Differences ``H(X) - z`` of all submaps, in the group chart where ``group`` ``(m,)``; in place."""
     for k in range(len(row_ptr) - 1):
@@ -168,7 +168,7 @@ def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
                 r[first + i], r[first + i + 1] = a * x + b * y, a * y - b * x
 
 
-@nb.njit(cache=True)
+@njit
 def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
     """``rᵀ Ω r`` of every submap."""
     for k in range(len(row_ptr) - 1):
@@ -210,7 +210,7 @@ class Slots(NamedTuple):
     """From :func:`entry_slots`."""
 
 
-@nb.njit(cache=True)
+@njit
 def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Array, value: Array) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
@@ -360,7 +360,7 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
     return f
 
 
-@nb.njit(cache=True)
+@njit
 def to_csc(
     nodes: Index, width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array
 ) -> tuple[Index, Index, Array]:

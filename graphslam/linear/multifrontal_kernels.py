@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.linear.product_kernels import BLOCK, subtract_product
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ LARGE = 64
 """Fronts of so many rows are worked on by products of blocks."""
 
 
-@nb.njit(cache=True)
+@njit
 def _earlier(position: Index, ptr: Index, idx: Index) -> tuple[Index, Index]:
     """For every position its neighbours at earlier positions, from lists that hold each pair at least one way."""
     N = len(position)
@@ -47,7 +47,7 @@ def _earlier(position: Index, ptr: Index, idx: Index) -> tuple[Index, Index]:
     return start, out
 
 
-@nb.njit(cache=True)
+@njit
 def _tree(start: Index, earlier: Index) -> Index:
     """Elimination tree: parent position or -1 (path compression through ``ancestor``)."""
     N = len(start) - 1
@@ -65,7 +65,7 @@ def _tree(start: Index, earlier: Index) -> Index:
     return parent
 
 
-@nb.njit(cache=True)
+@njit
 def _postorder(parent: Index) -> Index:
     """Positions in postorder: children before their parent, each subtree in one piece."""
     N = len(parent)
@@ -97,7 +97,7 @@ def _postorder(parent: Index) -> Index:
     return order
 
 
-@nb.njit(cache=True)
+@njit
 def analyse(
     order: Index, width: Index, ptr: Index, idx: Index, slack: int
 ) -> tuple[Index, Index, Index, Index, Index, Index, Index, Index]:
@@ -236,7 +236,7 @@ def analyse(
     return new_order, offset, first, above, row_ptr, rows, panel_ptr, sizes
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
     """Cholesky of the columns ``first`` to ``end`` of a front with ``r`` rows, within themselves."""
     for c in range(first, end):
@@ -255,7 +255,7 @@ def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
     return 0
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _eliminate(F: Array, w: int, r: int) -> int:
     """Partial Cholesky of the first ``w`` of ``r`` columns of a front, ``F[c, i]`` = row i ≥ c of column c."""
     if r >= LARGE:
@@ -311,7 +311,7 @@ class Blocks(NamedTuple):
     """(k,)"""
 
 
-@nb.njit(cache=True)
+@njit
 def factorise(analysis: Analysis, matrix: Blocks, damping: float, L: Array) -> int:
     """Numeric factorisation of ``A + damping · diag(A)`` into the panels ``L``.
 
@@ -404,7 +404,7 @@ def factorise(analysis: Analysis, matrix: Blocks, damping: float, L: Array) -> i
     return 0
 
 
-@nb.njit(cache=True)
+@njit
 def panel_scalars(offset: Index, row_ptr: Index, rows: Index) -> tuple[Index, Index]:
     """Scalars of the rows of every panel: ``(S + 1,)`` and ``(q,)``."""
     S = len(row_ptr) - 1

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.linear.multifrontal_kernels import LARGE
 from graphslam.linear.product_kernels import BLOCK, subtract_product
 
@@ -19,7 +19,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-@nb.njit(cache=True)
+@njit
 def forward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
     """``x ← L⁻¹ x`` for ``x`` ``(n,)``; ``own`` ``(S + 1,)`` is the first scalar of every supernode."""
     for s in range(len(own) - 1):
@@ -32,7 +32,7 @@ def forward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x:
                 x[row[at + i]] -= P[c, i] * v
 
 
-@nb.njit(cache=True)
+@njit
 def backward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
     """``x ← L⁻ᵀ x`` for ``x`` ``(n,)``."""
     for s in range(len(own) - 2, -1, -1):
@@ -45,7 +45,7 @@ def backward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x
             x[own[s] + c] = v / P[c, c]
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def forward_units(
     own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
 ) -> tuple[Array, Index]:
@@ -103,7 +103,7 @@ class Panels(NamedTuple):
     L: Array
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _solve_upper(P: Array, X: Array, first: int, end: int) -> None:
     """``X ← L⁻ᵀ X`` for the columns ``first`` to ``end`` of a panel, and the same rows of ``X`` ``(w, m)``."""
     for c in range(end - 1, first - 1, -1):
@@ -116,7 +116,7 @@ def _solve_upper(P: Array, X: Array, first: int, end: int) -> None:
             X[c, i] *= inverse
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def inverse_diagonal(panels: Panels, begin: Index, width: int, most: int) -> Array:
     """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
 

@@ -6,9 +6,10 @@ over threads: the result has the same bytes whatever the number of threads.
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 
@@ -16,7 +17,7 @@ BLOCK = 64
 """Rows and columns of a block."""
 
 
-@nb.njit(cache=True)
+@njit
 def _pack(A: Array, out: Array) -> None:
     """Blocks of columns of ``A`` ``(k, n)`` one after the other, each with its rows together."""
     k, n = A.shape
@@ -29,7 +30,7 @@ def _pack(A: Array, out: Array) -> None:
             at += m
 
 
-@nb.njit(cache=True)
+@njit
 def subtract_product(A: Array, B: Array, C: Array, upper: bool) -> None:
     """``C ← C - Aᵀ B`` for ``A`` ``(k, m)``, ``B`` ``(k, n)``, ``C`` ``(m, n)``.
 

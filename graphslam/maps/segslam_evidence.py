@@ -16,9 +16,9 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.segmap import NEW, SegMap
-from graphslam.frontends.segslam.submaps import base_of
 from graphslam.maps.added import added, grid_of, own_evidence
+from graphslam_frontends.segslam.segmap import NEW, SegMap
+from graphslam_frontends.segslam.submaps import base_of
 
 
 def own_evidence_of(

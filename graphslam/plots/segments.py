@@ -14,9 +14,9 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.segslam.sampling import OPEN, MapSample, nearest_step
-from graphslam.frontends.segslam.segmap import KINDS, MATCH, SegMap
 from graphslam.plots import style
+from graphslam_frontends.segslam.sampling import OPEN, MapSample, nearest_step
+from graphslam_frontends.segslam.segmap import KINDS, MATCH, SegMap
 
 Path = Trajectory | npt.ArrayLike
 

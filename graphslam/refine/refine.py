@@ -21,7 +21,6 @@ from graphslam.core.heap import give_back
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.shelf import Slot
-from graphslam.frontends.odometry.recorded import chain
 from graphslam.graph.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
@@ -32,6 +31,7 @@ from graphslam.refine.problem import Problem, Solved, alike, held, pair_noise, p
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
 from graphslam.registration.plane_kernels import Pairs
+from graphslam_frontends.odometry.recorded import chain
 
 log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]

@@ -16,8 +16,8 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam.frontends.odometry.lasting import LastingSigmas, lasting_sigmas
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.lasting import LastingSigmas, lasting_sigmas
+from graphslam_frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"
 FIELDS: dict[str, Field] = {
@@ -79,7 +79,7 @@ class Scans:
     @classmethod
     def of(cls, steps: Steps) -> Scans:
         """Those of steps, with σ of the lasting errors that their motion states, never less
-        than :data:`~graphslam.frontends.odometry.lasting.LEAST`."""
+        than :data:`~graphslam_frontends.odometry.lasting.LEAST`."""
         odometry = steps.odometry
         if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
             odometry = replace(odometry, covariances=steps.recorded.covariances)

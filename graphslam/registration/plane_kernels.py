@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -30,7 +31,7 @@ class Pairs(NamedTuple):
     j: Index
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def fit_surfaces(
     points: Array, neighbours: Index, least: int, out_normal: Array, out_flat: Array, out_tilt: Array
 ) -> None:
@@ -85,7 +86,7 @@ def fit_surfaces(
             out_flat[k, 0], out_flat[k, 1], out_flat[k, 2] = w[0], w[0], w[1]
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def plane_residuals(pairs: Pairs, R: Array, t: Array, points: Array, normals: Array, out: Array) -> None:
     """``n_jᵀ (T_j⁻¹ T_i p - q)`` of every pair.
 
@@ -142,7 +143,7 @@ def nothing_feigned(dim: int) -> Held:
     return Held(np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)), np.zeros((0, dim - 1, dim), np.float32))
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def wrench(x: Array, n: Array, out: Array) -> None:
     """Derivative of ``nᵀ y`` by a motion about the origin of a point that is at ``x``, in the order of a tangent."""
     if len(x) == 3:
@@ -154,7 +155,7 @@ def wrench(x: Array, n: Array, out: Array) -> None:
         out[0], out[1], out[2] = n[0], n[1], x[0] * n[1] - x[1] * n[0]
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def group_information(
     pairs: Pairs,
     poses: tuple[Array, Array],
@@ -206,7 +207,7 @@ def group_information(
                         F[m, u, v] += L * J[u] * J[v]
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array) -> None:
     """A derivative by a motion about a centre, world, as one by the right tangent of a pose."""
     d = len(t)
@@ -224,7 +225,7 @@ def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array)
         out[2] = sign * (K[2] - ((t[0] - centre[0]) * K[1] - (t[1] - centre[1]) * K[0]))
 
 
-@nb.njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def plane_blocks(
     pairs: Pairs,
     poses: tuple[Array, Array],

@@ -6,11 +6,12 @@ not depend on the order of adding.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from graphslam.core.jit import njit
 
-@numba.njit(cache=True, nogil=True)
+
+@njit(nogil=True)
 def splat(cells, offsets, values, field):
     """Raise the field to ``values`` around each occupied cell: the value of the nearest one stays, for values fall with
     distance.
@@ -30,7 +31,7 @@ def splat(cells, offsets, values, field):
             field[z, y, x] = max(field[z, y, x], values[k])
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def score_block(cells, counts, steps, phases, scores):
     """Add up the field under all points, for every heading and every translation of a lattice.
 
@@ -74,7 +75,7 @@ def score_block(cells, counts, steps, phases, scores):
                         scores[a, k, j, i] += block[k, j, i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def local_maxima(weights):
     """Elements that none of their neighbours exceeds, nor equals before them; the order is that of the array.
 
@@ -110,7 +111,7 @@ def local_maxima(weights):
     return found[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def is_maximum(weights, a, k, j, i):
     """Whether no neighbour of element ``[a, k, j, i]`` exceeds it, nor equals it before it."""
     na, nz, ny, nx = weights.shape

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from graphslam.core.geometry import Array
+from graphslam.core.jit import njit
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def follow_route_kernel(
     route: Array,
     look_ahead: float,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from graphslam.core.jit import njit
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+
+@njit(nogil=True, error_model="numpy")
 def see(R, p, places, rules, first, noise, out):
     """Measured points of poses in the body frame.
 
@@ -44,7 +45,7 @@ def see(R, p, places, rules, first, noise, out):
                 m += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def correspond(rules, shared, met, last, first, a, b):
     """Measurements that correspond: with the pose before, or with the last lap that recognised the landmark.
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +31,7 @@ class Chain(NamedTuple):
     """(1,) or (N,) [1/rad²]; zero where nothing was seen."""
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _log(R, r):
     """Rotation vector of a rotation matrix, below a half turn."""
     c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -44,7 +45,7 @@ def _log(R, r):
     r[0], r[1], r[2] = k * x, k * y, k * z
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def exp(w, R):
     """Write ``Exp(w)`` to ``R (3, 3)``."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -59,7 +60,7 @@ def exp(w, R):
     R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def move(rotation, position, step, scale, rotation_out, position_out):
     """Move every pose by ``scale * step`` (N, 6); rotations are made orthonormal again to second order."""
     E = np.empty((3, 3))
@@ -82,7 +83,7 @@ def move(rotation, position, step, scale, rotation_out, position_out):
                 rotation_out[i, r, c] = 1.5 * A[r, c] - 0.5 * s
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def reckon(rotation, translation, R, p):
     """Fill ``R (N, 3, 3)`` and ``p (N, 3)`` from their first pose by the chain's increments."""
     for i in range(len(translation)):
@@ -95,7 +96,7 @@ def reckon(rotation, translation, R, p):
                 )
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def odometry_residual(chain, poses, k, r, J):
     """Residual (6,) of odometry k and the left half (6, 6) of its Jacobian with respect to pose k + 1.
 
@@ -134,7 +135,7 @@ def odometry_residual(chain, poses, k, r, J):
     return dx, dy, dz
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sandwich(X, P, Y, M, row, column):
     """Write ``Xᵀ P Y`` of three (3, 3) to a corner of ``M``."""
     for i in range(3):
@@ -145,7 +146,7 @@ def _sandwich(X, P, Y, M, row, column):
             M[row + i, column + j] = a * Y[0, j] + b * Y[1, j] + c * Y[2, j]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def linearise(chain, poses, span, blocks, diagonal, upper, g):
     """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
 
@@ -215,7 +216,7 @@ def linearise(chain, poses, span, blocks, diagonal, upper, g):
     return total
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def product(diagonal, upper, v, begin, end, out):
     """Write the product of a chain of blocks with ``v (N, 6)`` to the rows ``begin … end - 1`` of ``out``."""
     N = len(diagonal)
@@ -237,7 +238,7 @@ def product(diagonal, upper, v, begin, end, out):
                     out[i, r] += upper[i - 1, c, r] * v[i - 1, c]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _cholesky(A):
     """Lower Cholesky factor in place of a block (6, 6); False where it is not positive definite."""
     for j in range(6):
@@ -256,7 +257,7 @@ def _cholesky(A):
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _solve(L, x):
     for i in range(6):
         s = x[i]
@@ -270,7 +271,7 @@ def _solve(L, x):
         x[i] = s / L[i, i]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def solve_chain(diagonal, upper, x):
     """Solve a chain of blocks in place of ``x (N, 6)`` by elimination; ``diagonal`` and ``upper`` are used up.
 
@@ -306,7 +307,7 @@ def solve_chain(diagonal, upper, x):
     return -1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def invert_blocks(blocks, begin, end):
     """Replace blocks (6, 6) by their inverses; returns the first that is not positive definite, or -1."""
     L = np.empty((6, 6))
@@ -324,7 +325,7 @@ def invert_blocks(blocks, begin, end):
     return -1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def multiply_blocks(blocks, v, begin, end, out):
     """Write ``blocks[i] v[i]`` to the rows ``begin … end - 1`` of ``out (N, 6)``."""
     for i in range(begin, end):
@@ -335,7 +336,7 @@ def multiply_blocks(blocks, v, begin, end, out):
             out[i, r] = s
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def forward_pass(sightings, chain_poses, span, rules, start_seen, D, b, out):
     """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
 
@@ -517,7 +518,7 @@ def forward_pass(sightings, chain_poses, span, rules, start_seen, D, b, out):
     return tied, refused
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
     """Add ``Jᵀ W J``, J = [[q]× , -I], to a block (6, 6)."""
     al, be = weight

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 Array = npt.NDArray[np.float64]
@@ -48,7 +48,7 @@ class Waiting(NamedTuple):
     """(2,): entries that were ever used; first free one, -1."""
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def make_waiting(landmarks):
     """Nothing waits."""
     ends = np.zeros(2, np.int64)
@@ -63,7 +63,7 @@ def make_waiting(landmarks):
     )
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def make_table(capacity):
     """An empty table for ``capacity`` blocks."""
     size = 16
@@ -77,7 +77,7 @@ def make_table(capacity):
     )
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _find(table, key):
     """Place of a block; it is made where there is none."""
     mask = len(table.key) - 1
@@ -92,7 +92,7 @@ def _find(table, key):
     return table.place[at]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _grown(table):
     """The same table with twice the room."""
     n = table.filled[0]
@@ -107,7 +107,7 @@ def _grown(table):
     return big
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keys_of(table):
     """Keys in the order of the blocks."""
     keys = np.empty(table.filled[0], np.int64)
@@ -117,7 +117,7 @@ def keys_of(table):
     return keys
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _sum_interval(sightings, poses, interval, slot, ids, sums):
     """Sums over the poses of one interval, a row for each landmark seen there; ``slot`` is zero before.
 
@@ -190,7 +190,7 @@ def _sum_interval(sightings, poses, interval, slot, ids, sums):
     return n
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _interval(c, k, N):
     """Poses of interval c: its keyframes and the end of its poses."""
     a = c * k
@@ -198,7 +198,7 @@ def _interval(c, k, N):
     return a, b, N if b == N - 1 else b
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _most(first, k, N, begin, end):
     """Most measurements of an interval ``begin … end - 1``."""
     most = 1
@@ -208,7 +208,7 @@ def _most(first, k, N, begin, end):
     return most
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _weighted(S, qx, qy, qz, X):
     """``X = S G`` (3, 6), G = [[q]×, -I], of a symmetric S (six figures)."""
     for r in range(3):
@@ -224,7 +224,7 @@ def _weighted(S, qx, qy, qz, X):
         X[r, 3], X[r, 4], X[r, 5] = -a, -b, -c
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_lever(qx, qy, qz, X, sign, B):
     """``B += sign · Gᵀ X``, G = [[q]×, -I]."""
     for c in range(6):
@@ -237,7 +237,7 @@ def _add_lever(qx, qy, qz, X, sign, B):
         B[5, c] -= z
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
     """Add the measurements' diagonal blocks of ``Pᵀ S P`` of the keyframes ``begin … end - 1`` to ``out (K, 6, 6)``.
 
@@ -310,7 +310,7 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
         n0 = n1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table):
     """Add the blocks of ``Pᵀ S P`` that come from measurements to ``table``, interval after interval.
 
@@ -424,7 +424,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
     return Waiting(slot, head, frame, after, kept, ends), table
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _subtract(X, Y, B):
     """``B -= Xᵀ Y`` of two (3, 6)."""
     for r in range(6):
@@ -433,7 +433,7 @@ def _subtract(X, Y, B):
             B[r, c] -= x * Y[0, c] + y * Y[1, c] + z * Y[2, c]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _longer(frame, after, kept, room):
     n = len(frame)
     f, a, s = np.empty(room, np.int32), np.empty(room, np.int32), np.empty((room, 6))
@@ -441,14 +441,14 @@ def _longer(frame, after, kept, room):
     return f, a, s
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _doubled(values):
     out = np.empty(2 * len(values), np.int32)
     out[: len(values)] = values
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _carried(A, left, right, h, T):
     """``T = h · Cₗᵀ A Cᵣ`` with C = [[I, 0], [-[d]×, I]] for the offsets ``left`` and ``right`` from a keyframe."""
     M = np.empty((6, 6))
@@ -468,7 +468,7 @@ def _carried(A, left, right, h, T):
         T[3, c2], T[4, c2], T[5, c2] = a, b, c
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keyframe_chain(position, diagonal, upper, k, out_diagonal, out_upper):
     """Add ``Pᵀ A P`` of a chain of blocks to ``out_diagonal (K, 6, 6)`` and ``out_upper (K - 1, 6, 6)``."""
     N, K = len(position), len(out_diagonal)
@@ -502,14 +502,14 @@ def keyframe_chain(position, diagonal, upper, k, out_diagonal, out_upper):
                     out_upper[c, r, s] += T[s, r]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _both(T, B):
     for r in range(6):
         for c in range(6):
             B[r, c] += T[r, c] + T[c, r]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def restrict(position, k, r, out):
     """Write ``Pᵀ r`` to ``out (K, 6)``."""
     N, K = len(position), len(out)
@@ -535,7 +535,7 @@ def restrict(position, k, r, out):
                 o[5] += g * r[i, 5]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def prolong(position, k, x, out):
     """Add ``P x`` of ``x (K, 6)`` to ``out (N, 6)``."""
     N, K = len(position), len(x)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from graphslam.core.jit import njit
 
-@nb.njit(cache=True, nogil=True)
+
+@njit(nogil=True)
 def _root(parent, i):
     """First member of the set of ``i``; every other node on the way is hung one step higher (path halving)."""
     while parent[i] != i:
@@ -15,7 +16,7 @@ def _root(parent, i):
     return i
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def join_pairs(parent, a, b):
     """Join the sets of ``a[k]`` and ``b[k]``; the smaller index becomes the root, so no parent is above its child.
 
@@ -36,7 +37,7 @@ def join_pairs(parent, a, b):
     return joined
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def number_sets(parent):
     """Replace every parent by the number of its set; sets are numbered by their first members. Returns their count.
 
@@ -52,7 +53,7 @@ def number_sets(parent):
     return n
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def renumber(label, table):
     """Number labels anew by their first appearance; ``table`` is -1 for each old label. Returns how many there are."""
     n = 0

@@ -14,9 +14,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class Poses(NamedTuple):
     """(N, 3) [m]"""
 
 
-@nb.njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@njit(nogil=True, inline="always", error_model="numpy")
 def _seen(R, x, y, z, along, across):
     """``s = R z`` and the two figures of its weight: W = α I + β s sᵀ."""
     r2 = x * x + y * y + z * z
@@ -62,19 +63,19 @@ def _seen(R, x, y, z, along, across):
     )
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _nine(R, i):
     return (R[i, 0, 0], R[i, 0, 1], R[i, 0, 2], R[i, 1, 0], R[i, 1, 1], R[i, 1, 2], R[i, 2, 0], R[i, 2, 1], R[i, 2, 2])
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_sightings(landmark, out):
     """Add one to ``out (L,)`` for each sighting."""
     for m in range(len(landmark)):
         out[landmark[m]] += 1
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def sum_landmarks(sightings, poses, begin, end, D, b):
     """Add ``Σ W`` (xx, xy, xz, yy, yz, zz) to ``D (L, 6)`` and ``Σ W (p + s)`` to ``b (L, 3)``."""
     for i in range(begin, end):
@@ -99,7 +100,7 @@ def sum_landmarks(sightings, poses, begin, end, D, b):
             b[j, 2] += al * az + d * sz
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def solve_landmarks(D, b, begin, end):
     """Replace ``D`` by its inverse and ``b`` by ``l = D⁻¹ b``, for landmarks ``begin … end - 1``."""
     for j in range(begin, end):
@@ -115,7 +116,7 @@ def solve_landmarks(D, b, begin, end):
         b[j, 2] = D[j, 2] * x + D[j, 4] * y + D[j, 5] * z
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def gradient(sightings, poses, l, begin, end, g, objective):
     """Write half the objective's gradient of each pose to ``g (N, 6)`` and ``Σ eᵀ W e`` to ``objective (N,)``."""
     for i in range(begin, end):
@@ -143,7 +144,7 @@ def gradient(sightings, poses, l, begin, end, g, objective):
         objective[i] = J
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def landmark_chi2(sightings, poses, l, begin, end, out, count):
     """Add ``eᵀ W e`` of each measurement to its landmark in ``out (L,)``, and one to ``count (L,)``."""
     for i in range(begin, end):
@@ -161,7 +162,7 @@ def landmark_chi2(sightings, poses, l, begin, end, out, count):
             count[j] += 1
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def diagonal(sightings, poses, landmarks, begin, end, blocks):
     """Add the measurements' diagonal blocks of the Schur complement to ``blocks (N, 6, 6)``.
 
@@ -214,7 +215,7 @@ def diagonal(sightings, poses, landmarks, begin, end, blocks):
                     blocks[i, 3 + r, 3 + k2] += C[r, k2]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def gather(sightings, poses, l, v, begin, end, t):
     """First pass of the product: add ``Σ W (q × w - u)`` to ``t (L, 3)``."""
     for i in range(begin, end):
@@ -237,7 +238,7 @@ def gather(sightings, poses, l, v, begin, end, t):
             t[j, 2] += al * az + d * sz
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def settle(Di, t, begin, end):
     """``t ← D⁻¹ t`` for landmarks ``begin … end - 1``."""
     for j in range(begin, end):
@@ -247,7 +248,7 @@ def settle(Di, t, begin, end):
         t[j, 2] = Di[j, 2] * x + Di[j, 4] * y + Di[j, 5] * z
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def scatter(sightings, poses, landmarks, v, begin, end, out):
     """Second pass: add ``f × q`` and ``-f``, f = W (q × w - u - t), to ``out (N, 6)``.
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import njit
 from graphslam.skeleton.chain_kernels import Array, _cholesky, _log, _solve
 from graphslam.skeleton.landmark_kernels import _nine
 
@@ -39,7 +39,7 @@ class Links(NamedTuple):
     """Its inverse."""
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _residual(links, e, turns, way, scratch, r):
     """Write the residual (6,) of link e between two rotations, p_j - p_i = ``way`` in the world."""
     Ra, Rb = turns
@@ -58,7 +58,7 @@ def _residual(links, e, turns, way, scratch, r):
         r[3 + i] = Ra[i] * dx + Ra[3 + i] * dy + Ra[6 + i] * dz - links.translation[e, i]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _turned(Rb, r, B):
     """Write ``R_j J_r(r)`` (3, 3), J_r the right Jacobian of the rotation residual: a turn of the body in the world."""
     x, y, z = r[0], r[1], r[2]
@@ -80,7 +80,7 @@ def _turned(Rb, r, B):
         B[i, 2] = u * j02 + v * j12 + w * j22
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def join_links(links, poses, covariance, misfit):
     """Join the links of each segment to one.
 
@@ -182,7 +182,7 @@ def join_links(links, poses, covariance, misfit):
     return total
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def tie_ends(ends, position, covariance, misfit, place, blocks, g):
     """Add joined links to the matrix and half the gradient of the poses at their ends.
 
@@ -261,7 +261,7 @@ def tie_ends(ends, position, covariance, misfit, place, blocks, g):
     return energy, -1
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def follow_links(links, poses, information, misfit, x):
     """Fill the steps ``x (N, 6)`` of all poses inside segments from those of their ends.
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from graphslam.core.jit import njit
 from graphslam.skeleton.coarse_kernels import _add_lever, _find, _weighted
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def order_by_landmark(landmark, first, ptr, pose, measurement):
     """Sightings of each landmark: ``ptr (L + 1,)``, poses and measurements ``(M,)`` in pose order; out."""
     for m in range(len(landmark)):
@@ -24,7 +24,7 @@ def order_by_landmark(landmark, first, ptr, pose, measurement):
             fill[landmark[m]] = at + 1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_blocks(landmark, first, ptr, pose, step, mark):
     """Blocks right of the diagonal, the diagonal included, in the rows of every ``step``-th pose."""
     total = 0
@@ -38,7 +38,7 @@ def count_blocks(landmark, first, ptr, pose, step, mark):
     return total
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def eliminate(sightings, poses, landmarks, order, table):
     """Integrate every landmark out: ``Σ Jᵀ W J`` on the diagonal, less the pairs of its sightings, into ``table``.
 

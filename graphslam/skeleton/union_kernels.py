@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from graphslam.core.jit import njit
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_passes(landmark, first, gap, last, passes):
     """``passes[j]``: how often landmark j came into view after ``gap`` poses or more without it."""
     for i in range(len(first) - 1):
@@ -19,7 +19,7 @@ def count_passes(landmark, first, gap, last, passes):
             last[j] = i
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def worst_in_view(landmark, first, ratio, out):
     """``out[j]``: the largest ``ratio (L,)`` of all landmarks that some pose sees together with landmark j."""
     for i in range(len(first) - 1):
@@ -31,7 +31,7 @@ def worst_in_view(landmark, first, ratio, out):
                 out[landmark[m]] = max(out[landmark[m]], worst)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def split_labels(sightings, poses, wrong, rules, landmark, n):
     """Give every track of a wrong landmark a number of its own, from ``n`` on. Returns the count of all labels.
 

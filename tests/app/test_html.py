@@ -19,7 +19,6 @@ import pandas as pd
 import pytest
 
 import graphslam
-import graphslam.frontends
 from graphslam.app.report.report import Report
 from graphslam.app.run.run import Run
 from graphslam.app.run.without_truth import WithoutTruth

@@ -18,13 +18,13 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segmap import MATCH, NEW
-from graphslam.frontends.segslam.segslam import run_segslam
-from graphslam.frontends.segslam.submaps import sampled_chain, settled_chain
 from graphslam.maps.alternatives import Alternative, choose
 from graphslam.maps.pieces import DivisionConfig
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segmap import MATCH, NEW
+from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_frontends.segslam.submaps import sampled_chain, settled_chain
 
 COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
 CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)

@@ -28,9 +28,6 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.views import view_of
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.segslam.segslam import run_segslam
-from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
@@ -40,6 +37,9 @@ from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import ChainRelative, Places, places_of
 from graphslam.loops.witness import Witness
 from graphslam.registration.place_descriptor import describe, join, similarity
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
 from tests.reference.loop_network import LoopNetwork
 from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops
 

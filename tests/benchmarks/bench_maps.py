@@ -37,11 +37,6 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.compact import pieces_of
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import Steps, make_steps
-from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig, settled
-from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.catalog import load
 from graphslam.maps.fuse import FusedMap, fuse
 from graphslam.maps.pieces import DivisionConfig, PieceId
@@ -50,6 +45,11 @@ from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.sim.garage import garage
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, settled
+from graphslam_frontends.segslam.segslam import run_segslam
 
 ALL_POINTS = 1_000_000
 NODE_EVERY = 3.0

@@ -21,11 +21,11 @@ import graphslam as gs
 from graphslam.core.geometry import align_se2, se2_between, se2_compose, se2_inverse, se2_transform
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig, StoppingConfig
-from graphslam.frontends.landmarks.prepare import prepare
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam.frontends.landmarks.rivals import SubmapProblem
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig, StoppingConfig
+from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.rivals import SubmapProblem
+from graphslam_frontends.odometry.motion import MotionNoise
 
 FLOORS = {"floor_position": 1e-3, "floor_heading": 1e-4}
 

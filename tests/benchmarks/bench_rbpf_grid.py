@@ -26,9 +26,9 @@ from graphslam.core.se3 import (
     se3_transform,
 )
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.rbpf_grid import run_rbpf
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.rbpf_grid import run_rbpf
+from graphslam_frontends.odometry.steps import Steps
 from tests.benchmarks.evidence_scenes import SPIN_RATE, tunnel
 
 PER_STEP = 15

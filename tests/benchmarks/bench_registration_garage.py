@@ -16,13 +16,13 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.odometry.steps import Steps, make_steps
 from graphslam.registration.register import Registration, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.garage import garage
+from graphslam_frontends.odometry.steps import Steps, make_steps
 
 NAMES = ("fitness", "fitness_upright", "fitness_known", "degeneracy", "tilt")
 

@@ -22,10 +22,10 @@ from graphslam.core.config import build
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import align_se3, se3_transform
-from graphslam.frontends.odometry.steps import Steps, make_steps
-from graphslam.frontends.scan_window.exits import relative_covariance
-from graphslam.frontends.scan_window.front_end import ScanWindowFrontEndConfig
-from graphslam.frontends.scan_window.tracker import track
+from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.front_end import ScanWindowFrontEndConfig
+from graphslam_frontends.scan_window.tracker import track
 
 LENGTH = 30.0
 """Way of the pieces whose exits are judged [m]."""

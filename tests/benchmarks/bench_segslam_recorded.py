@@ -28,15 +28,15 @@ from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.rbpf_grid import run_rbpf
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.steps import Steps, make_steps
-from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segslam import run_segslam
 from graphslam.io.catalog import load
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save
+from graphslam_frontends.grid.rbpf_grid import run_rbpf
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segslam import run_segslam
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",

@@ -22,8 +22,8 @@ from graphslam.calibrate.smoothing import CONSTANTS
 from graphslam.calibrate.windows import Seen, stretches
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.frontends.odometry.motion import MotionNoise
 from graphslam.io.log_store import save_log
+from graphslam_frontends.odometry.motion import MotionNoise
 
 ROBOT = draw_robot(3)
 OPTIONS = {

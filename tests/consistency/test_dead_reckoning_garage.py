@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.frontends.odometry.dead_reckoning import reckon
-from graphslam.frontends.odometry.drift import calibrate, fit_drift
-from graphslam.frontends.odometry.reckoned import Reckoned, level
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.garage import garage
+from graphslam_frontends.odometry.dead_reckoning import reckon
+from graphslam_frontends.odometry.drift import calibrate, fit_drift
+from graphslam_frontends.odometry.reckoned import Reckoned, level
 
 Drive = tuple[Reckoned, np.ndarray, np.ndarray]
 

@@ -13,12 +13,12 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
 from graphslam.evaluate.without_truth import class_consistency, correlated_dof, two_sided
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
 from graphslam.graph.gps import GpsConfig, arm_of
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 from graphslam.solve.registry import make_solver
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
 from tests.reference.graph_chain import make_chain
 from tests.reference.hat_matrix import class_figures, numeric_jacobian
 

@@ -16,7 +16,7 @@ from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, LandmarkObservations, Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.odometry.motion import MotionNoise
 
 Inject = Callable[[SensorLog], SensorLog]
 

@@ -53,7 +53,6 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.octomap import read_octomap, write_octomap
-from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.io.bags import read_bag
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
@@ -84,6 +83,7 @@ from graphslam.io.victoria_park_published import (
 )
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
+from graphslam_frontends.odometry.lasting import LEAST
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap, write_ros1, write_ros2
 

@@ -13,7 +13,7 @@ from graphslam.core.geometry import Array, se2_between
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import quat_rotate
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.steps import Steps
 
 HALL = np.array([[-2.07, -2.11, -0.07], [14.06, 10.09, 2.68]])
 """Low and high corner of the hall; rays end at its walls from inside. No wall lies between two voxels."""
@@ -140,7 +140,7 @@ def ring(
     times = 0.4 * np.arange(n)
     tilt = None
     if dim == 3 and tilt_sigma > 0:
-        from graphslam.frontends.grid.motion import tilts
+        from graphslam_frontends.grid.motion import tilts
 
         tilt = tilts(truth) + tilt_sigma * rng.normal(size=(n, 2))
     return Steps(

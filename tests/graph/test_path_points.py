@@ -16,13 +16,13 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import gps_innovations
-from graphslam.frontends.landmarks.smoothing_kernels import Evidence, path_covariances, smoothed_covariances
 from graphslam.graph.factors.landmark_submap import PathRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from graphslam_frontends.landmarks.smoothing_kernels import Evidence, path_covariances, smoothed_covariances
 
 FRAME = np.array([50.0, -20.0, 0.6])
 

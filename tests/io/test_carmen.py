@@ -11,9 +11,9 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.core.log import DropCounter
-from graphslam.frontends.odometry.steps import StepConfig, make_steps
 from graphslam.io.carmen import bearings, mend_stamps, read_carmen
 from graphslam.io.catalog import load
+from graphslam_frontends.odometry.steps import StepConfig, make_steps
 
 OFFSET = np.array([-0.04, 0.0, 0.0])
 

@@ -10,9 +10,9 @@ import scipy.io
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
-from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
 from graphslam.io.catalog import load
 from graphslam.io.plaza import read_plaza
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
 
 T = 10.0 + 0.2 * np.arange(1, 31)
 D, A = np.linspace(0.1, 0.4, 30), 0.02 * np.cos(np.arange(30))

@@ -11,16 +11,16 @@ from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.odometry.steps import Steps, make_steps
-from graphslam.frontends.segslam.front_end import settled
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segslam import run_segslam
-from graphslam.frontends.segslam.submaps import settled_chain
 from graphslam.maps.added import own_evidence
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
+from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.segslam.front_end import settled
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_frontends.segslam.submaps import settled_chain
 from tests.benchmarks.bench_maps import insert, scene, submaps_of
 from tests.reference.small_maps import same_map
 

@@ -9,10 +9,10 @@ import pytest
 
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.steps import make_steps
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import divide_submaps
+from graphslam_frontends.odometry.steps import make_steps
 from tests.benchmarks.bench_maps import bodies_of, insert, scene, submaps_of
 
 

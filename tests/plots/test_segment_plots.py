@@ -8,9 +8,6 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose
-from graphslam.frontends.segslam.paths import concatenate
-from graphslam.frontends.segslam.sampling import grow, root_of_segment
-from graphslam.frontends.segslam.segmap import Entry, SegMap
 from graphslam.plots.segments import (
     Tie,
     plot_entropies,
@@ -20,6 +17,9 @@ from graphslam.plots.segments import (
     running_maximum,
     sample_paths,
 )
+from graphslam_frontends.segslam.paths import concatenate
+from graphslam_frontends.segslam.sampling import grow, root_of_segment
+from graphslam_frontends.segslam.segmap import Entry, SegMap
 from tests.reference.segmap_twin import flat_grid, match_entry, small_segmap, straight
 
 

@@ -27,7 +27,7 @@ from graphslam.core.geometry import (
 from graphslam.core.log import SensorLog
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.motion import MotionNoise, steering_odometry
+from graphslam_frontends.odometry.motion import MotionNoise, steering_odometry
 
 
 @dataclass

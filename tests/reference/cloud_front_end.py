@@ -15,8 +15,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -90,8 +90,8 @@ def drive(layout: str, seed: int) -> Iterator[tuple[int, bool, Array, Array, Arr
 def segment_ends(result: object, truth: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Path, error and spread of every settled segment."""
     from graphslam.core.poses import level
-    from graphslam.frontends.segslam.covariance import exit_covariance
-    from graphslam.frontends.segslam.submaps import base_of, exits_of_interval, settled_chain
+    from graphslam_frontends.segslam.covariance import exit_covariance
+    from graphslam_frontends.segslam.submaps import base_of, exits_of_interval, settled_chain
 
     m = result.segmap  # type: ignore[attr-defined]
     g = m.group

@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.config import GridFilterConfig
 
 
 def probability(grid: EvidenceGrid, point: Array, unknown: float) -> float:

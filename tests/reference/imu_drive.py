@@ -11,7 +11,7 @@ from graphslam.core import se3
 from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.records import VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise
+from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 
 STATED = ImuNoise(
     gyro=5e-4,

@@ -9,8 +9,8 @@ import numpy as np
 
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.frontends.segslam.sampling import Root, grow_by, probabilities
-from graphslam.frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
+from graphslam_frontends.segslam.sampling import Root, grow_by, probabilities
+from graphslam_frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
 
 
 class PlainSegMap:

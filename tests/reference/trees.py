@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
-from graphslam.frontends.detectors.trees import TreeDetectorConfig
+from graphslam_frontends.detectors.trees import TreeDetectorConfig
 
 
 @dataclass

@@ -11,13 +11,13 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.records import LaserScans, Odometry
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import make_steps
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import refine
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Cloud
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import make_steps
 from tests.calibrate.room import drive, scan
 
 

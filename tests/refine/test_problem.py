@@ -10,12 +10,12 @@ from scipy.linalg import eigh
 
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.lasting import LEAST
 from graphslam.refine.motion import MotionModel
 from graphslam.refine.problem import FEIGNED, Problem, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
 from graphslam.registration.plane_kernels import Pairs
+from graphslam_frontends.odometry.lasting import LEAST
 
 EPS = 1e-6
 

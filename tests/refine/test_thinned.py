@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.lasting import LastingSigmas
 from graphslam.refine.nodes import thinned
 from graphslam.refine.scans import Scans
+from graphslam_frontends.odometry.lasting import LastingSigmas
 
 
 @pytest.mark.parametrize("most", [1, 7, 40, 99])

@@ -9,12 +9,12 @@ import numpy as np
 from graphslam.app.studies.segslam_trial import QUICK
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.steps import make_steps
 from graphslam.refine.scans import Scans
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.steps import make_steps
 
 
 @lru_cache(maxsize=32)

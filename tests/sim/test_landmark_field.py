@@ -16,13 +16,13 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, se2_l
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, LandmarkObservations, SteeringControls
 from graphslam.evaluate.consistency import joint_nees, pose_error
-from graphslam.frontends.odometry.motion import MotionNoise, steering_odometry
 from graphslam.sim.landmark_field import (
     PRESETS,
     LandmarkFieldConfig,
     landmark_field_preset,
     simulate_landmark_field,
 )
+from graphslam_frontends.odometry.motion import MotionNoise, steering_odometry
 from tests.reference.batch_slam import batch_slam
 from tests.sim.normality import P_VALUE, assert_normal
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from graphslam.core.jit import njit
 
 # columns of the result
 SCAN, RANGE, BEARING, RADIUS, VAR_RANGE, VAR_BEARING, BEAMS, FITTED = range(8)
@@ -21,7 +22,7 @@ _FIT_GATE = 9.0
 _MAX_ITERATIONS = 20
 
 
-@njit(cache=True)
+@njit
 def _clusters(r, angles, max_range, jump, missing, first, last, ends):  # type: ignore[no-untyped-def]
     """Split the returns of one scan; fills first/last beam and the end points (x0, y0, x1, y1) of each cluster."""
     count = 0
@@ -41,7 +42,7 @@ def _clusters(r, angles, max_range, jump, missing, first, last, ends):  # type: 
     return count
 
 
-@njit(cache=True)
+@njit
 def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
     """Is every other cluster farther than ``distance``: its last point from my first, its first from my last?"""
     d2 = distance * distance
@@ -57,7 +58,7 @@ def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@njit
 def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
     """Mean range of the one or two returns nearest to the middle of beams a..b, and how many they are."""
     best, total, used = 2 * (b - a) + 2, 0.0, 0
@@ -73,7 +74,7 @@ def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
     return total / used, used
 
 
-@njit(cache=True)
+@njit
 def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-untyped-def]
     """Weighted least squares of (rho, bearing, radius) on both edge angles and the ranges of the inner beams.
 
@@ -155,7 +156,7 @@ def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-u
     return False
 
 
-@njit(cache=True)
+@njit
 def detect(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-untyped-def]
     """Trunks of all scans.
 
@@ -169,7 +170,7 @@ def detect(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-
         In the order of the ``P_`` constants.
     mean_g, var_g : (m + 1,)
         Mean and variance, by the number of beams on the trunk, of the half chord behind the middle beam, in units of
-        the step (see :mod:`graphslam.frontends.detectors.trees`).
+        the step (see :mod:`graphslam_frontends.detectors.trees`).
 
     Returns
     -------

@@ -37,7 +37,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.records import LandmarkObservations, LaserScans
-from graphslam.frontends.detectors import kernels
+from graphslam_frontends.detectors import kernels
 
 Ints = npt.NDArray[np.int64]
 

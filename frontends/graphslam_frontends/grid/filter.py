@@ -26,15 +26,15 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport
-from graphslam.frontends.grid.ancestry import Ancestry
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
-from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam.frontends.grid.upright import upright_beams
-from graphslam.frontends.grid.weights import informed, inherit, spread
+from graphslam_frontends.grid.ancestry import Ancestry
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
+from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam_frontends.grid.upright import upright_beams
+from graphslam_frontends.grid.weights import informed, inherit, spread
 
 if TYPE_CHECKING:
-    from graphslam.frontends.odometry.steps import Steps
+    from graphslam_frontends.odometry.steps import Steps
 
 Ints = npt.NDArray[np.int64]
 
@@ -145,7 +145,7 @@ class GridFilter:
     pool : GridPool, optional
         Storage of the maps; default one of its own.
     prune_every : int
-        See :class:`~graphslam.frontends.grid.ancestry.Ancestry`.
+        See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
 
     Raises
     ------

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
-from graphslam.frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.config import GridFilterConfig
 
 
 def motion_covariance(increment: Array, covariance: Array, config: GridFilterConfig) -> Array:

@@ -24,21 +24,21 @@ from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import Watch
-from graphslam.frontends.grid.ancestry import Ancestry
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter import GridFilter, GridParticles, Tally
-from graphslam.frontends.grid.filter_drift import Passed, between_knots
-from graphslam.frontends.odometry.drift import DriftModel
-from graphslam.frontends.odometry.scan_use import (
+from graphslam_frontends.base import Watch
+from graphslam_frontends.grid.ancestry import Ancestry
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter import GridFilter, GridParticles, Tally
+from graphslam_frontends.grid.filter_drift import Passed, between_knots
+from graphslam_frontends.odometry.drift import DriftModel
+from graphslam_frontends.odometry.scan_use import (
     reckoned_covariance,
     uncorrected,
     uncorrected_covariance,
     with_findings,
 )
-from graphslam.frontends.odometry.steps import StepConfig, Steps
-from graphslam.frontends.segslam.covariance import Drift, exit_covariance
-from graphslam.frontends.stepwise import StepwiseFrontEnd
+from graphslam_frontends.odometry.steps import StepConfig, Steps
+from graphslam_frontends.segslam.covariance import Drift, exit_covariance
+from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 KNOTS = 33
 """Places along the path at which errors that are passed on are worked out; between them they are interpolated."""
@@ -211,7 +211,7 @@ def rbpf_submap(
         Factor on the drift model's covariance.
     steps : Steps, optional
         With them, dead reckoning's own covariance is added where no scan corrects it
-        (:mod:`graphslam.frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
+        (:mod:`graphslam_frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
     passed : Passed, optional
         That share; default none.
 
@@ -310,7 +310,7 @@ class RbpfGrid(StepwiseFrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        """See :class:`graphslam_frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
             steps = self.steps(log, drops=drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))

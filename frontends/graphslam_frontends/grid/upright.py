@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.registration.plane_kernels import fit_surfaces
 
 if TYPE_CHECKING:
-    from graphslam.frontends.odometry.steps import Steps
+    from graphslam_frontends.odometry.steps import Steps
 
 Flags = npt.NDArray[np.bool_]
 

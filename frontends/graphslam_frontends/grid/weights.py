@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.frontends.grid.particles import normalise_log_weights
+from graphslam_frontends.grid.particles import normalise_log_weights
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]

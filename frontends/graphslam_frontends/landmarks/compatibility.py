@@ -17,7 +17,7 @@ from scipy import stats
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.frontends.landmarks.compatibility_kernels import (
+from graphslam_frontends.landmarks.compatibility_kernels import (
     Joint,
     Pairs,
     candidates_kernel,

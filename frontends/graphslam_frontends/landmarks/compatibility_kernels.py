@@ -1,6 +1,6 @@
 """Compiled data association of one scan against a joint Gaussian: candidates, nearest neighbour, joint compatibility.
 
-All work on the active state of :mod:`graphslam.frontends.landmarks.ekf_kernels`. Gates come as an array over the
+All work on the active state of :mod:`graphslam_frontends.landmarks.ekf_kernels`. Gates come as an array over the
 degrees of
 freedom, so that an observation without bearing is judged with one. Twin: ``tests/reference/ekf_slam.py``.
 """
@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from graphslam.frontends.landmarks.ekf_kernels import linearise
-from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam.core.jit import njit
+from graphslam_frontends.landmarks.ekf_kernels import linearise
+from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
 
 
 class Joint(NamedTuple):
@@ -44,7 +44,7 @@ class Counts(NamedTuple):
     born: Any
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
     """Individually compatible pairings, grouped by observation and sorted by distance within.
 
@@ -97,7 +97,7 @@ def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
     return count
 
 
-@numba.njit(cache=True)
+@njit
 def nearest_kernel(pairs, pair_o, pair_k, cost, match):
     """Greedy gated nearest neighbour: the cheapest pair first, each observation and each landmark at most once."""
     match[:] = -1
@@ -115,7 +115,7 @@ def nearest_kernel(pairs, pair_o, pair_k, cost, match):
                 used[i] = True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     """Joint compatibility by branch and bound (Neira & Tardós 2001): most pairings, then least joint distance².
 
@@ -217,13 +217,13 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     return _hand_over(best_match, match, nodes, 0, best_d2)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _hand_over(best_match, match, nodes, capped, d2):
     match[:] = best_match
     return nodes, capped, d2 if d2 < np.inf else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cross(P, a, ca, b, cb):
     """``a P bᵀ`` for two rows over [pose, landmark at column ca or cb]."""
     total = 0.0
@@ -233,7 +233,7 @@ def _cross(P, a, ca, b, cb):
     return total
 
 
-@numba.njit(cache=True)
+@njit
 def misses_kernel(slots, scan, at, polar, counts, limits, dropped):
     """Provisional landmarks that should have been seen and were not: counts misses, marks those that go.
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.frontends.detectors.trees import TreeDetectorConfig
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.detectors.trees import TreeDetectorConfig
+from graphslam_frontends.odometry.motion import MotionNoise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +128,7 @@ class FilterConfig:
     """Scans up to this long before the first control are used, with that control held backwards [s]."""
     longest_gap: float = 60.0
     """Longest time without a record of the motion that is bridged [s]
-    (:mod:`graphslam.frontends.odometry.motion_gaps`)."""
+    (:mod:`graphslam_frontends.odometry.motion_gaps`)."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None

@@ -14,10 +14,10 @@ from scipy.linalg.blas import dsyrk
 
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array
-from graphslam.frontends.landmarks.compatibility import gates_by_dof, pair
-from graphslam.frontends.landmarks.compatibility_kernels import Counts, misses_kernel
-from graphslam.frontends.landmarks.ekf_config import EkfFilterConfig
-from graphslam.frontends.landmarks.ekf_kernels import (
+from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair
+from graphslam_frontends.landmarks.compatibility_kernels import Counts, misses_kernel
+from graphslam_frontends.landmarks.ekf_config import EkfFilterConfig
+from graphslam_frontends.landmarks.ekf_kernels import (
     Active,
     Now,
     augment_kernel,

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam.core.jit import njit
+from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
 
 
 class Active(NamedTuple):
@@ -44,7 +44,7 @@ class Now(NamedTuple):
     """(N,): what B has moved since it was folded in."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def predict_kernel(x, P, n, Phi, n0, u, Q):
     """``x ← x ∘ u``; u (3,) with right-tangent covariance Q (3, 3). Changes the rows and columns of the pose only."""
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -77,7 +77,7 @@ def predict_kernel(x, P, n, Phi, n0, u, Q):
             P[j, i] = P[i, j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def linearise(x, k, row, sensor, h, H, nu):
     """Jacobian rows H (2, 5) over [x, y, θ, l_x, l_y] and innovation nu (2,) of active landmark k; returns 1 or 2.
 
@@ -94,7 +94,7 @@ def linearise(x, k, row, sensor, h, H, nu):
     return 2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def update_kernel(active, n, n0, first, obs, at, sensor):
     """Exact stacked update by all observations o with ``at[o]`` = active landmark ≥ 0, linearised at the prediction.
 
@@ -174,7 +174,7 @@ def update_kernel(active, n, n0, first, obs, at, sensor):
     return nis, m
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def augment_kernel(x, P, n, Phi, n0, row, sensor):
     """Append the landmark seen in ``row`` (range, bearing, variances), with its exact cross covariances."""
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -199,7 +199,7 @@ def augment_kernel(x, P, n, Phi, n0, row, sensor):
         P[j, n], P[j, n + 1] = P[n, j], P[n + 1, j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
     """Lower bound of the Mahalanobis distance² of every observation to each passive landmark, as a share of its gate.
 
@@ -240,7 +240,7 @@ def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
         out[i] = best
 
 
-@numba.njit(cache=True)
+@njit
 def gather_kernel(P, rows, cols, out):
     """``out[i, j] = P[rows[i], cols[j]]`` of a symmetric matrix of which the lower triangle is kept."""
     for i in range(len(rows)):
@@ -250,7 +250,7 @@ def gather_kernel(P, rows, cols, out):
             out[i, j] = P[a, b] if a >= b else P[b, a]
 
 
-@numba.njit(cache=True)
+@njit
 def scatter_kernel(P, rows, cols, block):
     """``P[rows[i], cols[j]] = block[i, j]``, kept in the lower triangle."""
     for i in range(len(rows)):
@@ -263,7 +263,7 @@ def scatter_kernel(P, rows, cols, block):
                 P[b, a] = block[i, j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def innovation_kernel(x, P, obs, at, sensor):
     """Mahalanobis distance² (q,) of every observation to its active landmark ``at``; 0 where there is none."""
     out = np.zeros(len(obs))

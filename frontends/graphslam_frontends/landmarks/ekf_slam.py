@@ -19,21 +19,21 @@ from graphslam.core.path_points import PathPoints
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
-from graphslam.frontends.landmarks.ekf_filter import EkfMap
-from graphslam.frontends.landmarks.fix_points import (
+from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
+from graphslam_frontends.landmarks.ekf_filter import EkfMap
+from graphslam_frontends.landmarks.fix_points import (
     carried_points,
     fix_points,
     fixes_awaited,
     fixes_inside,
     way_of_fixes,
 )
-from graphslam.frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
-from graphslam.frontends.landmarks.snapshot import Snapshot
-from graphslam.frontends.landmarks.stopping import Stopping
-from graphslam.frontends.landmarks.summarise import Smoothed, smooth
-from graphslam.frontends.landmarks.systematic import systematic
+from graphslam_frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
+from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_frontends.landmarks.stopping import Stopping
+from graphslam_frontends.landmarks.summarise import Smoothed, smooth
+from graphslam_frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 OnScan = Callable[[int], None]
@@ -254,7 +254,7 @@ class Ekf(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`graphslam.frontends.base.FrontEnd`."""
+        """See :class:`graphslam_frontends.base.FrontEnd`."""
         data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
         yield from data.reach(0)
         if data.done:
@@ -320,7 +320,7 @@ class EkfSlam(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam.frontends.base.FrontEnd`; there is nothing after the one submap."""
+        """See :class:`graphslam_frontends.base.FrontEnd`; there is nothing after the one submap."""
         if after is not None:
             return
         data = _prepare(log, self.config, drops)

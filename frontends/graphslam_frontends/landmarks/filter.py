@@ -7,9 +7,9 @@ import numpy.typing as npt
 
 from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, se2_transform, wrap_angle
-from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam.frontends.landmarks.config import FilterConfig
-from graphslam.frontends.landmarks.kernels import (
+from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam_frontends.landmarks.config import FilterConfig
+from graphslam_frontends.landmarks.kernels import (
     CFG_LENGTH,
     IGNORED,
     MotionArrays,
@@ -17,7 +17,7 @@ from graphslam.frontends.landmarks.kernels import (
     ScanArrays,
     fastslam_step,
 )
-from graphslam.frontends.landmarks.range_only import Start, WaitingRanges
+from graphslam_frontends.landmarks.range_only import Start, WaitingRanges
 
 Ints = npt.NDArray[np.int64]
 

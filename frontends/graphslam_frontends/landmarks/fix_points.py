@@ -21,8 +21,8 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.path_points import SAME_TIME, PathPoints
 from graphslam.core.records import Gps
-from graphslam.frontends.landmarks.smoothing_kernels import path_covariances
-from graphslam.frontends.landmarks.summarise import Smoothed
+from graphslam_frontends.landmarks.smoothing_kernels import path_covariances
+from graphslam_frontends.landmarks.summarise import Smoothed
 
 STEP = 1e-5
 """Of the central differences [m, rad]."""

@@ -16,8 +16,8 @@ from scipy import stats
 
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, moment_match
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.summarise import REGULARISER, Association, Smoothed, moment_matched
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.summarise import REGULARISER, Association, Smoothed, moment_matched
 
 FALSE_ALARM = 0.01
 """Share of the submaps of honest filters that each test of the flag may blame."""
@@ -64,7 +64,7 @@ def particle_gaussians(
     smoothed : Smoothed
         Says which landmarks are left.
     inflate : bool
-        See :func:`graphslam.frontends.landmarks.summarise.moment_matched`; only the first filter's own moments are
+        See :func:`graphslam_frontends.landmarks.summarise.moment_matched`; only the first filter's own moments are
         inflated.
     """
     keep = smoothed.landmark_kept

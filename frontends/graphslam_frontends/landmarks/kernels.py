@@ -7,7 +7,7 @@ Cost per scan is particles × (landmarks + observations × landmarks *near each 
 bucketed, and an observation looks only into the buckets inside its gate.
 
 An observation with an infinite bearing variance is a range alone: one channel in innovation, likelihood and gate. It
-updates a landmark but cannot found one; what waits for that is in :mod:`graphslam.frontends.landmarks.range_only`.
+updates a landmark but cannot found one; what waits for that is in :mod:`graphslam_frontends.landmarks.range_only`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from graphslam.frontends.landmarks.measurement_kernels import (
+from graphslam.core.jit import njit
+from graphslam_frontends.landmarks.measurement_kernels import (
     TWO_PI,
     inverse_innovation,
     landmark_block,
@@ -44,7 +44,7 @@ CFG_GATE_1, CFG_GATE_NEW_1, CFG_OUTLIER, CFG_OUTLIER_1 = range(9, 13)
 CFG_LENGTH = 13
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _of_channels(vb, two, one):
     return one if math.isinf(vb) else two
 
@@ -117,7 +117,7 @@ class _Pairing(NamedTuple):
     pair_c: Any
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     """Maximum-likelihood association of one particle, exclusive (B4, step 2): fills match[o] with a slot or -1.
 
@@ -207,7 +207,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
                 pair_o[i] = -1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def fastslam_step(particles, scan, motion, sensor, cfg):
     """Advance every particle by one scan.
 

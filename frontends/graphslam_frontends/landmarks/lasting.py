@@ -12,10 +12,10 @@ import numpy as np
 
 from graphslam.core.geometry import Array, rotation2, se2_between
 from graphslam.core.lasting import CONSTANTS, LastingErrors
-from graphslam.frontends.landmarks.config import LastingConfig
-from graphslam.frontends.landmarks.fix_points import Way
-from graphslam.frontends.landmarks.smoothing_kernels import responses
-from graphslam.frontends.landmarks.summarise import Smoothed
+from graphslam_frontends.landmarks.config import LastingConfig
+from graphslam_frontends.landmarks.fix_points import Way
+from graphslam_frontends.landmarks.smoothing_kernels import responses
+from graphslam_frontends.landmarks.summarise import Smoothed
 
 MOVING = 1e-6
 """An increment of the odometry that is shorter and turns less is rest [m, rad]."""

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.frontends.landmarks.config import FilterConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.kernels import IGNORED
-from graphslam.frontends.landmarks.range_only import Start
-from graphslam.frontends.landmarks.summarise import majority_slots
+from graphslam_frontends.landmarks.config import FilterConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.kernels import IGNORED
+from graphslam_frontends.landmarks.range_only import Start
+from graphslam_frontends.landmarks.summarise import majority_slots
 
 Ints = npt.NDArray[np.int64]
 
@@ -27,7 +27,7 @@ class WholeMapParticles(ParticleSet):
     Parameters
     ----------
     config, sensor, field_of_view, miss_range, rng
-        As in :class:`graphslam.frontends.landmarks.filter.ParticleSet`.
+        As in :class:`graphslam_frontends.landmarks.filter.ParticleSet`.
     """
 
     def __init__(

@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from graphslam.core.jit import njit
 
 TWO_PI = 2.0 * math.pi
 LOG_2PI = math.log(TWO_PI)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def wrap(a):
     """Angle to (-π, π]."""
     return math.pi - (math.pi - a) % TWO_PI
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def observe(x, y, th, sensor, lx, ly, out):
     """Range, bearing and their Jacobians for a landmark (lx, ly) seen from pose (x, y, th) with ``sensor (3,)``.
 
@@ -43,7 +44,7 @@ def observe(x, y, th, sensor, lx, ly, out):
     out[8], out[9], out[10], out[11] = ux, uy, -uy / r, ux / r
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def pose_block(h, P):
     """``H_x P H_xᵀ`` (three numbers: 00, 01, 11) for the Jacobian rows h[2:8]."""
     a0 = h[2] * P[0, 0] + h[3] * P[1, 0] + h[4] * P[2, 0]
@@ -59,7 +60,7 @@ def pose_block(h, P):
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def landmark_block(h, c0, c1, c2):
     """``H_l Σ H_lᵀ`` (00, 01, 11) for Σ = [[c0, c1], [c1, c2]]."""
     a0, a1 = h[8] * c0 + h[9] * c1, h[8] * c1 + h[9] * c2
@@ -67,7 +68,7 @@ def landmark_block(h, c0, c1, c2):
     return a0 * h[8] + a1 * h[9], a0 * h[10] + a1 * h[11], b0 * h[10] + b1 * h[11]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def pose_update(m, P, h, nu0, nu1, i00, i01, i11):
     """EKF update of the proposal Gaussian (mean pose m, right-tangent covariance P) by one observation."""
     G = np.empty((3, 2))
@@ -87,7 +88,7 @@ def pose_update(m, P, h, nu0, nu1, i00, i01, i11):
     retract(m, K[0, 0] * nu0 + K[0, 1] * nu1, K[1, 0] * nu0 + K[1, 1] * nu1, K[2, 0] * nu0 + K[2, 1] * nu1)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def retract(m, dx, dy, dth):
     """``m ← m ∘ (dx, dy, dθ)``; first-order retraction, equal to Exp to the order of the filter."""
     c, s = math.cos(m[2]), math.sin(m[2])
@@ -96,7 +97,7 @@ def retract(m, dx, dy, dth):
     m[2] = wrap(m[2] + dth)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def cholesky3(P, L):
     """Lower Cholesky factor of a 3×3 covariance; a direction without variance gets a zero column."""
     L[:] = 0.0
@@ -111,14 +112,14 @@ def cholesky3(P, L):
                 L[i, j] = s / L[j, j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def sample(m, P, z, L):
     """``m ← m ∘ L z`` with P = L Lᵀ and z standard normal."""
     cholesky3(P, L)
     retract(m, L[0, 0] * z[0], L[1, 0] * z[0] + L[1, 1] * z[1], L[2, 0] * z[0] + L[2, 1] * z[1] + L[2, 2] * z[2])
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def inverse_innovation(s00, s01, s11):
     """Inverse (00, 01, 11) and determinant of an innovation covariance; of its range alone where s11 is infinite."""
     if math.isinf(s11):
@@ -127,7 +128,7 @@ def inverse_innovation(s00, s01, s11):
     return s11 / det, -s01 / det, s00 / det, det
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def log_2pi_channels(vb):
     """``k/2 · log 2π`` of an observation with k channels: 2, or 1 where its bearing variance ``vb`` is infinite."""
     return 0.5 * LOG_2PI if math.isinf(vb) else LOG_2PI

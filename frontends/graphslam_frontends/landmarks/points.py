@@ -24,10 +24,10 @@ from graphslam.core.records import Odometry, PointObservations
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform
 from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.odometry.motion import MotionNoise
-from graphslam.frontends.odometry.recorded import cut_odometry
 from graphslam.linear.space_maps import ORIGIN, Placed, SpaceMap, minimise
+from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_frontends.odometry.recorded import cut_odometry
 
 Ints = npt.NDArray[np.int64]
 NO_POSES, NO_POINTS = np.zeros((0, 7)), np.zeros((0, 3))

@@ -18,10 +18,10 @@ from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
-from graphslam.frontends.detectors.trees import TreeDetectorConfig, detect_trees
-from graphslam.frontends.landmarks.config import RangeBearingNoise
-from graphslam.frontends.odometry.motion import Motion, MotionNoise, motion_stream, motion_stream_name
-from graphslam.frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning, certain_until
+from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees
+from graphslam_frontends.landmarks.config import RangeBearingNoise
+from graphslam_frontends.odometry.motion import Motion, MotionNoise, motion_stream, motion_stream_name
+from graphslam_frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning, certain_until
 
 Ints = npt.NDArray[np.int64]
 

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.frontends.landmarks.config import DelayedStart
-from graphslam.frontends.landmarks.range_only_kernels import (
+from graphslam_frontends.landmarks.config import DelayedStart
+from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_LENGTH,
     FIT_LOG_LIKELIHOOD,
     FIT_MARGIN,

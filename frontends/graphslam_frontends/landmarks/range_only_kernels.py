@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from graphslam.frontends.landmarks.measurement_kernels import LOG_2PI, TWO_PI
+from graphslam.core.jit import njit
+from graphslam_frontends.landmarks.measurement_kernels import LOG_2PI, TWO_PI
 
 STARTS = 16
 ITERATIONS = 40
@@ -21,7 +21,7 @@ FIT_X, FIT_Y, FIT_XX, FIT_XY, FIT_YY, FIT_CHI2, FIT_MARGIN, FIT_LOG_LIKELIHOOD, 
 FIT_LENGTH = 10
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _normal(x, y, anchors, ranges, variances, limit, out):
     """Truncated χ² Σ min(d², limit) at (x, y); out: gradient (2), Gauss-Newton matrix (xx, xy, yy), inliers.
 
@@ -51,7 +51,7 @@ def _normal(x, y, anchors, ranges, variances, limit, out):
     return cost
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _descend(p, anchors, ranges, variances, limit, n):
     """Damped Gauss-Newton from p, in place; returns the truncated χ²; n holds the normal equations at the end."""
     damping = 1e-3
@@ -82,7 +82,7 @@ def _descend(p, anchors, ranges, variances, limit, n):
     return cost
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def circle_starts(anchors, ranges, limit):
     """Points (m, 2) on the circle of the shortest range, where the beacon lies within its noise.
 
@@ -99,7 +99,7 @@ def circle_starts(anchors, ranges, limit):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def trilaterate(anchors, ranges, variances, limit, starts, fit, used, minima):
     """Beacon seen at ``ranges`` (k,) with ``variances`` (k,) from ``anchors`` (k, 2); ranges with d² > limit go unused.
 
@@ -159,7 +159,7 @@ def trilaterate(anchors, ranges, variances, limit, starts, fit, used, minima):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def trilaterate_all(anchors, ranges, variances, limit, starts, fits, used, solved):
     """:func:`trilaterate` for every particle: anchors (n, k, 2), fits (n, FIT_LENGTH), used (n, k), solved (n,)."""
     minima = np.empty((len(starts), 3))

@@ -17,17 +17,17 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.landmarks.config import RbpfEkfConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.fix_points import fix_points, fixes_awaited, way_of_fixes
-from graphslam.frontends.landmarks.honesty import distance, flag, particle_gaussians
-from graphslam.frontends.landmarks.lasting import lasting_errors
-from graphslam.frontends.landmarks.prepare import Preparing, known_slots, landmark_stream
-from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
-from graphslam.frontends.landmarks.stopping import Stopping
-from graphslam.frontends.landmarks.summarise import Smoothed, winning_association
-from graphslam.frontends.landmarks.systematic import systematic
+from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.config import RbpfEkfConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.fix_points import fix_points, fixes_awaited, way_of_fixes
+from graphslam_frontends.landmarks.honesty import distance, flag, particle_gaussians
+from graphslam_frontends.landmarks.lasting import lasting_errors
+from graphslam_frontends.landmarks.prepare import Preparing, known_slots, landmark_stream
+from graphslam_frontends.landmarks.rivals import SubmapProblem, settle_rivals
+from graphslam_frontends.landmarks.stopping import Stopping
+from graphslam_frontends.landmarks.summarise import Smoothed, winning_association
+from graphslam_frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 
@@ -51,7 +51,7 @@ class RbpfEkf(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`graphslam.frontends.base.FrontEnd`."""
+        """See :class:`graphslam_frontends.base.FrontEnd`."""
         for found in self.with_particles(feed, seed=seed, after=after, drops=drops):
             yield None if found is None else found[0]
 

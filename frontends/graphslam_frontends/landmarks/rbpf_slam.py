@@ -20,13 +20,13 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.landmarks.config import RbpfSlamConfig
-from graphslam.frontends.landmarks.lineage import WholeMapParticles
-from graphslam.frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
-from graphslam.frontends.landmarks.snapshot import Snapshot
-from graphslam.frontends.landmarks.summarise import REGULARISER, Moments
-from graphslam.frontends.landmarks.systematic import systematic
+from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.config import RbpfSlamConfig
+from graphslam_frontends.landmarks.lineage import WholeMapParticles
+from graphslam_frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_frontends.landmarks.summarise import REGULARISER, Moments
+from graphslam_frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 Joint = Literal["never", "last", "all"]
@@ -117,7 +117,7 @@ def rbpf_snapshots(
     ConfigError
         If the cuts do not increase or lie outside the log.
     MissingDataError
-        See :func:`graphslam.frontends.landmarks.prepare.prepare`.
+        See :func:`graphslam_frontends.landmarks.prepare.prepare`.
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")
@@ -151,7 +151,7 @@ class RbpfSlam(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam.frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        """See :class:`graphslam_frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
             data = prepare(log, self.config, drops if drops is not None else DropCounter())
             yield self._build(data, seed.child(0))

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, se2_transform
-from graphslam.frontends.landmarks.config import DelayedStart
-from graphslam.frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate
-from graphslam.frontends.landmarks.summarise import Smoothed, smooth
+from graphslam_frontends.landmarks.config import DelayedStart
+from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate
+from graphslam_frontends.landmarks.summarise import Smoothed, smooth
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
@@ -28,7 +28,7 @@ _APART = 1.0  # a rival this near [m] is the landmark itself
 
 @dataclass(frozen=True, slots=True)
 class SubmapProblem:
-    """What :func:`graphslam.frontends.landmarks.summarise.smooth` smooths, beside the start.
+    """What :func:`graphslam_frontends.landmarks.summarise.smooth` smooths, beside the start.
 
     Parameters
     ----------

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from graphslam.frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam.core.jit import njit
+from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
 
 
 class Evidence(NamedTuple):
@@ -52,7 +52,7 @@ class Normal(NamedTuple):
     """(2 L,): that of the landmarks."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _inverse3(A):
     """Inverse of a symmetric 3×3 matrix by cofactors."""
     out = np.empty((3, 3))
@@ -70,7 +70,7 @@ def _inverse3(A):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _odometry_residual(a, b, u, e):
     """``e = u⁻¹ ∘ (a⁻¹ ∘ b)`` as (x, y, θ), and the between pose a⁻¹ ∘ b in e[3:6]."""
     c, s = math.cos(a[2]), math.sin(a[2])
@@ -82,7 +82,7 @@ def _odometry_residual(a, b, u, e):
     e[3], e[4], e[5] = bx, by, bt
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def smoothing_cost(poses, landmarks, evidence, d2, parts):
     """Objective Σ rᵀ Σ⁻¹ r; fills d2 per observation and parts = (odometry, range, bearing) shares."""
     u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
@@ -108,7 +108,7 @@ def smoothing_cost(poses, landmarks, evidence, d2, parts):
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _linearise(poses, landmarks, evidence, normal):
     """Fill the normal equations."""
     u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
@@ -173,7 +173,7 @@ def _linearise(poses, landmarks, evidence, normal):
                 H[2 * j + r_, 2 * j + q] += a0 * h[8 + q] + a1 * h[10 + q]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _eliminate(normal, last_seen, Ainv):
     """Eliminate poses 0 … T-2 forwards. Columns of C beyond ``last_seen[k]`` are still zero at pose k."""
     A, B, C, H, g, gl = normal
@@ -201,7 +201,7 @@ def _eliminate(normal, last_seen, Ainv):
                     H[r, q] -= c0 * G[0, q] + c1 * G[1, q] + c2 * G[2, q]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _reduced(A, C, H):
     """Information matrix of {exit pose, landmarks} after the elimination."""
     T, n = len(A), H.shape[0]
@@ -213,7 +213,7 @@ def _reduced(A, C, H):
     return 0.5 * (M + M.T)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
     """Damped Gauss-Newton over poses (T,3) and landmarks (L,2), both changed in place; base pose fixed at identity.
 
@@ -268,7 +268,7 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
     return cost, max_iterations, False
 
 
-@numba.njit(cache=True)
+@njit
 def seen_columns(T, n, ob_pose, ob_lm):
     """last_seen[k]: number of leading landmark columns that poses 0 … k touch (landmarks come in order of sighting)."""
     out = np.zeros(T, np.int64)
@@ -282,7 +282,7 @@ def seen_columns(T, n, ob_pose, ob_lm):
     return np.minimum(out, n)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _at_optimum(poses, landmarks, evidence):
     """The elimination ``(Ainv, B, C)`` at the optimum, and the joint covariance of {exit pose, landmarks}."""
     T, n = len(poses), 2 * len(landmarks)
@@ -297,7 +297,7 @@ def _at_optimum(poses, landmarks, evidence):
     return Ainv, B, C, joint
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _pose_before(Ainv, B, C, Sl, S, X):
     """One step of the backward recursion: covariance of pose k, and with the landmarks, from those of pose k + 1."""
     # pose k given the rest: -Ainv (B ξ_{k+1} + C l), conditional covariance Ainv
@@ -309,7 +309,7 @@ def _pose_before(Ainv, B, C, Sl, S, X):
     return 0.5 * (Sk + Sk.T), Xk
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def smoothed_covariances(poses, landmarks, evidence):
     """Laplace covariances at the optimum, Gauss-Newton Hessian.
 
@@ -329,7 +329,7 @@ def smoothed_covariances(poses, landmarks, evidence):
     return joint, marginal
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def path_covariances(poses, landmarks, evidence, at, G0, G1):
     """Joint covariances of points of the path, by the backward recursion of :func:`smoothed_covariances`.
 
@@ -382,7 +382,7 @@ def path_covariances(poses, landmarks, evidence, at, G0, G1):
     return cross, own
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def bends(poses, landmarks, evidence):
     """What curvature adds to ranges and bearings on average, by the covariance of each landmark as its sensor has it.
 
@@ -426,7 +426,7 @@ def bends(poses, landmarks, evidence):
     return mean
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def responses(poses, landmarks, evidence, along, seen):
     """How the optimum moves with constants that all residuals know, and what the residuals say of these.
 

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.frontends.landmarks.config import StoppingConfig
+from graphslam_frontends.landmarks.config import StoppingConfig
 
 
 class GrowingMap(Protocol):

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.smoothing_kernels import (
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.smoothing_kernels import (
     Evidence,
     bends,
     responses,

@@ -32,8 +32,8 @@ from graphslam.core.geometry import (
     se2_transform,
     wrap_angle,
 )
-from graphslam.frontends.landmarks.prepare import Prepared
-from graphslam.frontends.landmarks.smoothing_kernels import Evidence, smooth_kernel
+from graphslam_frontends.landmarks.prepare import Prepared
+from graphslam_frontends.landmarks.smoothing_kernels import Evidence, smooth_kernel
 
 Ints = npt.NDArray[np.int64]
 PARAMETERS = (

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from graphslam.core.jit import njit
 
 F8 = npt.NDArray[np.float64]
 I8 = npt.NDArray[np.int64]
@@ -66,7 +67,7 @@ class Cells(NamedTuple):
     """``(1,)``: blocks in use."""
 
 
-@nb.njit(cache=True, inline="always")
+@njit(inline="always")
 def _pack(x: float, y: float, z: float, inverse: float) -> Any:
     i = np.int64(np.floor(x * inverse)) + _HALF
     j = np.int64(np.floor(y * inverse)) + _HALF
@@ -74,7 +75,7 @@ def _pack(x: float, y: float, z: float, inverse: float) -> Any:
     return (i << 42) | (j << 21) | k
 
 
-@nb.njit(cache=True, inline="always")
+@njit(inline="always")
 def _find(c: Cells, key: Any) -> Any:
     mask = len(c.keys) - 1
     h = np.int64((np.uint64(key) * _MULTIPLIER) >> np.uint64(20)) & mask
@@ -87,7 +88,7 @@ def _find(c: Cells, key: Any) -> Any:
         h = (h + 1) & mask
 
 
-@nb.njit(cache=True)
+@njit
 def _put(c: Cells, key: Any) -> Any:
     """The block of a cube, made if it is new; -1 where there is no room."""
     mask = len(c.keys) - 1
@@ -111,7 +112,7 @@ def _put(c: Cells, key: Any) -> Any:
     return np.int64(b)
 
 
-@nb.njit(cache=True)
+@njit
 def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
     """A cell begins to count, or moved: cached cubes around it whose nearest it is now, or was, learn of it."""
     key = c.cube[b]
@@ -148,7 +149,7 @@ def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
                             sub += 1
 
 
-@nb.njit(cache=True)
+@njit
 def _eigen(S: F8, V: F8) -> None:
     """Eigenvalues of a symmetric 3 × 3 matrix onto its diagonal, eigenvectors into columns of V (Jacobi)."""
     V[:, :] = 0.0
@@ -178,7 +179,7 @@ def _eigen(S: F8, V: F8) -> None:
                     V[k, p], V[k, q] = cos * a - sin * b, sin * a + cos * b
 
 
-@nb.njit(cache=True)
+@njit
 def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, float]:
     """Main axes of the points of a cell: variances onto the diagonal of S, directions into columns of V.
 
@@ -204,7 +205,7 @@ def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, fl
     return k, max(1.0 - S[k, k] / flat, 0.0), min(max(second / flat - 0.5, 0.0), 1.0)
 
 
-@nb.njit(cache=True)
+@njit
 def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells, float]) -> None:
     """Take the points so far for the cell that is matched to.
 
@@ -254,7 +255,7 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
         _enter(c, b, size, new)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], around: tuple[Cells, float]) -> int:
     """Put points of the world into their cells; how many found no room.
 
@@ -303,7 +304,7 @@ def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], 
     return lost
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keep_since(c: Cells, out: Cells, scan: int) -> None:
     """Copy the cells that were seen since a scan into an empty level."""
     for b in range(c.used[0]):
@@ -319,7 +320,7 @@ def keep_since(c: Cells, out: Cells, scan: int) -> None:
         )
 
 
-@nb.njit(cache=True)
+@njit
 def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
     """Note the cell nearest to the middle of a cached cube."""
     if c.n_around[b] < 0:
@@ -346,7 +347,7 @@ def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
     return best
 
 
-@nb.njit(cache=True, inline="always")
+@njit(inline="always")
 def _nearest(c: Cells, x: float, y: float, z: float, size: float) -> Any:
     """The cell nearest to a point, but for less than an edge of a cached cube times √3; negative: none."""
     inverse = 1.0 / size
@@ -367,14 +368,14 @@ def _nearest(c: Cells, x: float, y: float, z: float, size: float) -> Any:
     return at
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest_cells(c: Cells, points: F8, size: float, out: I8) -> None:
     """The cell of each point; negative: none."""
     for p in range(len(points)):
         out[p] = _nearest(c, points[p, 0], points[p, 1], points[p, 2], size)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: float, out: F8) -> None:
     """Mean of ``exp(-d² / 2σ²)`` over points, at each rotation ``(m, 3, 3)`` about a place ``t``."""
     k = -0.5 / (sigma * sigma)
@@ -392,7 +393,7 @@ def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: floa
         out[r] = total / max(len(points), 1)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def normal_equations(
     c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, told: F8
 ) -> None:
@@ -417,7 +418,7 @@ def normal_equations(
     _normal_equations(c, points, pose, size, scale, (H, g, told), notes)
 
 
-@nb.njit(cache=True)
+@njit
 def _normal_equations(
     c: Cells,
     points: F8,
@@ -492,7 +493,7 @@ def _normal_equations(
             H[i, j] = H[j, i]
 
 
-@nb.njit(cache=True)
+@njit
 def _rotation(w: F8, R: F8, V: F8) -> None:
     """Rotation by a vector, and the left Jacobian."""
     x = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -511,7 +512,7 @@ def _rotation(w: F8, R: F8, V: F8) -> None:
             V[i, j] = one + b * K[i, j] + d * square
 
 
-@nb.njit(cache=True)
+@njit
 def _log(R: F8, t: F8, out: F8) -> None:
     """Logarithm (6,) of a motion that turns by less than a right angle."""
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
@@ -528,7 +529,7 @@ def _log(R: F8, t: F8, out: F8) -> None:
     out[5] = t[2] - 0.5 * a[2] + q * (w[0] * a[1] - w[1] * a[0])
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def descend(
     c: Cells,
     points: F8,
@@ -593,7 +594,7 @@ def descend(
     return stop[2]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def information_by_slot(
     c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, ends: F8, out: tuple[F8, F8, F8]
 ) -> None:
@@ -670,7 +671,7 @@ def information_by_slot(
                     M[i, j] += S[q, i] * S[q, j]
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def thin(points: F8, size: float, near: float, far: float, out: I8) -> int:
     """Rows of the first point of each cube, of those with squared ranges between; how many. They keep their order."""
     bits = 4

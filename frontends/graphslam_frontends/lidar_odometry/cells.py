@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.frontends.lidar_odometry import cell_kernels as kernels
+from graphslam_frontends.lidar_odometry import cell_kernels as kernels
 
 PARTS = 512
 """Parts of space whose gradients are told apart."""

@@ -26,14 +26,14 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.base import FrontEnd, Watch
-from graphslam.frontends.lidar_odometry.cells import evenly
-from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam.frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
-from graphslam.frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, Seen
-from graphslam.frontends.lidar_odometry.reckoned import Reckoned
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.lidar_odometry.cells import evenly
+from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam_frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
+from graphslam_frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, Seen
+from graphslam_frontends.lidar_odometry.reckoned import Reckoned
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.exits import relative_covariance
 
 BENT = 0.1
 """Way of points in the time from scan to scan from which it matters that they have no times [m]."""
@@ -162,7 +162,7 @@ class LidarFrontEnd(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`~graphslam.frontends.base.FrontEnd`. A scan is followed when the next one has come, and the IMU's
+        """See :class:`~graphslam_frontends.base.FrontEnd`. A scan is followed when the next one has come, and the IMU's
         readings up to it; the first ones when there are enough of them to know that unit."""
         first = 0 if after is None else after.key + 1
         while not feed.ended and self._stream(feed) is None:

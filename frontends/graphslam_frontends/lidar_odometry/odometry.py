@@ -18,12 +18,12 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array
-from graphslam.frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, evenly, thin
-from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam.frontends.lidar_odometry.inertial import Inertial
-from graphslam.frontends.lidar_odometry.joint import JointErrors
-from graphslam.frontends.lidar_odometry.reckoned import Reckoned
-from graphslam.frontends.scan_window.tracker import directions
+from graphslam_frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, evenly, thin
+from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam_frontends.lidar_odometry.inertial import Inertial
+from graphslam_frontends.lidar_odometry.joint import JointErrors
+from graphslam_frontends.lidar_odometry.reckoned import Reckoned
+from graphslam_frontends.scan_window.tracker import directions
 
 Index = npt.NDArray[np.int64]
 

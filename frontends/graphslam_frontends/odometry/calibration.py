@@ -19,7 +19,7 @@ from graphslam.registration.register import register
 from graphslam.registration.target import Target
 
 if TYPE_CHECKING:
-    from graphslam.frontends.odometry.steps import Steps
+    from graphslam_frontends.odometry.steps import Steps
 
 _MATCHING = RegistrationConfig(radii=(1.0, 0.3), near=0.15)
 _LEAST = 20

@@ -21,10 +21,10 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry, VelocityControls, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.dead_reckoning_kernels import complementary_kernel
-from graphslam.frontends.odometry.drift import DriftModel
-from graphslam.frontends.odometry.gaps import Gaps, find_gaps
-from graphslam.frontends.odometry.reckoned import (
+from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
+from graphslam_frontends.odometry.drift import DriftModel
+from graphslam_frontends.odometry.gaps import Gaps, find_gaps
+from graphslam_frontends.odometry.reckoned import (
     FADING,
     GYRO,
     LASTING,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from graphslam.core.jit import njit
 
-@numba.njit(cache=True, error_model="numpy")
+
+@njit(error_model="numpy")
 def complementary_kernel(times, rate, seen, time_constant, first, up):
     """Up direction in the base from a gyro, pulled towards the one that the accelerometer shows.
 

@@ -187,7 +187,7 @@ def calibrate(
     Parameters
     ----------
     errors : PathErrors
-        Covariance of dead reckoning between any two steps, as of :class:`~graphslam.frontends.odometry.steps.Steps`.
+        Covariance of dead reckoning between any two steps, as of :class:`~graphslam_frontends.odometry.steps.Steps`.
     path_length : (n,)
         Metres driven until each step, not falling.
     lengths : sequence of float

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from graphslam.frontends.odometry.reckoned import Reckoned
-from graphslam.frontends.odometry.recorded import RecordedErrors
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.reckoned import Reckoned
+from graphslam_frontends.odometry.recorded import RecordedErrors
+from graphslam_frontends.odometry.steps import Steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

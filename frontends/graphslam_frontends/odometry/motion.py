@@ -19,7 +19,7 @@ from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
-from graphslam.frontends.odometry.motion_kernels import (
+from graphslam_frontends.odometry.motion_kernels import (
     FRONT_STEER,
     REAR_AXLE,
     compose_increments_kernel,

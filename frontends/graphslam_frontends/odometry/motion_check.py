@@ -24,11 +24,11 @@ import numpy as np
 from graphslam.core.findings import Finding, Level
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.steps import Steps
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.register import Registration, distinct, register_starts
 from graphslam.registration.target import Target
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.steps import Steps
 
 PAIRS = 36
 """Pairs of a log that are matched, evenly spread."""

@@ -17,9 +17,9 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
-from graphslam.frontends.odometry.gaps import refuse_long
-from graphslam.frontends.odometry.motion import HEADING_UNKNOWN, Motion, MotionNoise, dead_reckoning, motion_stream
-from graphslam.frontends.odometry.recorded import BRIDGED
+from graphslam_frontends.odometry.gaps import refuse_long
+from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.recorded import BRIDGED
 
 SHORTEST = 1.0
 """A pause that is thrice the usual one and longer than this is a gap [s]: a robot can stop within a second."""
@@ -61,7 +61,7 @@ class MotionGap:
 def bridged_reckoning(
     log: SensorLog, times: Array, noise: MotionNoise, *, hold: float, limit: float, drops: DropCounter
 ) -> tuple[Odometry, str, list[MotionGap]]:
-    """Dead reckoning (:mod:`graphslam.frontends.odometry.motion`) with the gaps of the motion bridged by this model.
+    """Dead reckoning (:mod:`graphslam_frontends.odometry.motion`) with the gaps of the motion bridged by this model.
 
     Parameters
     ----------

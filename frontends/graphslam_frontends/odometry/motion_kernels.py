@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from graphslam.core.jit import njit
 
 REAR_AXLE, FRONT_STEER = 0, 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset, noise, increments, covs):
     """Compose the fine steps ``first[k]:first[k + 1]`` into increment k with its covariance.
 
@@ -98,12 +99,12 @@ def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset
         covs[k] = 0.5 * (P + P.T)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
     """Compose the fine steps ``first[k]:first[k + 1]`` of a base that drives arcs into increment k with its covariance.
 
     dt, speed, rate : (s,) fine steps with constant speed along x and constant yaw rate.
-    noise : (12,) as :meth:`graphslam.frontends.odometry.motion.MotionNoise.as_array`.
+    noise : (12,) as :meth:`graphslam_frontends.odometry.motion.MotionNoise.as_array`.
     increments : (n, 3) out; covs : (n, 3, 3) out, right tangent at the end of the increment.
     """
     sv0, sv1, sw0, sw1, correlated = noise[0], noise[1], noise[8], noise[9], noise[3] > 0.5
@@ -178,7 +179,7 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
         covs[k] = 0.5 * (P + P.T)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def compose_increments_kernel(steps, step_covs, first, increments, covs):
     """Compose independent steps ``first[k]:first[k + 1]``, covariances in the right tangent, into increment k.
 

@@ -19,7 +19,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.gaps import Gaps
+from graphslam_frontends.odometry.gaps import Gaps
 
 PSI, POS, GYRO, SCALE, FADING, LASTING = 0, slice(1, 4), slice(4, 7), 7, slice(8, 10), slice(10, 12)
 STATES = 12

@@ -13,8 +13,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.se3 import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.gaps import Gaps, refuse_long
-from graphslam.frontends.odometry.motion import MotionNoise, recorded_odometry
+from graphslam_frontends.odometry.gaps import Gaps, refuse_long
+from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
 
 BRIDGED = 0.2
 """σ of the pieces of a bridged record together, as a share of its motion."""
@@ -152,7 +152,7 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
 def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise) -> Odometry:
     """Increments between consecutive ``times``; a record that a stamp falls into is cut at constant velocity.
 
-    In the plane this is :func:`graphslam.frontends.odometry.motion.recorded_odometry`; here it goes on in space.
+    In the plane this is :func:`graphslam_frontends.odometry.motion.recorded_odometry`; here it goes on in space.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from graphslam.registration.register import register
 from graphslam.registration.target import Target
 
 if TYPE_CHECKING:
-    from graphslam.frontends.odometry.steps import Steps
+    from graphslam_frontends.odometry.steps import Steps
 
 MATCHING = RegistrationConfig(radii=(0.6, 0.3), near=0.15, floor_sigma=0.01, floor_turn=0.003)
 FITNESS = 0.6

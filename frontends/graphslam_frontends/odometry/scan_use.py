@@ -19,10 +19,10 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of, level
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
-from graphslam.frontends.odometry.motion_check import check_motion, motion_findings, spin_of
-from graphslam.frontends.odometry.scan_matching import match_neighbours
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.motion_check import check_motion, motion_findings, spin_of
+from graphslam_frontends.odometry.scan_matching import match_neighbours
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps, make_steps
 
 FEW = 10
 """Returns below which a step's scan does not hold a pose: a wall takes some beams to be a line."""
@@ -42,7 +42,7 @@ def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None 
     Raises
     ------
     GraphSlamError
-        As :func:`graphslam.frontends.odometry.steps.make_steps`; a DataError if no beam of any scan met anything.
+        As :func:`graphslam_frontends.odometry.steps.make_steps`; a DataError if no beam of any scan met anything.
     """
     count = DropCounter()
     steps = make_steps(log, replace(config, match_scans=False), drops=count)

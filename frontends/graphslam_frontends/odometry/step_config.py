@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
+from graphslam_frontends.odometry.motion import MotionNoise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,10 +47,10 @@ class StepConfig:
     """σ of an error of its distances that lasts, a share of them."""
     yaw_per_metre: float = 0.0
     """What recorded odometry in the plane turns too much for each metre driven: taken out [rad/m]. Wheels of unequal
-    size do that; :func:`graphslam.frontends.odometry.calibration.yaw_per_metre` finds it from scans."""
+    size do that; :func:`graphslam_frontends.odometry.calibration.yaw_per_metre` finds it from scans."""
     match_scans: bool = False
     """In the plane: fuse the motion with matches of neighbouring scans
-    (:mod:`graphslam.frontends.odometry.scan_matching`)."""
+    (:mod:`graphslam_frontends.odometry.scan_matching`)."""
     odometry_tilt_sigma: float = 0.0
     """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
     then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""

@@ -14,14 +14,14 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.grid.motion import tilts
-from graphslam.frontends.odometry.calibration import without_yaw_per_metre
-from graphslam.frontends.odometry.dead_reckoning import reckon
-from graphslam.frontends.odometry.drift import PathErrors
-from graphslam.frontends.odometry.gaps import Gaps, find_gaps
-from graphslam.frontends.odometry.motion import steering_odometry, velocity_odometry
-from graphslam.frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
-from graphslam.frontends.odometry.step_config import StepConfig
+from graphslam_frontends.grid.motion import tilts
+from graphslam_frontends.odometry.calibration import without_yaw_per_metre
+from graphslam_frontends.odometry.dead_reckoning import reckon
+from graphslam_frontends.odometry.drift import PathErrors
+from graphslam_frontends.odometry.gaps import Gaps, find_gaps
+from graphslam_frontends.odometry.motion import steering_odometry, velocity_odometry
+from graphslam_frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
+from graphslam_frontends.odometry.step_config import StepConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

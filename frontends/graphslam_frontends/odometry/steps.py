@@ -21,12 +21,12 @@ from graphslam.core.point_clouds import PointClouds, check_offsets
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans, Odometry, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
-from graphslam.frontends.odometry.drift import PathErrors
-from graphslam.frontends.odometry.gaps import Gaps
-from graphslam.frontends.odometry.scan_matching import match_neighbours
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.step_motion import MotionSource, motion_source
+from graphslam_frontends.odometry.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
+from graphslam_frontends.odometry.drift import PathErrors
+from graphslam_frontends.odometry.gaps import Gaps
+from graphslam_frontends.odometry.scan_matching import match_neighbours
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.step_motion import MotionSource, motion_source
 
 __all__ = ["PathErrors", "StepConfig", "Steps", "make_steps"]
 

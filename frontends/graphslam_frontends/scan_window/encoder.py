@@ -2,7 +2,7 @@
 
 Wheels roll straight on. A head whose encoder reads too much sees the world turned the other way about the robot, so
 that scans put on each other say that the robot moves askew, by that angle, all along. The tracker solves for this
-direction (:mod:`~graphslam.frontends.scan_window.tracker`); here it is found with the scans of the one head, taken off
+direction (:mod:`~graphslam_frontends.scan_window.tracker`); here it is found with the scans of the one head, taken off
 its angles, and looked for again until nothing is left.
 """
 
@@ -17,10 +17,10 @@ from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.se3 import quat_to_matrix
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import make_steps
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.tracker import Tracker
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.tracker import Tracker
 
 UPRIGHT = 0.9
 """Cosine of the tilt up to which the axis of a head counts as upright."""

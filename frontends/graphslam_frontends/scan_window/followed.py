@@ -12,11 +12,11 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.exits import relative_covariance
-from graphslam.frontends.scan_window.tracker import Track, track
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.tracker import Track, track
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,16 +19,16 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.base import Watch
-from graphslam.frontends.odometry.scan_use import scan_findings
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.encoder import encoder_findings
-from graphslam.frontends.scan_window.exits import relative_covariance
-from graphslam.frontends.scan_window.followed import once
-from graphslam.frontends.scan_window.tracker import Found, Tracker
-from graphslam.frontends.stepwise import StepwiseFrontEnd
+from graphslam_frontends.base import Watch
+from graphslam_frontends.odometry.scan_use import scan_findings
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.encoder import encoder_findings
+from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.followed import once
+from graphslam_frontends.scan_window.tracker import Found, Tracker
+from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 LAST = "end-of-log"
 MANY = 0.2
@@ -108,7 +108,7 @@ class ScanWindow(StepwiseFrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`~graphslam.frontends.base.FrontEnd`."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`."""
         first = 0 if after is None else after.key + 1
         c = self.config
         for s in window_submaps(self.steps(log, drops=drops), c.window, c.submap, first_key=first):

@@ -29,13 +29,13 @@ from scipy.spatial import cKDTree
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.frontends.grid.motion import tilted
-from graphslam.frontends.grid.weights import spread
-from graphslam.frontends.odometry.lasting import lasting_sigmas
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.config import ScanWindowConfig
 from graphslam.registration.plane_kernels import Pairs, nothing_feigned, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import fit_places, rotations, thin_places
+from graphslam_frontends.grid.motion import tilted
+from graphslam_frontends.grid.weights import spread
+from graphslam_frontends.odometry.lasting import lasting_sigmas
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.config import ScanWindowConfig
 
 Index = npt.NDArray[np.int64]
 

@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.frontends.segslam.config import ChoiceConfig
-from graphslam.frontends.segslam.localisation import Localisation
-from graphslam.frontends.segslam.segmap import MATCH, Entry
 from graphslam.registration import gates
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.gates import height_between, match_fails, shift_between, tilt_between
 from graphslam.registration.register import Registration
+from graphslam_frontends.segslam.config import ChoiceConfig
+from graphslam_frontends.segslam.localisation import Localisation
+from graphslam_frontends.segslam.segmap import MATCH, Entry
 
 NULL = -1
 """The draw's answer for no match."""

@@ -9,18 +9,18 @@ from typing import ClassVar
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.frontends.base import Watch
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.odometry.scan_use import with_findings
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.followed import followed, once
-from graphslam.frontends.segslam.config import SegSlamConfig
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segslam import run_segslam
-from graphslam.frontends.segslam.submaps import drift_by_path, settle, settled_chain
-from graphslam.frontends.stepwise import StepwiseFrontEnd
+from graphslam_frontends.base import Watch
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.odometry.scan_use import with_findings
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.followed import followed, once
+from graphslam_frontends.segslam.config import SegSlamConfig
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +65,7 @@ class SegSlam(StepwiseFrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`~graphslam.frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
         result = self.result(log, seed=seed, drops=drops, watch=watch)
         for submap in settled(result, self.config.drift, self.config.segslam):
             if submap.key == 0:

@@ -18,9 +18,9 @@ from graphslam.core.poses import group_of, pose_mean, pose_scatter
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.evidence.queries import cast_grids
-from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam.frontends.segslam.config import LocalisationConfig
-from graphslam.frontends.segslam.segmentation import Window
+from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam_frontends.segslam.config import LocalisationConfig
+from graphslam_frontends.segslam.segmentation import Window
 
 _SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
 

@@ -20,17 +20,17 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
-from graphslam.frontends.segslam.choice import NULL, Proposal, judge
-from graphslam.frontends.segslam.config import SegSlamConfig
-from graphslam.frontends.segslam.localisation import localise
-from graphslam.frontends.segslam.sampling import draw_weights, grow, root_of_particle
-from graphslam.frontends.segslam.segmap import NEW, Entry, SegMap
-from graphslam.frontends.segslam.window import Ahead
-from graphslam.frontends.segslam.winnowing import Candidates, Winnowed, winnow
 from graphslam.registration.register import Registration, distinct, register_starts
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
+from graphslam_frontends.segslam.choice import NULL, Proposal, judge
+from graphslam_frontends.segslam.config import SegSlamConfig
+from graphslam_frontends.segslam.localisation import localise
+from graphslam_frontends.segslam.sampling import draw_weights, grow, root_of_particle
+from graphslam_frontends.segslam.segmap import NEW, Entry, SegMap
+from graphslam_frontends.segslam.window import Ahead
+from graphslam_frontends.segslam.winnowing import Candidates, Winnowed, winnow
 
 K = TypeVar("K")
 V = TypeVar("V")

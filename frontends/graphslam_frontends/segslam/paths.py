@@ -10,8 +10,8 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.segslam.sampling import OPEN, MapSample
-from graphslam.frontends.segslam.segmap import SegMap
+from graphslam_frontends.segslam.sampling import OPEN, MapSample
+from graphslam_frontends.segslam.segmap import SegMap
 
 Ints = npt.NDArray[np.int64]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.frontends.segslam.segmap import SegMap
-from graphslam.frontends.segslam.submaps import base_of, settled_chain
+from graphslam_frontends.segslam.segmap import SegMap
+from graphslam_frontends.segslam.submaps import base_of, settled_chain
 
 
 @dataclass(frozen=True, slots=True)

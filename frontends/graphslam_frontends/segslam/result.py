@@ -11,14 +11,14 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.grid.ancestry import Ancestry
-from graphslam.frontends.grid.filter import Tally
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.segslam.matching import Attempt
-from graphslam.frontends.segslam.paths import concatenate
-from graphslam.frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
-from graphslam.frontends.segslam.segmap import SegMap
-from graphslam.frontends.segslam.winnowing import Winnowed
+from graphslam_frontends.grid.ancestry import Ancestry
+from graphslam_frontends.grid.filter import Tally
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam.matching import Attempt
+from graphslam_frontends.segslam.paths import concatenate
+from graphslam_frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
+from graphslam_frontends.segslam.segmap import SegMap
+from graphslam_frontends.segslam.winnowing import Winnowed
 
 Ints = npt.NDArray[np.int64]
 

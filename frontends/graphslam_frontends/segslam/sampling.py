@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.poses import frame_between, heading_of, upright
-from graphslam.frontends.segslam.segmap import NEW, Entry, SegMap
+from graphslam_frontends.segslam.segmap import NEW, Entry, SegMap
 
 Ints = npt.NDArray[np.int64]
 

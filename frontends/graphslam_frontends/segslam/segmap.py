@@ -22,8 +22,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, Group, normalised
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
-from graphslam.frontends.segslam.store import Maps, Table
+from graphslam_frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
+from graphslam_frontends.segslam.store import Maps, Table
 
 Ints = npt.NDArray[np.int64]
 

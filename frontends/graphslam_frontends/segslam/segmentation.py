@@ -20,7 +20,7 @@ from graphslam.core.poses import group_of, normalised
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood
 from graphslam.evidence.queries import cast_grids
-from graphslam.frontends.segslam.config import SegmentationConfig
+from graphslam_frontends.segslam.config import SegmentationConfig
 
 Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
 """Points, origins and returns of one step, in the base frame at its stamp."""

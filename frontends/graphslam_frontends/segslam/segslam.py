@@ -21,17 +21,17 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
-from graphslam.frontends.base import Watch
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter import GridFilter
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.segslam.config import SegSlamConfig
-from graphslam.frontends.segslam.matching import Attempt, Matcher
-from graphslam.frontends.segslam.progress import Progress
-from graphslam.frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
-from graphslam.frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
-from graphslam.frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
-from graphslam.frontends.segslam.window import Ahead, look_ahead
+from graphslam_frontends.base import Watch
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter import GridFilter
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam.config import SegSlamConfig
+from graphslam_frontends.segslam.matching import Attempt, Matcher
+from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
+from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
+from graphslam_frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
+from graphslam_frontends.segslam.window import Ahead, look_ahead
 
 Ints = npt.NDArray[np.int64]
 
@@ -59,9 +59,9 @@ def run_segslam(
     progress : bool
         Show a progress bar.
     prune_every : int
-        See :class:`~graphslam.frontends.grid.ancestry.Ancestry`.
+        See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
     watch : callable, optional
-        Called with a :class:`~graphslam.frontends.segslam.progress.Progress` after every step; changes nothing.
+        Called with a :class:`~graphslam_frontends.segslam.progress.Progress` after every step; changes nothing.
 
     Raises
     ------

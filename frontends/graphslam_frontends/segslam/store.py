@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, heading_of
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.segment import KINDS
+from graphslam_frontends.segslam.segment import KINDS
 
 Ints = npt.NDArray[np.int64]
 Scans = frozenset[tuple[int, int]]

@@ -20,14 +20,14 @@ from graphslam.core.poses import frame_between, group_of, level, normalised, pos
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.filter_drift import FilterDrift, between_knots
-from graphslam.frontends.odometry.scan_use import reckoned_covariance, uncorrected, uncorrected_covariance
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.followed import FollowedErrors
-from graphslam.frontends.segslam.config import HandoverConfig
-from graphslam.frontends.segslam.covariance import exit_covariance
-from graphslam.frontends.segslam.sampling import MapSample, nearest_step
-from graphslam.frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
+from graphslam_frontends.grid.filter_drift import FilterDrift, between_knots
+from graphslam_frontends.odometry.scan_use import reckoned_covariance, uncorrected, uncorrected_covariance
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.followed import FollowedErrors
+from graphslam_frontends.segslam.config import HandoverConfig
+from graphslam_frontends.segslam.covariance import exit_covariance
+from graphslam_frontends.segslam.sampling import MapSample, nearest_step
+from graphslam_frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 
 Ints = npt.NDArray[np.int64]
 
@@ -54,8 +54,8 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
     """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
 
     With the steps also the share that the filter passes on of what dead reckoning states of its own errors
-    (:class:`~graphslam.frontends.grid.filter_drift.Passed`), and all of it where no scan corrects it
-    (:mod:`graphslam.frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
+    (:class:`~graphslam_frontends.grid.filter_drift.Passed`), and all of it where no scan corrects it
+    (:mod:`graphslam_frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
     """
     if steps is not None and isinstance(steps.errors, FollowedErrors):
         steps.errors.prepare(segmap[int(i)].interval[0] for i in chain)

@@ -13,9 +13,9 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.frontends.grid.weights import spread
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.segslam.segmentation import Window, gather_window
+from graphslam_frontends.grid.weights import spread
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam.segmentation import Window, gather_window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.evidence.contents import box_query
-from graphslam.frontends.segslam.config import WinnowConfig
-from graphslam.frontends.segslam.sampling import OPEN, MapSample
-from graphslam.frontends.segslam.segmap import SegMap
+from graphslam_frontends.segslam.config import WinnowConfig
+from graphslam_frontends.segslam.sampling import OPEN, MapSample
+from graphslam_frontends.segslam.segmap import SegMap
 
 Ints = npt.NDArray[np.int64]
 

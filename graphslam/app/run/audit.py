@@ -12,9 +12,9 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.association import match_observations, pair_agreement
 from graphslam.evaluate.metrics import Metrics
-from graphslam.frontends.base import FrontEnd
 from graphslam.io.catalog import locate
 from graphslam.io.victoria_park_published import read_slsjf_observations
+from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]

@@ -24,11 +24,11 @@ from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
 from graphslam.evaluate.without_truth import two_sided
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.landmarks.config import LastingConfig, RbpfEkfConfig
-from graphslam.frontends.landmarks.prepare import landmark_stream
-from graphslam.frontends.odometry.motion import motion_stream
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.landmarks.config import LastingConfig, RbpfEkfConfig
+from graphslam_frontends.landmarks.prepare import landmark_stream
+from graphslam_frontends.odometry.motion import motion_stream
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
 """Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""

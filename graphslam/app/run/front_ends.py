@@ -12,8 +12,8 @@ from graphslam.app.run.choice import kind_preset
 from graphslam.core.config import build, merge
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.frontends.base import FrontEnd
 from graphslam.io.readers import readers
+from graphslam_frontends.base import FrontEnd
 
 GROUP = "graphslam.frontends"
 
@@ -48,7 +48,7 @@ def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
     if FrontEnd not in kind.__mro__:
         raise ConfigError(
             f"front end {kind.__name__} is none; wanted a name, a class that inherits from "
-            "graphslam.frontends.base.FrontEnd, or an object of one"
+            "graphslam_frontends.base.FrontEnd, or an object of one"
         )
     return str(getattr(kind, "name", kind.__name__))
 
@@ -89,7 +89,7 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
     made = kind(config=build(config_type, options, "frontend"))
     if not isinstance(made, FrontEnd):
         raise ConfigError(
-            f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam.frontends.base.FrontEnd"
+            f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam_frontends.base.FrontEnd"
         )
     if not made.incremental() and type(made).submaps is FrontEnd.submaps:
         raise ConfigError(f"front end {name!r} is none: {kind.__name__} has neither submaps nor follow")

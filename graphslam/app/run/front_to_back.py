@@ -19,9 +19,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.shelved import load_shelved, shelved
-from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
+from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,8 @@ from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 
 
 def _front_end(log: SensorLog, frontend: str, options: Mapping[str, Any] | None) -> Any:

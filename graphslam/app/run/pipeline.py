@@ -83,7 +83,6 @@ from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evaluate.trust import pooled_nonlinearity, rows_as_json
 from graphslam.evidence.shelved import load_shelved
-from graphslam.frontends.base import FrontEnd
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
@@ -95,6 +94,7 @@ from graphslam.maps.run_map import RunMap, has_maps, make_run_map
 from graphslam.refine.scans import Scans
 from graphslam.solve.registry import SOLVERS
 from graphslam.solve.solution import Solution
+from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def run(
     source : card name, file, folder, or SensorLog
     frontend : str, class or object, optional
         Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`). Or a class
-        that inherits from :class:`~graphslam.frontends.base.FrontEnd`, or an object of one, which has its own options.
+        that inherits from :class:`~graphslam_frontends.base.FrontEnd`, or an object of one, which has its own options.
     solver : str
         Registered name.
     seed : int

@@ -29,12 +29,12 @@ from graphslam.core.records import Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.stream_checks import check_streams
-from graphslam.frontends.base import FrontEnd
 from graphslam.io.growing_log import GrowingLog
 from graphslam.io.log_kinds import kind_name
 from graphslam.maps.global_map import GlobalMap, make_map
 from graphslam.solve.batch import state_of
 from graphslam.solve.solution import make_solution
+from graphslam_frontends.base import FrontEnd
 
 
 class Slam:

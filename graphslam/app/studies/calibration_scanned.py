@@ -25,7 +25,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain
 
 UNKNOWN = "unknown"
 """Name of a recorded log here: no preset is made for it."""

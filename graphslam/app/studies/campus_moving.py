@@ -24,11 +24,11 @@ from graphslam.core.se3 import se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.odometry.steps import make_steps
-from graphslam.frontends.scan_window.front_end import ScanWindow
 from graphslam.maps.moving import outvoted
 from graphslam.sim.campus import simulate_campus
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.scan_window.front_end import ScanWindow
 
 ALL = 1_000_000
 """Beams of a step: every one of them is scored."""

@@ -24,10 +24,6 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.frontends.landmarks.ekf_slam import ekf_snapshots
-from graphslam.frontends.landmarks.prepare import prepare
-from graphslam.frontends.landmarks.rbpf_slam import rbpf_snapshots
-from graphslam.frontends.landmarks.snapshot import Snapshot
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
@@ -36,6 +32,10 @@ from graphslam.join.polish import polish
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.solve.network.full_batch import full_batch
+from graphslam_frontends.landmarks.ekf_slam import ekf_snapshots
+from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
+from graphslam_frontends.landmarks.snapshot import Snapshot
 
 CLASSICAL: dict[str, Callable[..., JoinResult]] = {
     "eif": partial(join_sequential, classical=True),

@@ -104,7 +104,7 @@ def source_digest() -> str:
     Versions change with a release; between releases this tells whether two trials were run by the same code.
     """
     digest = hashlib.sha256()
-    for package in ("graphslam", "graphslam.frontends"):  # a link in a checkout, which ``rglob`` does not follow
+    for package in ("graphslam", "graphslam_frontends"):
         root = Path(str(importlib.import_module(package).__file__)).resolve().parent
         for path in sorted(root.rglob("*.py")):
             digest.update(f"{package}/{path.relative_to(root).as_posix()}\0".encode())

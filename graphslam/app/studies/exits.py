@@ -28,8 +28,8 @@ from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam.sim.crawler_config import CrawlerConfig, crawler_preset
+from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 
 FACTOR = {
     **{"wheel_sigma": 4.0, "wheel_scale": 4.0, "range_sigma": 4.0, "drop_out": 4.0},

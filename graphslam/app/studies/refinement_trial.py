@@ -25,9 +25,6 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.refined import heading_error
-from graphslam.frontends.odometry.steps import make_steps
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.submaps import base_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine
@@ -35,6 +32,9 @@ from graphslam.refine.scans import Scans
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.solve.batch import BatchSolver
+from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.submaps import base_of
 
 ROBOTS = {
     "range_sigma": (0.01, 0.05),

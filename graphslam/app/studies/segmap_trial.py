@@ -26,8 +26,6 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.loops import LoopCloser
@@ -35,6 +33,8 @@ from graphslam.loops.measure import Loop
 from graphslam.maps.entropy import Clarity
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.solution import Solution
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
 
 RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
 """A loop is right if it is off by less [m], [rad]: three σ of a good registration, and half a pillar's breadth."""

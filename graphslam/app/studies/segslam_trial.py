@@ -27,24 +27,24 @@ from graphslam.evaluate import segslam_judge as judge
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.refined import heading_error
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
-from graphslam.frontends.odometry.drift import DriftModel
-from graphslam.frontends.odometry.steps import StepConfig, Steps, make_steps
-from graphslam.frontends.segslam.config import (
+from graphslam.sim.court import court
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.world import DRAWN, World
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
+from graphslam_frontends.odometry.drift import DriftModel
+from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,
     SegmentationConfig,
     SegSlamConfig,
     WinnowConfig,
 )
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segslam import run_segslam
-from graphslam.sim.court import court
-from graphslam.sim.crawler import simulate_crawler
-from graphslam.sim.crawler_config import CrawlerConfig
-from graphslam.sim.world import DRAWN, World
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segslam import run_segslam
 
 Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path", "climbs"]
 DEAD_RECKONING = "dead-reckoning"

@@ -20,8 +20,8 @@ from graphslam.app.cli import app, one_line
 from graphslam.app.run.run import Run
 from graphslam.core.errors import ConfigError, MissingDataError, SolverError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.frontends.landmarks.config import RbpfEkfConfig
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.config import RbpfEkfConfig
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 
 FEW = {"frontend": {"particles": 10}}
 

@@ -14,7 +14,7 @@ from graphslam.app.worlds import simulate
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.range_scans import RangeScans
-from graphslam.frontends.scan_window.encoder import encoder_offset, turning_heads
+from graphslam_frontends.scan_window.encoder import encoder_offset, turning_heads
 
 SMALL = {"size": (66.0, 66.0), "block": 55.0, "every": 3, "every_beam": 3, "speed": 1.5, "movers": 1}
 SHARP = {"reflect_sigma": (1e-3, 1e-3), "hidden_share": (1e-6, 1e-6), "orbit_sigma": (0.05, 0.05)}

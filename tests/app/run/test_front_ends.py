@@ -13,7 +13,7 @@ import pytest
 import graphslam as gs
 from graphslam.app.run import front_ends
 from graphslam.core.errors import UnknownNameError
-from graphslam.frontends.base import FrontEnd
+from graphslam_frontends.base import FrontEnd
 
 
 @dataclass(frozen=True)

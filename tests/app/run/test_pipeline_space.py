@@ -21,9 +21,9 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps, Odometry
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.io.g2o import read_g2o
+from graphslam_frontends.base import FrontEnd
 from tests.reference.space_chain import dense_chain
 
 GROUP = {2: SE2, 3: SE3}

@@ -21,11 +21,11 @@ from graphslam.core.log import SensorLog
 from graphslam.core.plan_view import plan_path
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import Odometry
-from graphslam.frontends.lidar_odometry.front_end import FIRST
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
+from graphslam_frontends.lidar_odometry.front_end import FIRST
 from tests.frontends.landmarks.test_preparing import in_portions
 
 QUIET = {"calibrate": {"use": "none"}}

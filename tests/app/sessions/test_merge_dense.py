@@ -32,12 +32,12 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.base import FrontEnd
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.session_ties import TieConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
+from graphslam_frontends.base import FrontEnd
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
 from tests.reference.hall_sessions import HallDrive, hall_drive

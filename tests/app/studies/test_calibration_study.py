@@ -15,7 +15,7 @@ from graphslam.app.studies.definition import find_study
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain
 
 
 def test_quick_study_maps_a_drawn_robot_three_ways(tmp_path) -> None:

@@ -20,8 +20,8 @@ from graphslam.core.poses import SE3
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
-from graphslam.frontends.scan_window.front_end import ScanWindow
 from graphslam.sim.campus import simulate_campus
+from graphslam_frontends.scan_window.front_end import ScanWindow
 
 
 @pytest.fixture(scope="module")

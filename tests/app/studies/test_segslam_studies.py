@@ -22,10 +22,10 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, level
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
-from graphslam.frontends.segslam.front_end import SegSlamFrontEndConfig
-from graphslam.frontends.segslam.result import SegSlamResult
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
+from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
+from graphslam_frontends.segslam.result import SegSlamResult
 
 STUDIES = {"segslam-garage": GARAGE, "segslam-mine": MINE, "segslam-building": BUILDING}
 

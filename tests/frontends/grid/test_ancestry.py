@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GeometryError
-from graphslam.frontends.grid.ancestry import Ancestry
-from graphslam.frontends.grid.particles import systematic_resample
+from graphslam_frontends.grid.ancestry import Ancestry
+from graphslam_frontends.grid.particles import systematic_resample
 from tests.reference.family_tree import FamilyTree
 
 

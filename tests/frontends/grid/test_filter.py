@@ -11,10 +11,10 @@ from graphslam.core.errors import GeometryError
 from graphslam.core.poses import group_of, level
 from graphslam.core.random import SeedTree
 from graphslam.evidence.memory import memory
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter import GridFilter
-from graphslam.frontends.grid.rbpf_grid import run_rbpf
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter import GridFilter
+from graphslam_frontends.grid.rbpf_grid import run_rbpf
+from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
 CONFIG = GridFilterConfig(particles=8, voxel_size=0.2, heading_walk=0.02)
@@ -59,7 +59,7 @@ def test_one_particle_takes_roll_and_pitch_from_gravity() -> None:
     steps = ring(1, 3, length=8.0, beams=40)
     assert steps.tilt is not None
     path = run_rbpf(steps, replace(CONFIG, particles=1), SeedTree(0)).ancestry.path(0)
-    from graphslam.frontends.grid.motion import tilts
+    from graphslam_frontends.grid.motion import tilts
 
     assert tilts(path) == pytest.approx(steps.tilt, abs=1e-12)
     # the frame of the map stands level: the robot drove on one level, and stays there

@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.poses import SE2, SE3, Group, level
-from graphslam.frontends.grid.filter_drift import FilterDrift, Passed, between_knots
+from graphslam_frontends.grid.filter_drift import FilterDrift, Passed, between_knots
 
 MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
 

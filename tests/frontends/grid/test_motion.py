@@ -8,8 +8,8 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import quat_multiply, se3_exp
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.motion import motion_covariance, move, square_root, tilted, tilts, walk_tilt_errors
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.motion import motion_covariance, move, square_root, tilted, tilts, walk_tilt_errors
 
 QUIET = {"motion_scale": 0.0, "position_walk": 0.0, "height_walk": 0.0, "heading_walk": 0.0, "heading_turn": 0.0,
          "tilt_walk": 0.0}  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
+from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
 
 
 def test_resampling_is_unbiased_and_systematic(rng):

@@ -17,12 +17,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.memory import memory
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter_drift import Passed
-from graphslam.frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
-from graphslam.frontends.odometry.scan_use import reckoned_covariance
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter_drift import Passed
+from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
+from graphslam_frontends.odometry.scan_use import reckoned_covariance
+from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring, true_end
 
 CONFIG = GridFilterConfig(particles=20, heading_walk=0.02)

@@ -10,10 +10,10 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.random import SeedTree
 from graphslam.evidence.likelihood import log_weights
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter import GridFilter
-from graphslam.frontends.grid.upright import NEIGHBOURS, SURE, upright_beams, vertical
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter import GridFilter
+from graphslam_frontends.grid.upright import NEIGHBOURS, SURE, upright_beams, vertical
+from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
 
@@ -67,7 +67,7 @@ def test_what_is_up_is_seen_from_a_tilted_body() -> None:
     poses = GridFilter(
         replace(ring(1, 3, length=1.0, beams=10), tilt_sigma=0.0), GridFilterConfig(particles=1), SeedTree(0)
     ).particles.poses
-    from graphslam.frontends.grid.motion import tilted
+    from graphslam_frontends.grid.motion import tilted
 
     for t, seen in zip(tilt, vertical(tilt)):
         q = tilted(poses, t[None])[0, 3:]

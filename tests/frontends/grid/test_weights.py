@@ -9,10 +9,10 @@ import pytest
 
 from graphslam.core.random import SeedTree
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter import GridFilter
-from graphslam.frontends.grid.particles import normalise_log_weights
-from graphslam.frontends.grid.weights import informed, inherit, spread
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter import GridFilter
+from graphslam_frontends.grid.particles import normalise_log_weights
+from graphslam_frontends.grid.weights import informed, inherit, spread
 from tests.frontends.grid_world import ring
 from tests.reference.grid_weighing import endpoint_gains
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import ConfigError
-from graphslam.frontends.landmarks.compatibility import gates_by_dof, pair
+from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair
 from tests.reference.ekf_slam import distance2, exhaustive_joint, measurement, nearest_neighbour
 
 SENSOR = np.array([0.4, 0.1, -0.05])

@@ -7,10 +7,10 @@ import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError
 from graphslam.core.geometry import se2_compose
-from graphslam.frontends.landmarks import ekf_filter
-from graphslam.frontends.landmarks.ekf_config import EkfSlamConfig
-from graphslam.frontends.landmarks.ekf_filter import EkfMap
-from graphslam.frontends.landmarks.ekf_kernels import linearise
+from graphslam_frontends.landmarks import ekf_filter
+from graphslam_frontends.landmarks.ekf_config import EkfSlamConfig
+from graphslam_frontends.landmarks.ekf_filter import EkfMap
+from graphslam_frontends.landmarks.ekf_kernels import linearise
 from tests.reference.ekf_slam import DenseEkf, DenseEkfByDistance, measurement
 
 SENSOR = np.array([0.6, -0.3, 0.1])

@@ -16,11 +16,11 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.submap_consistency import submaps_consistency
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.landmarks.config import StoppingConfig
-from graphslam.frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
-from graphslam.frontends.landmarks.ekf_slam import Ekf, EkfSlam, ekf_snapshots
-from graphslam.frontends.landmarks.snapshot import Snapshot
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.landmarks.config import StoppingConfig
+from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
+from graphslam_frontends.landmarks.ekf_slam import Ekf, EkfSlam, ekf_snapshots
+from graphslam_frontends.landmarks.snapshot import Snapshot
 
 SEED = SeedTree(0)
 CUTS = StoppingConfig(scans=59)

@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2
 
 from graphslam.core.geometry import se2_compose, wrap_angle
-from graphslam.frontends.landmarks.config import DelayedStart, RbpfEkfConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.measurement_kernels import observe
+from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.measurement_kernels import observe
 from tests.reference.fastslam import SlowParticle, measure, numeric_jacobians
 
 SENSOR = np.array([0.6, -0.3, 0.1])

@@ -13,10 +13,10 @@ from graphslam.core.geometry import wrap_angle
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.metrics import Metrics, flag_counts, front_end_metrics
 from graphslam.evaluate.submap_consistency import submaps_consistency
-from graphslam.frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
-from graphslam.frontends.landmarks.honesty import flag, pool, variance_bounds
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
+from graphslam_frontends.landmarks.honesty import flag, pool, variance_bounds
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.odometry.motion import MotionNoise
 
 
 def test_pool_is_unbiased_for_estimates_of_one_posterior():

@@ -12,9 +12,9 @@ from graphslam.core.charts import map_difference
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log, wrap_angle
 from graphslam.core.lasting import LastingErrors
-from graphslam.frontends.landmarks.config import LastingConfig
-from graphslam.frontends.landmarks.lasting import lasting_errors
-from graphslam.frontends.landmarks.summarise import Smoothed, smooth
+from graphslam_frontends.landmarks.config import LastingConfig
+from graphslam_frontends.landmarks.lasting import lasting_errors
+from graphslam_frontends.landmarks.summarise import Smoothed, smooth
 from tests.frontends.landmarks.test_smoothing import SENSOR, Q, drive
 from tests.reference.fastslam import measure
 

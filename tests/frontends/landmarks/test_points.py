@@ -14,7 +14,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_inverse, se3_transform, so3_exp
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.frontends.landmarks.points import Points, PointsConfig
+from graphslam_frontends.landmarks.points import Points, PointsConfig
 
 
 def flight(seed: int, **changes: float) -> SensorLog:

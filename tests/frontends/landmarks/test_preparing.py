@@ -15,10 +15,10 @@ import graphslam as gs
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
-from graphslam.frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
-from graphslam.frontends.landmarks.prepare import Prepared, Preparing, prepare
-from graphslam.frontends.odometry.motion import MotionNoise, dead_reckoning
 from graphslam.io.growing_log import GrowingLog
+from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
+from graphslam_frontends.landmarks.prepare import Prepared, Preparing, prepare
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
 
 
 def in_portions(log: SensorLog, seed: int, most: int = 7) -> Iterator[tuple[str, Any]]:

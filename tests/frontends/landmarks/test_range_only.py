@@ -16,11 +16,11 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.frontends.landmarks.config import DelayedStart, RbpfEkfConfig, RbpfSlamConfig, StoppingConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.prepare import prepare
-from graphslam.frontends.landmarks.range_only import WaitingRanges
-from graphslam.frontends.landmarks.range_only_kernels import (
+from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig, RbpfSlamConfig, StoppingConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.range_only import WaitingRanges
+from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_CHI2,
     FIT_LENGTH,
     FIT_LOG_LIKELIHOOD,
@@ -32,10 +32,10 @@ from graphslam.frontends.landmarks.range_only_kernels import (
     circle_starts,
     trilaterate,
 )
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam.frontends.landmarks.rbpf_slam import rbpf_snapshots
-from graphslam.frontends.landmarks.rivals import SubmapProblem, settle_rivals
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
+from graphslam_frontends.landmarks.rivals import SubmapProblem, settle_rivals
+from graphslam_frontends.odometry.motion import MotionNoise
 from tests.reference import trilateration as slow
 
 BEACON = np.array([6.0, 9.0])

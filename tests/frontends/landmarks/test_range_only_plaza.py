@@ -10,8 +10,8 @@ import graphslam as gs
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.log import DropCounter
-from graphslam.frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
-from graphslam.frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
+from graphslam_frontends.landmarks.prepare import prepare
 from tests.benchmarks.bench_plaza import Evidence, Model, free_nees
 
 pytestmark = pytest.mark.data

@@ -13,13 +13,13 @@ from graphslam.core.gaussian import moment_match
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.frontends.landmarks.config import RbpfSlamConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.lineage import WholeMapParticles
-from graphslam.frontends.landmarks.prepare import prepare
-from graphslam.frontends.landmarks.rbpf_slam import RbpfSlam, WholeMapFilter, rbpf_snapshots
-from graphslam.frontends.landmarks.summarise import REGULARISER
-from graphslam.frontends.odometry.motion import MotionNoise
+from graphslam_frontends.landmarks.config import RbpfSlamConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.lineage import WholeMapParticles
+from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.rbpf_slam import RbpfSlam, WholeMapFilter, rbpf_snapshots
+from graphslam_frontends.landmarks.summarise import REGULARISER
+from graphslam_frontends.odometry.motion import MotionNoise
 from tests.frontends.landmarks.test_fastslam_step import FOV, SENSOR, world
 
 

@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, wrap_angle
 from graphslam.evaluate.trust import BENT
-from graphslam.frontends.landmarks.smoothing_kernels import bends
-from graphslam.frontends.landmarks.summarise import smooth
+from graphslam_frontends.landmarks.smoothing_kernels import bends
+from graphslam_frontends.landmarks.summarise import smooth
 from tests.reference.fastslam import measure
 
 SENSOR = np.array([0.5, 0.2, 0.1])

@@ -13,11 +13,11 @@ from graphslam.core.geometry import wrap_angle
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.submap_consistency import submaps_consistency
-from graphslam.frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
-from graphslam.frontends.landmarks.filter import ParticleSet
-from graphslam.frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam.frontends.landmarks.stopping import Stopping
-from graphslam.frontends.landmarks.summarise import common_features, moment_matched, winning_association
+from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
+from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.stopping import Stopping
+from graphslam_frontends.landmarks.summarise import common_features, moment_matched, winning_association
 
 
 def particle_set(n=4, observations=6, **config):

@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.records import LaserScans
-from graphslam.frontends.detectors.trees import (
+from graphslam_frontends.detectors.trees import (
     TreeDetectorConfig,
     Trunks,
     detect_trees,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.records import LandmarkObservations, LaserScans
-from graphslam.frontends.detectors.trees import TreeDetectorConfig, detect_trees, find_trunks
 from graphslam.io.victoria_park import read_victoria_park
 from graphslam.io.victoria_park_published import read_ufastslam_detections
+from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees, find_trunks
 from tests.reference.trees import detect_scan
 
 pytestmark = pytest.mark.data

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from graphslam.core import se3
-from graphslam.frontends.lidar_odometry import cell_kernels as kernels
-from graphslam.frontends.lidar_odometry.cells import CellMap, LevelConfig, evenly, thin
+from graphslam_frontends.lidar_odometry import cell_kernels as kernels
+from graphslam_frontends.lidar_odometry.cells import CellMap, LevelConfig, evenly, thin
 from tests.reference.plain_cells import plain_cells, plain_cost, plain_fit
 
 SCALE = 2.0

@@ -12,9 +12,9 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, LidarSubmapConfig
 from graphslam.io.log_store import load_log, save_log
 from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, LidarSubmapConfig
 
 FRONT = LidarFrontEnd(LidarFrontEndConfig(submap=LidarSubmapConfig(length=2.0, points=500)))
 

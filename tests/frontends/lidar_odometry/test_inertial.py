@@ -12,12 +12,12 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError
 from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.random import SeedTree
-from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam.frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, odometry_of
-from graphslam.frontends.lidar_odometry.inertial import Readings, Way, fit, running, tilt_of, upright
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, odometry_of
+from graphslam_frontends.lidar_odometry.inertial import Readings, Way, fit, running, tilt_of, upright
 
 NOISE = ImuNoise(
     gyro=3e-4,

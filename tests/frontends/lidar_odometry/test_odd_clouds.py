@@ -12,7 +12,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.frontends.lidar_odometry.front_end import LidarFrontEnd
+from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd
 
 Clouds = Sequence[np.ndarray]
 

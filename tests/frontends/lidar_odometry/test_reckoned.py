@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core import se3
 from graphslam.core.records import Odometry
-from graphslam.frontends.lidar_odometry.reckoned import NOISE, Reckoned
+from graphslam_frontends.lidar_odometry.reckoned import NOISE, Reckoned
 
 
 def wheels(scale: float = 1.0, n: int = 200, dim: int = 2) -> tuple[Odometry, np.ndarray]:

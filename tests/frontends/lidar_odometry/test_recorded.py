@@ -5,9 +5,9 @@ import pytest
 
 import graphslam as gs
 from graphslam.core import se3
-from graphslam.frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam.frontends.lidar_odometry.odometry import LidarOdometry
-from graphslam.frontends.odometry.recorded import chain
+from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
+from graphslam_frontends.odometry.recorded import chain
 
 SCANS = 90
 

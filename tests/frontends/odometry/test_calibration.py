@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import se2_exp, se2_log
-from graphslam.frontends.odometry.calibration import without_yaw_per_metre, yaw_per_metre
+from graphslam_frontends.odometry.calibration import without_yaw_per_metre, yaw_per_metre
 from tests.frontends.grid_world import ring
 from tests.frontends.odometry.test_recorded import winding
 

@@ -11,10 +11,10 @@ from scipy.stats import chi2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
 from graphslam.core.log import DropCounter
-from graphslam.frontends.odometry.dead_reckoning import DeadReckoningNoise, dead_reckon, reckon
-from graphslam.frontends.odometry.drift import calibrate
-from graphslam.frontends.odometry.gaps import find_gaps
-from graphslam.frontends.odometry.reckoned import Reckoned, euler, euler_quat, level, tangent_of_state
+from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise, dead_reckon, reckon
+from graphslam_frontends.odometry.drift import calibrate
+from graphslam_frontends.odometry.gaps import find_gaps
+from graphslam_frontends.odometry.reckoned import Reckoned, euler, euler_quat, level, tangent_of_state
 from tests.reference.imu_drive import NOISE, STILL, drive
 
 TIMES = np.linspace(0.0, 40.0, 101)

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from graphslam.app.worlds import mesh_world
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.grid.filter_drift import FilterDrift
-from graphslam.frontends.grid.motion import motion_covariance, walk_tilt_errors
-from graphslam.frontends.odometry.drift import DriftModel
 from graphslam.sim.crawler import crawler_motion
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import yaw_bias_for
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.motion import motion_covariance, walk_tilt_errors
+from graphslam_frontends.odometry.drift import DriftModel
 from tests.reference.garage_exits import Ends, read
 
 STEP = 0.4

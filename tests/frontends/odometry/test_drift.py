@@ -7,8 +7,8 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.drift import DriftModel, calibrate, fit_drift
-from graphslam.frontends.odometry.recorded import RecordedErrors
+from graphslam_frontends.odometry.drift import DriftModel, calibrate, fit_drift
+from graphslam_frontends.odometry.recorded import RecordedErrors
 
 PURE = dict.fromkeys(
     ("position_walk", "position_scale", "z_walk", "z_scale", "heading_walk", "heading_scale", "bend"), 0.0

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_log
 from graphslam.core.records import AckermannGeometry, SteeringControls
-from graphslam.frontends.odometry.motion import MotionNoise, steering_odometry
+from graphslam_frontends.odometry.motion import MotionNoise, steering_odometry
 
 T = np.arange(0.0, 2.0, 0.025)
 SPEED = 3.0 + np.sin(T)

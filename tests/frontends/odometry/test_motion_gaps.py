@@ -14,8 +14,8 @@ from graphslam.core.geometry import se2_exp, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Odometry, VelocityControls
-from graphslam.frontends.odometry.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoning
-from graphslam.frontends.odometry.motion_gaps import MotionGap, bridged_reckoning
+from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoning
+from graphslam_frontends.odometry.motion_gaps import MotionGap, bridged_reckoning
 from tests.faults import inject_landmarks as inject
 
 

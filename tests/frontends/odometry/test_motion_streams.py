@@ -15,7 +15,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.log import SensorLog
 from graphslam.core.records import AckermannGeometry, Gps, Odometry, SteeringControls, VelocityControls
-from graphslam.frontends.odometry.motion import (
+from graphslam_frontends.odometry.motion import (
     MotionNoise,
     dead_reckoning,
     recorded_odometry,

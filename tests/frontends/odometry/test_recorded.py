@@ -16,8 +16,9 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry
-from graphslam.frontends.odometry.motion import MotionNoise, recorded_odometry
-from graphslam.frontends.odometry.recorded import (
+from graphslam.io.catalog import load
+from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
+from graphslam_frontends.odometry.recorded import (
     RecordedErrors,
     add_yaw_bias,
     bridge,
@@ -25,8 +26,7 @@ from graphslam.frontends.odometry.recorded import (
     cut_odometry,
     lasting_effect,
 )
-from graphslam.frontends.odometry.steps import StepConfig, make_steps
-from graphslam.io.catalog import load
+from graphslam_frontends.odometry.steps import StepConfig, make_steps
 
 NOISE = MotionNoise(floor_position=1e-6, floor_heading=1e-6)
 

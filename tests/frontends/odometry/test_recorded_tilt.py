@@ -10,9 +10,9 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import LaserScans, Odometry
-from graphslam.frontends.grid.motion import tilts
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.grid.motion import tilts
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.steps import StepConfig, make_steps
 from tests.frontends.odometry.test_recorded import winding
 
 

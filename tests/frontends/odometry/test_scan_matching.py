@@ -10,9 +10,9 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
-from graphslam.frontends.odometry.recorded import chain
-from graphslam.frontends.odometry.scan_matching import fuse, match_neighbours
-from graphslam.frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.scan_matching import fuse, match_neighbours
+from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
 

@@ -11,9 +11,9 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
-from graphslam.frontends.odometry.deskew import assign, cut_beams, spread
-from graphslam.frontends.odometry.reckoned import Reckoned
-from graphslam.frontends.odometry.steps import StepConfig, level_on_the_whole, make_steps
+from graphslam_frontends.odometry.deskew import assign, cut_beams, spread
+from graphslam_frontends.odometry.reckoned import Reckoned
+from graphslam_frontends.odometry.steps import StepConfig, level_on_the_whole, make_steps
 from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled
 from tests.reference.imu_drive import drive
 from tests.reference.plain_steps import deskew_all, room_scans, winding_path

@@ -11,7 +11,7 @@ from graphslam.core.errors import ConfigError, DataError, GeometryError, Missing
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
 from tests.frontends.step_logs import odometry_of, planar_log, room_log, spoiled
 
 

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_between, se2_transform
 from graphslam.core.log import DropCounter
-from graphslam.frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.odometry.steps import StepConfig, make_steps
 from tests.frontends.step_logs import odometry_of, planar_log
 
 

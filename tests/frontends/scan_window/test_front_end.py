@@ -22,19 +22,19 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.followed import FollowedErrors, followed
-from graphslam.frontends.scan_window.front_end import (
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.followed import FollowedErrors, followed
+from graphslam_frontends.scan_window.front_end import (
     ScanWindow,
     ScanWindowFrontEndConfig,
     WindowSubmapConfig,
     window_submaps,
 )
-from graphslam.frontends.scan_window.tracker import track
-from graphslam.frontends.segslam.config import SegSlamConfig
-from graphslam.frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
+from graphslam_frontends.scan_window.tracker import track
+from graphslam_frontends.segslam.config import SegSlamConfig
+from graphslam_frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
 from tests.frontends.grid_world import ring
 
 WINDOW = ScanWindowConfig(lay=2.0)

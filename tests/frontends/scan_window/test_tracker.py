@@ -15,11 +15,11 @@ from graphslam.core.poses import SE2, SE3, chained, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import matrix_to_quat
 from graphslam.core.trajectory import Trajectory
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.scan_window.config import ScanWindowConfig
-from graphslam.frontends.scan_window.exits import relative_covariance
-from graphslam.frontends.scan_window.tracker import Track, Tracker, effects, track
 from graphslam.registration.plane_kernels import Pairs, plane_residuals
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.tracker import Track, Tracker, effects, track
 from tests.frontends.grid_world import ring
 
 CONFIG = ScanWindowConfig(lay=2.0)

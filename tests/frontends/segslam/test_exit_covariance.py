@@ -23,7 +23,7 @@ from graphslam.core.poses import (
     pose_mean,
     pose_scatter,
 )
-from graphslam.frontends.segslam.covariance import exit_covariance, exit_nees
+from graphslam_frontends.segslam.covariance import exit_covariance, exit_nees
 
 GROUPS = [SE2, SE3]
 

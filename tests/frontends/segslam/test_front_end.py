@@ -14,10 +14,10 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans, Odometry
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.base import FrontEnd
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.odometry.step_config import StepConfig
-from graphslam.frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
+from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
 from tests.frontends.grid_world import ring
 from tests.frontends.segslam.test_segslam import CONFIG
 

@@ -13,8 +13,8 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_inverse
 from graphslam.core.poses import frame_between, level
-from graphslam.frontends.segslam.paths import concatenate, seams
-from graphslam.frontends.segslam.sampling import (
+from graphslam_frontends.segslam.paths import concatenate, seams
+from graphslam_frontends.segslam.sampling import (
     OPEN,
     _draw,
     draw_weights,
@@ -24,7 +24,7 @@ from graphslam.frontends.segslam.sampling import (
     root_of_particle,
     root_of_segment,
 )
-from graphslam.frontends.segslam.segmap import SAME, Entry, SegMap
+from graphslam_frontends.segslam.segmap import SAME, Entry, SegMap
 from tests.reference.segmap_twin import all_samples, flat_grid, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)

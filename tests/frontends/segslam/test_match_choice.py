@@ -14,13 +14,13 @@ from graphslam.core.errors import DataError
 from graphslam.core.poses import pose_mean, pose_scatter
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
-from graphslam.frontends.segslam.choice import NULL, Proposal, judge, match_covariance, second_modes
-from graphslam.frontends.segslam.config import ChoiceConfig, LocalisationConfig
-from graphslam.frontends.segslam.localisation import Localisation, localise, range_error
-from graphslam.frontends.segslam.segmap import MATCH
-from graphslam.frontends.segslam.segmentation import Window
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.register import Registration
+from graphslam_frontends.segslam.choice import NULL, Proposal, judge, match_covariance, second_modes
+from graphslam_frontends.segslam.config import ChoiceConfig, LocalisationConfig
+from graphslam_frontends.segslam.localisation import Localisation, localise, range_error
+from graphslam_frontends.segslam.segmap import MATCH
+from graphslam_frontends.segslam.segmentation import Window
 
 C = ChoiceConfig()
 RULES = RegistrationConfig(gates=Gates(fitness=0.85, degeneracy=0.006, tilt=math.radians(4.0)))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from graphslam.frontends.segslam import matching
-from graphslam.frontends.segslam.matching import Recent
+from graphslam_frontends.segslam import matching
+from graphslam_frontends.segslam.matching import Recent
 
 
 def test_what_was_asked_for_longest_ago_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:

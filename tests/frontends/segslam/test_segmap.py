@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from graphslam.core.errors import CovarianceError, DataError, GeometryError, GridLockedError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
+from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
 from tests.reference.segmap_twin import PlainSegMap, flat_grid, mark, marked, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)

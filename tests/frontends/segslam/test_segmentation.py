@@ -11,8 +11,8 @@ from graphslam.core import se3
 from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.config import SegmentationConfig, SegSlamConfig
-from graphslam.frontends.segslam.segmentation import Segmenter, few, gather_window, motion_error, predictive_score
+from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
+from graphslam_frontends.segslam.segmentation import Segmenter, few, gather_window, motion_error, predictive_score
 
 NAN = math.nan
 UP = np.array([0.0, 0, 0, 0, 0, 0, 1])

@@ -11,17 +11,17 @@ import pytest
 from graphslam.core.errors import DataError
 from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
-from graphslam.frontends.grid.config import GridFilterConfig
-from graphslam.frontends.odometry.steps import Steps
-from graphslam.frontends.segslam.config import (
+from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,
     SegmentationConfig,
     SegSlamConfig,
     WinnowConfig,
 )
-from graphslam.frontends.segslam.result import SegSlamResult
-from graphslam.frontends.segslam.segslam import run_segslam
+from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_frontends.segslam.segslam import run_segslam
 from tests.frontends.grid_world import ring
 
 CONFIG = SegSlamConfig(

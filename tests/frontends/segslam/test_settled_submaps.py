@@ -14,10 +14,10 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_inverse
 from graphslam.core.poses import SE3, level, pose_mean
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.config import HandoverConfig
-from graphslam.frontends.segslam.segmap import SAME, Entry, SegMap
-from graphslam.frontends.segslam.submaps import Drift, drift_by_errors, settle, settled_chain
 from graphslam.io.submap_store import read_submaps, write_submaps
+from graphslam_frontends.segslam.config import HandoverConfig
+from graphslam_frontends.segslam.segmap import SAME, Entry, SegMap
+from graphslam_frontends.segslam.submaps import Drift, drift_by_errors, settle, settled_chain
 from tests.reference.segmap_twin import flat_grid, mark, marked, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)

@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry
-from graphslam.frontends.segslam.window import bring_up_to_date, look_ahead
+from graphslam_frontends.segslam.window import bring_up_to_date, look_ahead
 from tests.frontends.grid_world import ring
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.frontends.segslam.config import WinnowConfig
-from graphslam.frontends.segslam.sampling import MapSample, grow, root_of_particle, root_of_segment
-from graphslam.frontends.segslam.segmap import Entry, SegMap
-from graphslam.frontends.segslam.winnowing import Candidates, Winnowed
-from graphslam.frontends.segslam.winnowing import winnow as winnow_all
+from graphslam_frontends.segslam.config import WinnowConfig
+from graphslam_frontends.segslam.sampling import MapSample, grow, root_of_particle, root_of_segment
+from graphslam_frontends.segslam.segmap import Entry, SegMap
+from graphslam_frontends.segslam.winnowing import Candidates, Winnowed
+from graphslam_frontends.segslam.winnowing import winnow as winnow_all
 from tests.reference.segmap_twin import match_entry, straight
 
 SIDE = 20.0  # metres of a side, a step a metre

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from graphslam.core.jit import njit
 
 
-@njit(cache=True)
+@njit
 def _turn(w, R, J):
     """``Exp(w)`` and its right Jacobian, both (3, 3), in place."""
     x, y, z = w[0], w[1], w[2]
@@ -33,7 +34,7 @@ def _turn(w, R, J):
             J[i, j] = one - c * O[i, j] + b * o2
 
 
-@njit(cache=True)
+@njit
 def _step(w, a, dt, noise, state):
     """One step of constant rate ``w`` and force ``a``, biases taken off, over ``dt``: everything in place."""
     R, p, v, P, Phi = state
@@ -73,7 +74,7 @@ def _step(w, a, dt, noise, state):
     R[:, :] = R @ whole
 
 
-@njit(cache=True)
+@njit
 def preintegrate_spans(times, rate, force, begin, end, bias, noise):
     """Preintegrate over many spans of time.
 
