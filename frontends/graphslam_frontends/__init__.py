@@ -1,4 +1,4 @@
-"""Storey 2, beside the graph: sensor data in, submaps out. Never imports gtsam."""
+"""Layer 2: front ends: sensor data in, submaps out. Imports no gtsam."""
 
 from graphslam.core.face import face
 

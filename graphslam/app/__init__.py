@@ -1,1 +1,1 @@
-"""Storey 6: pipeline, run folder, verbs and the command line."""
+"""Layer 9: pipeline, run folder, commands and the command line."""

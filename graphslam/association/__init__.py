@@ -1,1 +1,1 @@
-"""Which landmark is which: one search for the graph and for joiners."""
+"""Layer 3: data association of landmarks, for the graph and for map joining."""

@@ -1,4 +1,4 @@
-"""Submaps and streams in, a solved graph out, submap by submap; no files, and no words for the terminal."""
+"""Layer 8: submaps and sensor streams in, a solved graph out. Reads and writes no files."""
 
 from graphslam.core.face import face
 

@@ -1,1 +1,1 @@
-"""Noise and lasting errors of a robot's sensors, estimated from a log itself, without truth."""
+"""Layer 3: sensor noise and systematic errors, estimated from a log without ground truth."""

@@ -1,4 +1,4 @@
-"""Storey 0: geometry, Gaussians, sensor records and the submap contract. Imports nothing above it."""
+"""Layer 0: geometry, Gaussians, sensor records, the submap, configuration and errors. Imports no other layer."""
 
 from graphslam.core.face import face
 

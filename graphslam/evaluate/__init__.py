@@ -1,4 +1,4 @@
-"""Storey 4: consistency (NEES, CI) and trajectory errors."""
+"""Layer 7: accuracy (ATE, RPE) and consistency (NEES, consistency index), with and without ground truth."""
 
 from graphslam.core.face import face
 

@@ -1,4 +1,4 @@
-"""Evidence grids: log-odds maps of occupied and free space that copy in constant time (SegSLAM, section 2)."""
+"""Layer 1: evidence grids, log-odds maps of occupied and free space with copy on write (SegSLAM, section 2)."""
 
 from graphslam.core.face import face
 

@@ -1,1 +1,1 @@
-"""Storey 2: nodes, factors and the evidence ledger. The package itself imports no gtsam; its modules do."""
+"""Layer 2: the factor graph: nodes, factors and the evidence ledger. The package itself imports no gtsam."""

@@ -1,4 +1,4 @@
-"""Storey 4: one reader or writer a file format, and the data-set catalogue."""
+"""Layer 6: readers and writers, one file format each, and the catalogue of data sets."""
 
 from graphslam.core.face import face
 

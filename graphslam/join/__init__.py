@@ -1,4 +1,4 @@
-"""Storey 3: classical submap joiners (EIF in sequence and by binary tree, EKF) and landmark association."""
+"""Layer 5: map joining: extended information filters in sequence and by binary tree, and an EKF."""
 
 from graphslam.core.face import face
 

@@ -1,1 +1,1 @@
-"""Linear algebra of sparse symmetric systems: block Cholesky, multifrontal factors, patterns. Knows no graph."""
+"""Layer 1: linear algebra of sparse symmetric systems: block Cholesky, multifrontal factors, sparsity patterns."""

@@ -1,4 +1,4 @@
-"""Loops between submaps and ties between sessions: candidates, gates, consistency, ledger."""
+"""Layer 5: loop closures between submaps and between sessions: candidates, gates, consistency, ledger."""
 
 from graphslam.core.face import face
 

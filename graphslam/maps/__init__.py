@@ -1,4 +1,4 @@
-"""Maps that follow the graph: pieces of submaps, fused at the solved poses and re-posed when nodes move."""
+"""Layer 6: maps that follow the graph: pieces of submaps, fused at the estimated poses."""
 
 from graphslam.core.face import face
 

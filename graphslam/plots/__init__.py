@@ -1,4 +1,4 @@
-"""Storey 5: data in, Axes out."""
+"""Layer 8: figures: data in, matplotlib axes out."""
 
 from graphslam.core.face import face
 

@@ -1,1 +1,1 @@
-"""Refinement: one least-squares problem over all steps, with the scans themselves as measurements."""
+"""Layer 5: refinement of the path: one least-squares problem with the scans as measurements."""

@@ -1,1 +1,1 @@
-"""Scan and map matching: where one cloud lies in another, how sure that is, and where else it might lie."""
+"""Layer 1: registration of scans and submaps: relative pose, its covariance, and other possible poses."""

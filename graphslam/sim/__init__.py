@@ -1,4 +1,4 @@
-"""Storey 4: simulated worlds, vehicles and sensors with stated noise, truth included."""
+"""Layer 6: simulated worlds, vehicles and sensors with known noise and ground truth."""
 
 from graphslam.core.face import face
 

@@ -1,4 +1,4 @@
-"""Skeleton networks: measurement nodes collapsed into landmarks, landmarks integrated out, poses relaxed."""
+"""Layer 4: skeleton networks: landmarks are integrated out, the pose network is relaxed (urban GraphSLAM)."""
 
 from graphslam.core.face import face
 

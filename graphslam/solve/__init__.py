@@ -1,4 +1,4 @@
-"""Storey 3: incremental and batch solvers over graphs and pose networks."""
+"""Layer 4: incremental and batch solvers of factor graphs and pose networks."""
 
 from graphslam.core.face import face
 
