@@ -46,8 +46,6 @@ class FrontEnd(Protocol):
 
         Parameters
         ----------
-        log : SensorLog
-        seed : SeedTree
         after : Submap or None
             The last submap that is already there; the next one starts at its end.
         drops : DropCounter or None
@@ -73,7 +71,6 @@ class FrontEnd(Protocol):
 
         Parameters
         ----------
-        feed : Feed
         seed, after, drops, watch
             As in :meth:`submaps`.
         """

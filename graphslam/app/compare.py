@@ -51,17 +51,11 @@ def map_nees(
 
     Parameters
     ----------
-    estimate : SubmapEstimate
     keys : (m,)
         Keys of the submaps that were joined.
     truth : MapTruth
         In the frame of the first base.
     chart : "cartesian" or "group", optional
-
-    Raises
-    ------
-    DataError
-        Nothing in the estimate has a truth.
     """
     error, known = _errors(estimate, keys, truth, chart)
     if len(known) == 0:

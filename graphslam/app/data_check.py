@@ -20,7 +20,6 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     Parameters
     ----------
     source : card name, file or folder
-    reader : str, optional
     options
         For the reader.
 
@@ -28,11 +27,6 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     -------
     list of Noticed
         The first line says what was read. What cannot be read at all is a line of level ``bad``.
-
-    Raises
-    ------
-    UnknownNameError
-        Neither a card nor a path; no such reader.
     """
     try:
         log = load(source, reader=reader, **options)

@@ -28,14 +28,7 @@ PRESETS = {"garage": None, "quick": 5}
 
 
 def demo_log(preset: str, seed: int) -> SensorLog:
-    """The drive of a demo.
-
-    Raises
-    ------
-    UnknownNameError
-    GraphSlamError
-        Open3D, which casts the rays of the scanner, is not there.
-    """
+    """The drive of a demo."""
     if preset not in PRESETS:
         raise UnknownNameError("size of the demo", preset, PRESETS)
     if preset == "garage":
@@ -68,7 +61,6 @@ class DemoProgress(Observer):
 
     Parameters
     ----------
-    picture : Path
     truth : Trajectory or None
         Drawn beside the segments.
     shown : bool

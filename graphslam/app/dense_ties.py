@@ -21,13 +21,7 @@ from graphslam.loops.rules import LoopConfig
 
 
 def problem_of_run(run: Run) -> PoseProblem:
-    """The submaps and ties of a run that has its graph in memory.
-
-    Raises
-    ------
-    DataError
-        They are no single chain of dense submaps.
-    """
+    """The submaps and ties of a run that has its graph in memory."""
     assert run.graph is not None
     return PoseProblem.of_graph(run.graph)
 
@@ -41,13 +35,6 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
         Of the run.
     files : Path
         Where its outputs lie.
-    submaps : list of Submap
-
-    Raises
-    ------
-    DataError
-        The graph is not of these submaps.
-    FormatError, ConfigError, CovarianceError
     """
     stated: dict[str, Any] = read_options(root).get("backend", {})
     config: BackEndConfig = build(BackEndConfig, {k: v for k, v in stated.items() if v is not None}, "backend")

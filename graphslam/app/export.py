@@ -36,11 +36,6 @@ def map_to_enu(run: Run, heading: float | None) -> Array:
 
     Where GPS fixes were scored, their frame is east and north and its origin is the datum. Else the datum is the first
     base, and only the user knows where it looked.
-
-    Raises
-    ------
-    ConfigError
-        A heading for a run that knows its own, or none for one that does not.
     """
     scored = run.gps.get("all")
     if scored is not None:
@@ -61,7 +56,6 @@ def geographic_map(
 
     Parameters
     ----------
-    run : Run
     datum : (latitude, longitude)
         Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84].
     heading : float, optional
@@ -70,10 +64,6 @@ def geographic_map(
         Of the ellipses.
 
     A run in space is seen from above; it has no landmarks.
-
-    Raises
-    ------
-    ConfigError, GeometryError
     """
     if not 0 < confidence < 1:
         raise ConfigError(f"confidence = {confidence}; wanted in (0, 1)")
@@ -101,12 +91,7 @@ def geographic_map(
 
 
 def parse_datum(text: str) -> tuple[float, float]:
-    """``LAT,LON`` in degrees.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """``LAT,LON`` in degrees."""
     try:
         latitude, longitude = (float(v) for v in text.split(","))
     except ValueError:
@@ -231,13 +216,7 @@ def _dense_map(run: Run) -> RunMap:
 
 
 def map_points(run: Run) -> Array:
-    """Points of a run's dense map ``(n, 3)`` in the frame of the first base [m]: centres of the occupied voxels.
-
-    Raises
-    ------
-    MissingDataError
-        The run has no dense map.
-    """
+    """Points of a run's dense map ``(n, 3)`` in the frame of the first base [m]: centres of the occupied voxels."""
     points = np.asarray(_dense_map(run).fused.grid.occupied_cloud(), dtype=np.float64)
     return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
 

@@ -97,11 +97,6 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         Its fused map. Of a refined run the graphs are judged by the maps that they have before the refinement.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    MissingDataError
-        The graph of the run held GPS or an IMU, whose records are not in its folder: an older version wrote it.
     """
     config, streams = _graph_options(run)
     if run.folder is not None and any(s.report.get("refined") for s in run.submaps):
@@ -148,15 +143,6 @@ def clearest_of_topologies(
         Where the run's log is by now; default where it was.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    ConfigError
-        A run of another front end, or ``most`` less than 1.
-    DataError
-        The log is not that of the run.
-    MissingDataError
-        No such log.
     """
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
@@ -245,8 +231,6 @@ def write_clearest(
 
     Parameters
     ----------
-    folder : Path
-    found : Clearest
     bands : mapping, optional
         Heights of floor plans [m].
     """

@@ -38,11 +38,6 @@ class LiveView(Observer):
         Of the log.
     file : path, optional
         Recording that is written (``.rrd``) instead of opening a viewer.
-
-    Raises
-    ------
-    MissingExtraError
-        Rerun is not installed.
     """
 
     def __init__(self, name: str, file: str | Path | None = None) -> None:

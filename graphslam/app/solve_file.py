@@ -62,10 +62,6 @@ def solve_file(
     dict
         Ready for JSON. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is the
         same answer under g2o's residual.
-
-    Raises
-    ------
-    MissingDataError, FormatError, CovarianceError, IndeterminateError, UnknownNameError, ConfigError
     """
     network = read_network(path, noise=noise, repair=repair, create_missing=create_missing, max_size=max_size)
     solution = solve_network(network, solver, starts=starts, certificate=certificate, progress=progress, **options)

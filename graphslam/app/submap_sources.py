@@ -31,7 +31,6 @@ class SubmapSource:
 
     Parameters
     ----------
-    submaps : list of Submap
     truth : MapTruth or None
         Landmarks only where the submaps' identities are the truth's.
     covariance_scale : float
@@ -81,10 +80,6 @@ def submap_source(
     source : Run, path, card, sequence of Submap, or PoseProblem
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
-
-    Raises
-    ------
-    UnknownNameError, MissingDataError, FormatError, DataError
     """
     if isinstance(source, SubmapSource):
         return source

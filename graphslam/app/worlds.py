@@ -121,13 +121,7 @@ def _campus(
 
 
 def world_of(log: SensorLog) -> World:
-    """The world that a log of :func:`simulate` was recorded in, made again.
-
-    Raises
-    ------
-    ConfigError
-        A log that was not made so.
-    """
+    """The world that a log of :func:`simulate` was recorded in, made again."""
     made = log.meta.get("made_with")
     if not isinstance(made, dict):
         raise ConfigError(f"log {log.name!r} does not say which world it was recorded in")

@@ -57,7 +57,6 @@ def joint_compatibility(
 
     Parameters
     ----------
-    pairings : Pairings
     seeds : (k,) int
         First pairing of each start.
     gate : float
@@ -66,7 +65,6 @@ def joint_compatibility(
         χ² limit of the joint distance with 1, 2, … pairings (index = number of pairings).
     persistent : bool
         A pairing that would break the joint limit is passed over for the next likely one, instead of ending the start.
-    accepted : Accepted
     """
     observed, target, nu, C = pairings
     out_pairs, out_count, out_score, out_cost = accepted

@@ -24,7 +24,6 @@ class Clique:
     Parameters
     ----------
     members : (n,) bool
-    size : int
     bound : int
         No clique is larger. ``size == bound`` proves that this one is a maximum.
     """
@@ -54,11 +53,6 @@ def maximum_clique(adjacent: npt.ArrayLike, *, budget: int = 200_000) -> Clique:
     -------
     Clique
         Of several maximum cliques always the same one.
-
-    Raises
-    ------
-    GeometryError
-        Not a square symmetric matrix.
     """
     A = np.array(adjacent, dtype=np.bool_)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or not (A == A.T).all():

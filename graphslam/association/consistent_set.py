@@ -71,13 +71,6 @@ class Chain:
             Of their right tangents.
         known : (n - 1,) bool, optional
             Increments that were measured; the chain is cut at the others, whose numbers are not looked at.
-
-        Raises
-        ------
-        GeometryError
-            Shapes that do not fit, or numbers that are not finite.
-        CovarianceError
-            A covariance that is not positive semi-definite.
         """
         z, Q = np.array(increments, dtype=np.float64), np.array(covariances, dtype=np.float64)
         d = _tangent(z)
@@ -124,15 +117,7 @@ class LoopArrays:
 
     @classmethod
     def of(cls, chain: Chain, ends: npt.ArrayLike, measured: npt.ArrayLike, covariance: npt.ArrayLike) -> LoopArrays:
-        """Loops (i, j) in any direction, checked and turned.
-
-        Raises
-        ------
-        GeometryError
-            Shapes that do not fit, nodes outside the chain, a loop from a node to itself, numbers not finite.
-        CovarianceError
-            A covariance that is not positive semi-definite.
-        """
+        """Loops (i, j) in any direction, checked and turned."""
         e = np.array(ends, dtype=np.int64).reshape(-1, 2)
         d = chain.tangent_dim
         z = np.array(measured, dtype=np.float64).reshape(len(e), chain.poses.shape[1])
@@ -277,17 +262,6 @@ def consistent_loops(
         the clique. The expected share of a right loop is ``1 - level``.
     budget : int
         Branches of the exact search (:func:`~graphslam.association.clique.maximum_clique`).
-
-    Returns
-    -------
-    ConsistentSet
-
-    Raises
-    ------
-    ConfigError
-        Level or share outside (0, 1) and [0, 1).
-    GeometryError, CovarianceError
-        Bad arrays (:meth:`Chain.of`, :meth:`LoopArrays.of`).
 
     Notes
     -----

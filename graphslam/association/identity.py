@@ -32,7 +32,6 @@ class Doubt:
     ----------
     factor_id, entry : int
         Factor, and place of the landmark in its submap.
-    landmark_id : int
     statistic : float
         By how much the objective would fall.
     """

@@ -94,7 +94,6 @@ def associate(graph: PoseGraph, submap: Submap, config: AssociationConfig | None
         Its values and covariance are used as they stand: update the solver first.
     submap : Submap
         Entries whose id is not -1 keep it.
-    config : AssociationConfig, optional
 
     Returns
     -------

@@ -20,8 +20,6 @@ def euclidean_merges(graph: PoseGraph, distance: float = 0.7, *, within_submap: 
 
     Parameters
     ----------
-    graph : PoseGraph
-    distance : float
     within_submap : bool
         Also merge two landmarks that one submap holds apart.
 
@@ -46,7 +44,6 @@ def mahalanobis_merges(graph: PoseGraph, gate: float = 11.8, *, distance: float 
 
     Parameters
     ----------
-    graph : PoseGraph
     gate : float
         χ² with two degrees of freedom.
     distance : float

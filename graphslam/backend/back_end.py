@@ -72,7 +72,6 @@ class BackEnd:
 
     Parameters
     ----------
-    config : BackEndConfig
     solver : str
         Name in the solver registry.
     """
@@ -282,13 +281,7 @@ class BackEnd:
         return ledger
 
     def undo_loop(self, loop: int) -> None:
-        """Take a loop, or a front end's match with its ties, out of the graph; what was found with it in stays.
-
-        Raises
-        ------
-        DataError
-            It is not in the graph.
-        """
+        """Take a loop, or a front end's match with its ties, out of the graph; what was found with it in stays."""
         ledger = ledger_of_events(self.graph.events)
         d = ledger.of(loop)
         if d.verdict != "accepted" or d.factor_id not in self.graph.records:

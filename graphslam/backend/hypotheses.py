@@ -55,11 +55,8 @@ def built(
 
     Parameters
     ----------
-    submaps : sequence of Submap
-    config : BackEndConfig
     fixes : Gps, optional
         Those that count.
-    gps : GpsOptions, optional
     imu : ImuPart, optional
         Of this graph alone.
     """
@@ -99,7 +96,6 @@ def choices_of_matches(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     support : float
         The run's own threshold (``backend.match_support``).
     loops : sequence of Decision
@@ -147,8 +143,6 @@ def solve_choice(
 
     Parameters
     ----------
-    submaps : sequence of Submap
-    chosen : Chosen
     config : BackEndConfig
         The run's.
     loops : sequence of Decision
@@ -242,7 +236,6 @@ class Hypothesis:
         Keys of the submaps whose entry is withdrawn.
     chain : (m,) int64
         Segments.
-    submaps : list of Submap
     grids : dict of int to EvidenceGrid
         By submap key, what it saw itself.
     """
@@ -298,7 +291,6 @@ def hypotheses_of(
 
     Parameters
     ----------
-    result : SegSlamResult
     most : int
         Hypotheses that are looked at, at least one; the map samples come on top.
     drift : FilterDrift
@@ -312,14 +304,8 @@ def hypotheses_of(
 
     Returns
     -------
-    hypotheses : list of Hypothesis
     left_out : int
         Topologies with too little weight, or beyond the number that was asked for.
-
-    Raises
-    ------
-    GraphSlamError
-        Segments that make no submaps.
     """
     if most < 1:
         raise ConfigError(f"number of hypotheses = {most}; wanted at least 1")
@@ -350,7 +336,6 @@ def solve_hypotheses(
 
     Parameters
     ----------
-    told : sequence of Hypothesis
     config : BackEndConfig
         Of the run; nodes, level bases and scale are taken from it.
     find : FindConfig, optional
@@ -361,11 +346,6 @@ def solve_hypotheses(
         Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`built`.
     progress : bool
         Show a bar.
-
-    Raises
-    ------
-    GraphSlamError
-        A graph that cannot be solved.
     """
     find = find_config(config) if find is None else find
     # no match is a factor at once: `find_loops` decides on them

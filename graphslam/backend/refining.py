@@ -66,7 +66,6 @@ class Refined:
 
     Parameters
     ----------
-    refinement : Refinement
     map : GlobalMap
         With the refined path and nodes.
     submaps : list of Submap
@@ -95,10 +94,8 @@ def refine_run(
 
     Parameters
     ----------
-    config : RefineConfig
     scans : Scans or None
         None: the front end works on no scans.
-    submaps : sequence of Submap
     m : GlobalMap
         Solved.
     gps : (Gps, GpsConfig), optional
@@ -192,11 +189,9 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
         Of the graph.
     submaps : sequence of Submap
         That say which streams their front end used.
-    r : Refinement
 
     Returns
     -------
-    ledger : Ledger
     findings : list of Finding
         What is spent, and which streams of the graph the refined path does not hold.
     """
@@ -234,7 +229,6 @@ def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | 
 
     Parameters
     ----------
-    r : Refinement
     wrong : sequence of (i, j, metres, radians), optional
         Loops of the graph that it contradicts (:func:`wrong_loops`); None: the graph is not known.
     """

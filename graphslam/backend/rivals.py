@@ -77,7 +77,6 @@ def two_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> TwoMaps | 
 
     Parameters
     ----------
-    graph : PoseGraph
     solver : Solver
         Of that graph.
     closer : LoopCloser

@@ -44,18 +44,14 @@ class DenseSession:
 
     Parameters
     ----------
-    name : str
     submaps : list of Submap
         Keys and clock of the common graph.
-    config : BackEndConfig
-    map : SessionMap
     inner : list of InnerTie
         Nodes counted from the session's first base.
     shift : float
         Seconds that were added to its clock.
     fixes : Gps or None
         On the common clock.
-    gps : GpsOptions
     T_gps_base : (7,) or (3,) or None
         First base in the GPS frame by the run's own graph.
     refined : bool
@@ -114,8 +110,6 @@ def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, 
 
     Parameters
     ----------
-    graph : PoseGraph
-    session : DenseSession
     start : (7,) or (3,), optional
         Where it is thought to begin; None for the first session, which begins at the origin.
     use_gps : bool
@@ -157,7 +151,6 @@ class Attached:
 
     Parameters
     ----------
-    first_node : int
     known : DenseSession
         What it was tied to.
     ties : Ties or None
@@ -194,28 +187,16 @@ def attach(
 
     Parameters
     ----------
-    graph : PoseGraph
     solver : Solver
         Of the graph, which is at its optimum.
     known : DenseSession
         One that is in the graph.
     known_node : int
         Node of its first base.
-    new : DenseSession
-    config : TieConfig, optional
     found : (TwoSessions, Ties), optional
         What was found already.
     use_gps : bool
         With the new session's fixes, if it has any.
-    progress : bool
-
-    Raises
-    ------
-    DataError
-        The two do not overlap as far as can be seen. The graph is as it was.
-    SolverError
-        The graph, or places that are near each other by the ties, contradict them; it holds the session all the same,
-        and is of no use any more.
     """
     c = TieConfig() if config is None else config
     if found is None:
@@ -266,11 +247,6 @@ def attach_by_gps(
     ----------
     places : bool
         Then also by places that are near each other.
-
-    Raises
-    ------
-    DataError
-        One of them has no GPS in its graph.
     """
     ends = []
     for s in (known, new):

@@ -56,13 +56,7 @@ def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
 
 
 class FixPart:
-    """The fixes of a run: the graph is given them submap by submap, as they come.
-
-    Parameters
-    ----------
-    feed : Feed
-    config : GpsOptions
-    """
+    """The fixes of a run: the graph is given them submap by submap, as they come."""
 
     def __init__(self, feed: Feed, config: GpsOptions) -> None:
         self.feed, self.config = feed, config
@@ -90,13 +84,7 @@ def imus_of(feed: Feed) -> dict[str, Imu]:
 
 
 def compasses_of(log: SensorLog, config: CompassOptions) -> dict[str, Compass]:
-    """The compasses of a log that are to be used, by name.
-
-    Raises
-    ------
-    MissingDataError
-        ``compass.use`` names a stream that the log does not have.
-    """
+    """The compasses of a log that are to be used, by name."""
     found = {name: s for name, s in log.streams.items() if isinstance(s, Compass)}
     if config.use == "none":
         return {}
@@ -112,13 +100,7 @@ def compasses_of(log: SensorLog, config: CompassOptions) -> dict[str, Compass]:
 
 
 def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObservations]:
-    """The stream of distances to beacons that is to be used, by name.
-
-    Raises
-    ------
-    MissingDataError
-        ``beacons.use`` names no stream of sightings.
-    """
+    """The stream of distances to beacons that is to be used, by name."""
     if config.use == "none":
         return {}
     found = {name: s for name, s in log.streams.items() if isinstance(s, LandmarkObservations)}
@@ -132,18 +114,7 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
 
 
 class ImuPart:
-    """The IMUs of a run: axes are looked at, and factors are made, while it goes on.
-
-    Parameters
-    ----------
-    feed : Feed
-    config : ImuOptions
-
-    Raises
-    ------
-    MissingDataError
-        ``config.use`` names a stream that the log does not have.
-    """
+    """The IMUs of a run: axes are looked at, and factors are made, while it goes on."""
 
     def __init__(self, feed: Feed, config: ImuOptions) -> None:
         self.feed, self.config = feed, config
@@ -166,11 +137,6 @@ class ImuPart:
         """Hold the axes of every IMU against the path, once, as soon as there is enough of it.
 
         Those the front end uses, too: a path that is made with wrong axes contradicts the forces.
-
-        Raises
-        ------
-        DataError
-            A mounting is contradicted and ``imu.axes`` is ``"refuse"``.
         """
         if self.config.axes == "ignore" or graph.dim != 3 or not graph.submaps:
             return
@@ -186,14 +152,8 @@ class ImuPart:
 
         Parameters
         ----------
-        graph : PoseGraph
         more : bool
             More submaps will come: what is said once of an IMU is said later.
-
-        Raises
-        ------
-        EvidenceReusedError
-            The stream that is named was used by the front end.
         """
         made = 0
         for name in self._wanted(graph):

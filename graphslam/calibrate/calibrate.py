@@ -24,18 +24,10 @@ def calibrate_streams(
 
     Parameters
     ----------
-    log : SensorLog
     kind : {"sightings", "scans"}
         What is looked at beside the motion.
-    effort : Effort
     config : object
         Of a front end that reads them: how landmarks are detected, how scans become steps.
-    seed : int
-
-    Raises
-    ------
-    DataError, MissingDataError
-        The log says nothing.
     """
     if kind == "sightings":
         seen = Seen.of(log, *landmark_stream(log, config.detector))

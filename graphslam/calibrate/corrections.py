@@ -130,13 +130,7 @@ class CalibrateConfig:
 
 
 def calibrated(log: SensorLog, c: Corrections) -> SensorLog:
-    """The log with the corrections applied: motion, sightings and their stated noise; its truth is left alone.
-
-    Raises
-    ------
-    MissingDataError
-        No motion in it.
-    """
+    """The log with the corrections applied: motion, sightings and their stated noise; its truth is left alone."""
     if c.neutral:
         return log
     name, motion = motion_stream(log)

@@ -41,7 +41,6 @@ class Estimate:
     ----------
     name : str
         As in :class:`~graphslam.calibrate.corrections.Corrections`; logarithms and shares as the kernels have them.
-    value, sigma : float
     gain : float
         Likelihood that it gains over noise alone [nats]; NaN where that was not worth a fit.
     other, other_sigma : float
@@ -131,7 +130,6 @@ class Calibration:
         What was looked at: ``sightings``, ``ranges``, ``scans`` or ``clouds``.
     corrections : Corrections
         What is applied.
-    estimates : tuple of Estimate
     noise : mapping of str to float
         Standard deviations, as they were fitted.
     notes : tuple of Finding

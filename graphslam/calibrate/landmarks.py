@@ -67,10 +67,8 @@ def ranged(
 
     Parameters
     ----------
-    seen : Seen
     until : float
         Seconds of the log that are used.
-    seed : int
     starts : int
         Layouts that are tried.
     first : float

@@ -228,12 +228,6 @@ def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
     ----------
     steps : Steps
         With the odometry as it was recorded.
-    effort : Effort
-
-    Raises
-    ------
-    DataError
-        Too few scans match.
     """
     most = 200 if effort.windows is not None and effort.windows <= 20 else 1000
     most = max(int(most * effort.poses / 2000) if most == 200 else most, 40)
@@ -263,7 +257,6 @@ def predicted(p: Pairs, found: Calibration, *, widen: bool) -> Prediction:
 
     Parameters
     ----------
-    p : Pairs
     found : Calibration
         Whose applied constants are asked; each half estimates them anew.
     widen : bool

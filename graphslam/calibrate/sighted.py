@@ -61,16 +61,8 @@ def calibrate_sightings(
 
     Parameters
     ----------
-    seen : Seen
-    effort : Effort
-    seed : int
     noise : MotionNoise, optional
         Of controls, as it is without a calibration.
-
-    Raises
-    ------
-    DataError
-        Too little is seen twice, or nothing moves.
     """
     held, noise = seen.holding(), noise or MotionNoise()
     blind = not np.any(seen.sightings.has_bearing)
@@ -337,7 +329,6 @@ def profile_clock(s: Smoothing, seen: Seen) -> Estimate:
     ----------
     s : Smoothing
         Fitted without an offset.
-    seen : Seen
     """
     period = seen.period
     scores: dict[int, float] = {}

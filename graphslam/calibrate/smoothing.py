@@ -104,7 +104,6 @@ class Smoothing:
 
     Parameters
     ----------
-    windows : list of Window
     sensor : (3,)
         Sensor in the base.
     free : tuple of str

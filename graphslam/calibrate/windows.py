@@ -30,10 +30,8 @@ class Seen:
 
     Parameters
     ----------
-    log : SensorLog
     name : str
         Of the stream of sightings.
-    sightings : LandmarkObservations
     clock : Array
         Stamps of the motion's records, and at them the seconds in motion and the metres since the first (3, r).
     withheld : (q,) bool, optional
@@ -126,8 +124,6 @@ def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = 
 
     Parameters
     ----------
-    seen : Seen
-    seconds : float
     count : int, optional
         At most so many, spread over the log; all by default.
     visits : bool

@@ -93,19 +93,10 @@ def read_npz(
 
     Parameters
     ----------
-    path : path
-    fmt : str
     old : sequence of str
         Earlier formats that the caller reads as well.
     fields : mapping of str to Field, optional
         What the arrays must be; only these are returned, and checked. Without: all, for a caller that checks them.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Truncated, corrupt, holding pickled objects, of another format, or with arrays that are not as declared.
     """
     where = str(path)
     arrays = read_arrays(path)
@@ -126,12 +117,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_json(path: str | os.PathLike[str], *, fmt: str, shape: Any = None) -> dict[str, Any]:
-    """Read a JSON object whose key ``format`` says ``fmt``, and check its shape (:func:`reading.check_json`).
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """Read a JSON object whose key ``format`` says ``fmt``, and check its shape (:func:`reading.check_json`)."""
     where = str(path)
     value: Any = parse_json(read_text(path), where)
     if not isinstance(value, dict):

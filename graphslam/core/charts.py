@@ -45,12 +45,7 @@ _SMALL = 1e-3
 
 
 def check_chart(chart: str) -> str:
-    """The name of a chart, or a refusal of what is none.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """The name of a chart, or a refusal of what is none."""
     if chart not in CHARTS:
         raise ConfigError(f"unknown chart {chart!r}; wanted {' or '.join(repr(c) for c in CHARTS)}")
     return chart
@@ -131,7 +126,6 @@ def map_difference(x: ArrayLike, mean: ArrayLike, chart: str, *, space: bool = F
     x, mean : (n,)
         In the base frame.
     chart : "cartesian" or "group"
-    space : bool
     """
     x, mean = np.asarray(x, dtype=np.float64), np.asarray(mean, dtype=np.float64)
     if space:

@@ -27,13 +27,6 @@ def connect(address: str, *, timeout: float = 10.0) -> Client:
     -------
     distributed.Client
         Not the process-wide default client; a context manager that the caller closes.
-
-    Raises
-    ------
-    MissingExtraError
-        If ``distributed`` is not installed.
-    ConfigError
-        If nobody answers at the address, or it is not one.
     """
     distributed = import_extra("distributed", "a Dask cluster")
     try:
@@ -53,13 +46,6 @@ def hands(workers: int | None = None, address: str | None = None) -> Iterator[Ca
         Processes of a Dask cluster that lives as long as this; one that dies is started again, and its task repeated.
     address : str, optional
         Of a running scheduler. Without either, tasks run here, one after the other.
-
-    Raises
-    ------
-    ConfigError
-        Both are given, or fewer than one worker is wanted.
-    GraphSlamError
-        ``distributed`` is not installed; or workers died over the same task again and again.
     """
     if workers is not None and (address is not None or workers < 1):
         raise ConfigError(f"{workers} workers and the cluster {address!r}; wanted one of them, and at least 1 worker")

@@ -32,13 +32,7 @@ def spelled(default: Any, **keys: str) -> Any:
 
 
 def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
-    """Build dataclass ``kind`` from nested mappings.
-
-    Raises
-    ------
-    ConfigError
-        Unknown key or a value of the wrong type; names the full key.
-    """
+    """Build dataclass ``kind`` from nested mappings."""
     hints = typing.get_type_hints(kind)
     fields = {f.name: f for f in dataclasses.fields(kind)}
     parts = {key: (f, part) for f in fields.values() for key, part in f.metadata.get(KEYS, {}).items()}
@@ -61,13 +55,7 @@ def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
 
 
 def convert(hint: Any, value: Any, name: str) -> Any:
-    """``value`` as the type that ``hint`` asks for; ``name`` is that of the option, for messages.
-
-    Raises
-    ------
-    ConfigError
-        It is of another type.
-    """
+    """``value`` as the type that ``hint`` asks for; ``name`` is that of the option, for messages."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None or (value == "none" and str not in args):
@@ -112,13 +100,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    ConfigError
-        Missing or malformed.
-    """
+    """Read a TOML file."""
     try:
         return tomllib.loads(read_text(path))
     except MissingDataError as error:

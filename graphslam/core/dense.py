@@ -40,11 +40,6 @@ class CloudMap:
         Row of ``origins`` from which each point was seen; with ``origins`` only, and then needed.
     cell : float
         Edge of the cells in which the points are thinned to be matched, and of the voxels of the space they saw [m].
-
-    Raises
-    ------
-    GeometryError
-        Impossible shapes, figures that are not finite, or scans without an origin.
     """
 
     __slots__ = ("_points", "_scan", "_shape", "cell", "origins")

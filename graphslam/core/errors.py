@@ -80,7 +80,6 @@ class IndeterminateError(GraphSlamError):
 
     Parameters
     ----------
-    message : str
     variables : sequence of str
         Names of the unconstrained variables.
     """

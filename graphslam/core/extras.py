@@ -44,11 +44,6 @@ def import_extra(module: str, need: str, *, where: str | None = None) -> ModuleT
         What cannot be done without it: the beginning of the sentence that a user reads.
     where : str, optional
         File that asks for it.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed, or cannot be loaded; says what to install.
     """
     package = module.partition(".")[0]
     extra = next(name for name, e in EXTRAS.items() if package in e.modules)

@@ -24,7 +24,6 @@ def face(room: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], C
 
     Returns
     -------
-    __getattr__, __dir__ : callable
     __all__ : list of str
         Sorted.
     """

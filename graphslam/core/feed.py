@@ -11,10 +11,6 @@ class Feed:
 
     One that grows is a :class:`graphslam.io.growing_log.GrowingLog`. What a front end makes of a feed depends on its
     records alone, never on the portions in which they came.
-
-    Parameters
-    ----------
-    log : SensorLog
     """
 
     def __init__(self, log: SensorLog) -> None:
@@ -32,12 +28,7 @@ class Feed:
 
     @property
     def log(self) -> SensorLog:
-        """The log; of one that grows there is none before it has ended.
-
-        Raises
-        ------
-        DataError
-        """
+        """The log; of one that grows there is none before it has ended."""
         return self._log
 
     def names(self, kind: type) -> list[str]:
@@ -58,13 +49,7 @@ class Feed:
         return float(times[-1]) if len(times) else -float("inf")
 
     def part(self, stream: str, first: int = 0, last: int | None = None) -> Stream:
-        """Records ``first … last - 1`` of a stream, by default to the last that has come.
-
-        Raises
-        ------
-        DataError
-            They were let go of.
-        """
+        """Records ``first … last - 1`` of a stream, by default to the last that has come."""
         whole: Stream = self._log[stream]
         return whole if first == 0 and last is None else whole.take(slice(first, last))
 

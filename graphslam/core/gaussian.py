@@ -21,13 +21,7 @@ from graphslam.core.reading import usable
 
 
 def inverses(covariances: Array, where: str) -> Array:
-    """Information matrices of covariances ``(n, d, d)`` from a file.
-
-    Raises
-    ------
-    FormatError
-        One is not positive definite, or so near to singular that its inverse is not finite.
-    """
+    """Information matrices of covariances ``(n, d, d)`` from a file."""
     finite = np.isfinite(covariances).all(axis=(1, 2))
     low = np.where(finite, 0.0, np.nan)
     low[finite] = np.linalg.eigvalsh(covariances[finite])[:, 0]
@@ -54,10 +48,6 @@ def check_covariance(
 
     Asymmetry at the level of rounding (1e-6 relative) is averaged away; more is refused, because GTSAM would
     silently read one triangle only.
-
-    Raises
-    ------
-    CovarianceError
     """
     P = np.array(cov, dtype=np.float64)
     if P.ndim != 2 or P.shape[0] != P.shape[1] or dim not in (None, len(P)):
@@ -155,13 +145,7 @@ class Information:
     vector: Array
 
     def factor(self) -> spla.SuperLU:
-        """Sparse factorisation with a symmetric fill-reducing ordering.
-
-        Raises
-        ------
-        CovarianceError
-            If the matrix is singular.
-        """
+        """Sparse factorisation with a symmetric fill-reducing ordering."""
         try:
             return spla.splu(
                 sp.csc_matrix(self.matrix),

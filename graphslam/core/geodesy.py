@@ -17,12 +17,7 @@ _E2 = FLATTENING * (2.0 - FLATTENING)
 
 
 def check_geodetic(latitude: ArrayLike, longitude: ArrayLike) -> None:
-    """Refuse what is no place on Earth.
-
-    Raises
-    ------
-    GeometryError
-    """
+    """Refuse what is no place on Earth."""
     lat, lon = np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)
     if not (np.all(np.isfinite(lat)) and np.all(np.abs(lat) <= 90.0)):
         raise GeometryError("latitude is impossible", got=latitude, wanted="degrees in [-90, 90]")
@@ -40,13 +35,7 @@ def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
 
 
 def ecef_to_geodetic(ecef: ArrayLike) -> Array:
-    """Inverse of :func:`geodetic_to_ecef`, in closed form (Vermeille, Journal of Geodesy 76, 2002, eq. 1-13).
-
-    Raises
-    ------
-    GeometryError
-        Within 50 km of the Earth's centre, where latitude is not unique.
-    """
+    """Inverse of :func:`geodetic_to_ecef`, in closed form (Vermeille, Journal of Geodesy 76, 2002, eq. 1-13)."""
     x, y, z = np.moveaxis(np.asarray(ecef, dtype=np.float64), -1, 0)
     if np.any(np.sqrt(x**2 + y**2 + z**2) < 5e4):
         raise GeometryError("point is near the Earth's centre", wanted="50 km from it, or more")

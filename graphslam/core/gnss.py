@@ -45,10 +45,6 @@ class Pseudoranges:
         Carrier-to-noise density ratio C/N0 [dBHz].
     lever : (3,)
         Antenna in the base frame [m].
-
-    Raises
-    ------
-    DataError, GeometryError
     """
 
     times: Array

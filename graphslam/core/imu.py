@@ -128,11 +128,6 @@ def usable_readings(
     rows : (k,) int
     dropped : dict of str to int
 
-    Raises
-    ------
-    GeometryError
-        Arrays that do not fit.
-
     Examples
     --------
     >>> rows, dropped = usable_readings([0.0, 0.2, 0.1, 0.3], np.zeros((4, 3)), np.ones((4, 3)))

@@ -40,12 +40,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value of a JSON text: finite numbers, every key once, no more than :data:`MOST_NESTED` levels.
-
-    Raises
-    ------
-    FormatError
-    """
+    """The value of a JSON text: finite numbers, every key once, no more than :data:`MOST_NESTED` levels."""
     try:
         value = json.loads(
             text, parse_constant=_constant, parse_float=_float, parse_int=_int, object_pairs_hook=_object
@@ -82,11 +77,6 @@ def check_json(value: Any, shape: Any, where: str, at: str = "") -> Any:
         mapping of any keys.
     where, at : str
         File, and place in it.
-
-    Raises
-    ------
-    FormatError
-        Names the place.
     """
     place = f" of {at}" if at else ""
     if isinstance(shape, dict):
@@ -140,13 +130,7 @@ def _words(shape: Any) -> str:
 
 
 def read_json_lines(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """The JSON objects of a file that has one a line.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        Names file and line.
-    """
+    """The JSON objects of a file that has one a line."""
     out = []
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line:

@@ -39,10 +39,6 @@ class BeamLabels:
         Stamps of the records.
     labels : (n, m) int16
         Number of the thing; -1: nothing, or something that stands still.
-
-    Raises
-    ------
-    DataError
     """
 
     times: Array
@@ -56,13 +52,7 @@ class BeamLabels:
         object.__setattr__(self, "labels", np.ascontiguousarray(labels, dtype=np.int16))
 
     def of(self, times: Array) -> npt.NDArray[np.int16]:
-        """Labels ``(k, m)`` of the records with these stamps ``(k,)``, for instance of a part of the log.
-
-        Raises
-        ------
-        DataError
-            A stamp that no record has.
-        """
+        """Labels ``(k, m)`` of the records with these stamps ``(k,)``, for instance of a part of the log."""
         k = np.clip(np.searchsorted(self.times, times), 0, max(len(self.times) - 1, 0))
         if len(times) and (not len(self.times) or np.any(self.times[k] != times)):
             raise DataError("a stamp that no labelled record has", got=len(times), wanted="stamps of the stream")

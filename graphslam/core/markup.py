@@ -115,7 +115,6 @@ def table(
 
     Parameters
     ----------
-    rows : sequence of mapping or Row
     columns : mapping or sequence of str
         Keys of the cells, or keys with their headings.
     class_ : str

@@ -15,13 +15,7 @@ Triangles = npt.NDArray[np.int32]
 
 
 def check_mesh(vertices: Any, triangles: Any, *, where: str | None = None) -> tuple[Array, Triangles]:
-    """A mesh as vertices ``(v, 3)`` float64 and triangles ``(t, 3)`` int32, both contiguous.
-
-    Raises
-    ------
-    GeometryError
-        Impossible shapes or types, a vertex that is not finite, a triangle that names no vertex.
-    """
+    """A mesh as vertices ``(v, 3)`` float64 and triangles ``(t, 3)`` int32, both contiguous."""
     v, t = np.ascontiguousarray(vertices, dtype=np.float64), np.asarray(triangles)
     if v.ndim != 2 or v.shape[1] != 3:
         raise GeometryError("vertices of a mesh have the wrong shape", where=where, got=v.shape, wanted="(v, 3)")

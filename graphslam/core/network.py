@@ -77,12 +77,6 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
     ----------
     labels : sequence of str
         How to call matrix k in an error, for example ``"3 -> 7"``.
-
-    Raises
-    ------
-    CovarianceError
-        Not finite, not symmetric beyond 1e-6 of the diagonal, or with an eigenvalue below ``-1e-9`` of the largest.
-        GTSAM would take every one of these in silence.
     """
     info = np.array(information, dtype=np.float64)
     bad = _where(info, lambda part: ~usable(part).all(axis=(1, 2)))
@@ -147,11 +141,6 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
     information : (m, d, d)
     repaired : (k,)
         Indices of the matrices that were changed.
-
-    Raises
-    ------
-    CovarianceError
-        For a matrix that is not finite or has no positive eigenvalue: there is nothing to repair it from.
     """
     info = np.array(information, dtype=np.float64)
     if len(info) == 0:
@@ -216,10 +205,6 @@ class PoseNetwork:
         How the file's noise columns were read, in words.
     source : str
         File the network came from; names it in errors.
-
-    Raises
-    ------
-    GeometryError, DataError, CovarianceError
     """
 
     dim: int

@@ -71,15 +71,7 @@ def texts(*shape: int | str, optional: bool = False) -> Field:
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
-    """All arrays of an npz archive. Nothing is unpickled, and no more than the limit is read.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Truncated, corrupt, of another kind, or larger than the limit.
-    """
+    """All arrays of an npz archive. Nothing is unpickled, and no more than the limit is read."""
     where = str(path)
     if not Path(path).is_file():
         raise MissingDataError("no such file", where=where)
@@ -110,13 +102,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
 
 
 def read_npy(stream: IO[bytes], size: int, name: str) -> npt.NDArray[Any]:
-    """The one array of a stream of ``size`` bytes in NumPy's format: numbers, truth values or texts.
-
-    Raises
-    ------
-    ValueError
-        Anything else; names what.
-    """
+    """The one array of a stream of ``size`` bytes in NumPy's format: numbers, truth values or texts."""
     shape, fortran, dtype, begin = npy_header(stream, name)
     claimed = dtype.itemsize * math.prod(shape)
     if claimed != size - begin:
@@ -147,12 +133,7 @@ def npy_begin(head: bytes) -> int:
 
 
 def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Shape, order, type and length of the header of an array in NumPy's format.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Shape, order, type and length of the header of an array in NumPy's format."""
     head = stream.read(8)
     if len(head) < 8 or head[:6] != b"\x93NUMPY" or head[6] not in (1, 2, 3):
         raise ValueError(f"{name} is no array of NumPy")
@@ -176,13 +157,7 @@ def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.
 def check_arrays(
     arrays: Mapping[str, npt.NDArray[Any]], fields: Mapping[str, Field], where: str
 ) -> dict[str, npt.NDArray[Any]]:
-    """The declared arrays, whole numbers as int64 and others as they are; arrays that are not declared are left out.
-
-    Raises
-    ------
-    FormatError
-        One is missing, of another type or shape, or holds a number that is not finite.
-    """
+    """The declared arrays, whole numbers as int64 and others as they are; arrays that are not declared are left out."""
     lengths: dict[str, int] = {}
     found = {}
     for name, field in fields.items():

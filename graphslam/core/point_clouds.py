@@ -56,11 +56,6 @@ class ArrayClouds:
         Points of scan k are rows ``offsets[k]:offsets[k + 1]``.
     before : (q,), optional
         Time from each point to the stamp of its scan [s]; negative: measured later.
-
-    Raises
-    ------
-    DataError
-        Offsets that do not partition the points; a point or a time that is not finite.
     """
 
     points: Array
@@ -101,12 +96,7 @@ class ArrayClouds:
 
 
 def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:
-    """Validate ``(n + 1,)`` offsets that partition ``total`` rows: from 0, not decreasing, to ``total``.
-
-    Raises
-    ------
-    DataError
-    """
+    """Validate ``(n + 1,)`` offsets that partition ``total`` rows: from 0, not decreasing, to ``total``."""
     a = np.asarray(offsets)
     if a.ndim != 1 or len(a) < 1 or a.dtype.kind not in "iu":
         raise DataError(

@@ -18,13 +18,7 @@ FARTHEST = 1e6
 
 
 def finite_points(points: Any, *, what: str = "points", drops: DropCounter | None = None) -> Array:
-    """Points ``(m, 2 | 3)`` [m] without those that are not finite or beyond :data:`FARTHEST`, which are counted.
-
-    Raises
-    ------
-    GeometryError
-        Of another shape.
-    """
+    """Points ``(m, 2 | 3)`` [m] without those that are not finite or beyond :data:`FARTHEST`, which are counted."""
     p = np.ascontiguousarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] not in (2, 3):
         raise GeometryError(f"{what} have the wrong shape", got=p.shape, wanted="(m, 2) or (m, 3)")
@@ -37,12 +31,7 @@ def finite_points(points: Any, *, what: str = "points", drops: DropCounter | Non
 
 
 def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
-    """One finite pose, ``(3,)`` in two dimensions and ``(7,)`` in three; its quaternion is made a unit one.
-
-    Raises
-    ------
-    GeometryError
-    """
+    """One finite pose, ``(3,)`` in two dimensions and ``(7,)`` in three; its quaternion is made a unit one."""
     T = np.array(pose, dtype=np.float64)
     n = 3 if dim == 2 else 7
     if T.shape != (n,) or not np.all(np.isfinite(T)):

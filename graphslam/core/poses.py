@@ -118,13 +118,7 @@ def upright(positions: ArrayLike, headings: ArrayLike) -> Array:
 
 
 def normalised(weights: ArrayLike | None, n: int) -> Array:
-    """Weights ``(n,)`` that sum to one; uniform if none are given.
-
-    Raises
-    ------
-    GeometryError
-        Wrong number, negative, not finite, or all zero.
-    """
+    """Weights ``(n,)`` that sum to one; uniform if none are given."""
     if weights is None:
         return np.full(n, 1.0 / n)
     w = np.asarray(weights, dtype=np.float64)
@@ -140,11 +134,6 @@ def pose_mean(poses: ArrayLike, weights: ArrayLike | None = None, *, iterations:
     ----------
     poses : (n, 7) or (n, 3)
     weights : (n,), optional
-
-    Raises
-    ------
-    GeometryError
-        No poses, or impossible weights.
     """
     p = np.asarray(poses, dtype=np.float64)
     group = group_of(p)

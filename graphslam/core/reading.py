@@ -40,13 +40,7 @@ _limit: ContextVar[int] = ContextVar("size_limit", default=MAX_SIZE)
 
 @contextmanager
 def size_limit(max_size: int | None) -> Iterator[None]:
-    """Read at most ``max_size`` bytes of each file, counted after decompression; None leaves the limit as it is.
-
-    Raises
-    ------
-    ConfigError
-        The limit is not positive.
-    """
+    """Read at most ``max_size`` bytes of each file, counted after decompression; None leaves the limit as it is."""
     if max_size is not None and max_size <= 0:
         raise ConfigError(f"max_size = {max_size}; wanted a number of bytes above 0")
     token = None if max_size is None else _limit.set(int(max_size))
@@ -68,12 +62,7 @@ def most_bytes() -> int:
 
 
 def check_size(size: int, where: str) -> None:
-    """Refuse more bytes than the limit.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse more bytes than the limit."""
     limit = _limit.get()
     if size > limit:
         raise FormatError(
@@ -89,16 +78,8 @@ def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> byt
 
     Parameters
     ----------
-    path : path
     first : int, optional
         About so many bytes are enough.
-
-    Raises
-    ------
-    MissingDataError
-        No such file, or it cannot be read.
-    FormatError
-        Truncated or corrupt compression, or more data than the limit.
     """
     where = str(path)
     try:
@@ -176,12 +157,7 @@ def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str, step: int)
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does."""
     raw = read_bytes(path)
     try:
         return raw.decode("utf-8")
@@ -210,24 +186,14 @@ def whole(values: npt.ArrayLike) -> Any:
 
 
 def safe_name(name: str, where: str) -> str:
-    """The name, if it is a plain file name: a file that a folder names lies in that folder.
-
-    Raises
-    ------
-    FormatError
-    """
+    """The name, if it is a plain file name: a file that a folder names lies in that folder."""
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,200}", name):
         raise FormatError("file name leads out of its folder", where=where, got=repr(name[:80]), wanted="a file name")
     return name
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """Path of the file ``name`` in ``folder``; a symbolic link that leads out of the folder is refused.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Path of the file ``name`` in ``folder``; a symbolic link that leads out of the folder is refused."""
     path = folder / safe_name(name, where)
     if path.is_symlink():
         leads = Path(os.path.realpath(path))

@@ -34,13 +34,7 @@ class Stream(Protocol):
 
 
 def check_times(times: Any, n: int | None = None, *, where: str | None = None) -> Array:
-    """Validate stamps ``(n,)``: finite, strictly increasing.
-
-    Raises
-    ------
-    DataError
-        Names the first offending record.
-    """
+    """Validate stamps ``(n,)``: finite, strictly increasing."""
     t = np.ascontiguousarray(times, dtype=np.float64)
     if t.ndim != 1 or (n is not None and len(t) != n):
         raise DataError("stamps have the wrong shape", where=where, got=t.shape, wanted=f"({n},)" if n else "(n,)")

@@ -24,13 +24,7 @@ def skew(v: ArrayLike) -> Array:
 
 
 def quat_normalize(q: ArrayLike) -> Array:
-    """Unit quaternions ``(..., 4)`` (xyzw) with w ≥ 0.
-
-    Raises
-    ------
-    GeometryError
-        Where a quaternion is zero or not finite.
-    """
+    """Unit quaternions ``(..., 4)`` (xyzw) with w ≥ 0."""
     a = np.asarray(q, dtype=np.float64)
     n = np.linalg.norm(a, axis=-1, keepdims=True)
     if not np.all(np.isfinite(n)) or np.any(n < 1e-12):

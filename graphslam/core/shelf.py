@@ -65,9 +65,6 @@ class Slot(Generic[T]):
 
     Parameters
     ----------
-    shelf : Shelf
-    key : int
-    nbytes : int
     pack, unpack : callable
         From the value to arrays, and back.
     """

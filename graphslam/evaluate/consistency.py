@@ -44,13 +44,7 @@ def vector_pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
 
 
 def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
-    """``D² = eᵀ P⁻¹ e`` (eq. 18) for errors ``(..., n)`` and covariances ``(..., n, n)``.
-
-    Raises
-    ------
-    CovarianceError
-        Where a covariance is not symmetric positive definite; names the first.
-    """
+    """``D² = eᵀ P⁻¹ e`` (eq. 18) for errors ``(..., n)`` and covariances ``(..., n, n)``."""
     e, P = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     if P.shape[-2:] != (e.shape[-1], e.shape[-1]):
         raise CovarianceError("covariance does not fit the error", got=P.shape, wanted=(*e.shape, e.shape[-1]))
@@ -71,12 +65,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
 def joint_nees(
     error: ArrayLike, *, covariance: ArrayLike | None = None, information: sp.spmatrix | sp.sparray | None = None
 ) -> float:
-    """NEES of one whole map: error ``(n,)`` with its dense covariance, or its sparse information matrix.
-
-    Raises
-    ------
-    CovarianceError
-    """
+    """NEES of one whole map: error ``(n,)`` with its dense covariance, or its sparse information matrix."""
     e = np.asarray(error, dtype=np.float64)
     if (covariance is None) == (information is None):
         raise CovarianceError("a joint NEES needs either a covariance or an information matrix")

@@ -37,7 +37,6 @@ class Job:
         What it is called in messages.
     trial : callable int → iterable
         Picklable by name for every executor but ``serial``.
-    seed : int
     """
 
     name: str
@@ -51,7 +50,6 @@ class Outcome:
 
     Parameters
     ----------
-    job : Job
     values : tuple
         What the trial gave; empty if it failed.
     error : str or None
@@ -93,7 +91,6 @@ def execute(
 
     Parameters
     ----------
-    jobs : sequence of Job
     executor : {"serial", "processes", "dask"}
         ``processes`` are spawned, never forked: a forked child of a threaded library hangs or dies.
     workers : int, optional
@@ -102,13 +99,6 @@ def execute(
         Of the scheduler, for ``dask``.
     prepare : callable, optional
         Called before each trial in the process that runs it (e.g. to hold libraries to one thread).
-
-    Raises
-    ------
-    ConfigError
-        Unknown executor, an impossible number of workers, a trial that cannot be pickled, no scheduler at ``address``.
-    GraphSlamError
-        No worker process can start, or the cluster went away.
     """
     if executor not in ("serial", "processes", "dask"):
         raise ConfigError(f"unknown executor {executor!r}; known: serial, processes, dask")

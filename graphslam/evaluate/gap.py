@@ -56,10 +56,6 @@ def objectives_along(submaps: Sequence[Submap], method: str, *, progress: bool =
         at the minimum after every submap.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    UnknownNameError, DataError, CovarianceError, SolverError
     """
     if method not in METHODS:
         raise UnknownNameError("method along a sequence", method, METHODS)
@@ -103,7 +99,6 @@ def gap_along(
     ----------
     submaps, progress
         See :func:`objectives_along`.
-    methods : sequence of str
 
     Returns
     -------
@@ -215,7 +210,6 @@ def polish_history(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     start : SubmapEstimate, optional
         Map to start from, of these submaps and unpolished; default the chain of submaps.
     rtol, max_iterations

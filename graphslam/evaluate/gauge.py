@@ -49,13 +49,6 @@ def aligned_nees(error: ArrayLike, covariance: ArrayLike, directions: ArrayLike)
     covariance : (n, n)
     directions : (n, 3)
         :func:`gauge_directions`.
-
-    Raises
-    ------
-    DataError
-        Not more than three scalars, or shapes that differ.
-    CovarianceError
-        A covariance that is not positive definite, or scalars that do not determine the motion.
     """
     e, G = np.asarray(error, dtype=np.float64), np.asarray(directions, dtype=np.float64)
     if e.ndim != 1 or G.shape != (len(e), 3) or len(e) <= 3:

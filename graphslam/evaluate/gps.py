@@ -161,7 +161,6 @@ class FixDistances:
         Square root of the median variance of such a distance: of the path, there, and of the fix [m].
     ratio : float
         Median of the squared distances over their variances.
-    fixes : int
     """
 
     median: float
@@ -190,7 +189,6 @@ def fix_distances(trajectory: Trajectory, gps: Gps, *, sigma: float | None = Non
     ----------
     trajectory : Trajectory
         With covariances; of a path in space, what is seen from above.
-    gps : Gps
     sigma : float, optional
         σ of each coordinate [m] in place of the stream's own.
 

@@ -45,7 +45,6 @@ class GpsInnovations:
         the fix itself.
     unpredicted : int
         Fixes outside every submap's path.
-    confidence : float
     """
 
     times: Array
@@ -158,11 +157,6 @@ def gps_innovations(
         its bias; the others share a new one per segment.
     segment_gap : float
         [s]
-
-    Raises
-    ------
-    DataError
-        The graph has no datum, or no fix lies inside a submap's path.
     """
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:

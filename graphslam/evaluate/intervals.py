@@ -20,13 +20,7 @@ def _numbers(values: ArrayLike, least: int, what: str) -> Array:
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Mean of ``(n,)`` values and the bounds of Student's interval; of one value, nan bounds.
-
-    Raises
-    ------
-    DataError
-        No values, or one that is not finite.
-    """
+    """Mean of ``(n,)`` values and the bounds of Student's interval; of one value, nan bounds."""
     v = _numbers(values, 1, "a mean")
     mean = float(v.mean())
     if len(v) < 2:
@@ -36,13 +30,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
 
 
 def share_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Bounds of a probability of which ``count`` of ``total`` independent trials came true (Clopper and Pearson 1934).
-
-    Raises
-    ------
-    DataError
-        Impossible numbers.
-    """
+    """Bounds of a probability of which ``count`` of ``total`` independent trials came true (Clopper and Pearson 1934)."""
     if total < 1 or not 0 <= count <= total:
         raise DataError("no interval of a share", got=f"{count} of {total}", wanted="0 … total, total ≥ 1")
     a = 0.5 * (1.0 - confidence)
@@ -60,14 +48,6 @@ def ratio_of_means(
     ----------
     a, b : (n,)
         Row k of both is of run k.
-    rng : numpy Generator
-    confidence : float
-    draws : int
-
-    Raises
-    ------
-    DataError
-        Different lengths, no runs, or a mean of ``b`` that is not above zero.
     """
     x, y = _numbers(a, 1, "a ratio"), _numbers(b, 1, "a ratio")
     if len(x) != len(y) or y.mean() <= 0:
@@ -93,13 +73,6 @@ def grouped_mean_interval(
     values : (n,)
     groups : (n,)
         Label of each, as the number of its run.
-    rng : numpy Generator
-    confidence : float
-    draws : int
-
-    Raises
-    ------
-    DataError
     """
     v, g = _numbers(values, 1, "a mean"), np.asarray(groups).ravel()
     if len(g) != len(v):

@@ -25,7 +25,6 @@ def sighting_findings(
 
     Parameters
     ----------
-    log : SensorLog
     reports : sequence of mapping
         Of all submaps.
     dropped : mapping of str to int

@@ -43,10 +43,6 @@ BENT = 0.1
 def check_log(log: SensorLog) -> list[Noticed]:
     """Everything that can be told of a log before a run.
 
-    Parameters
-    ----------
-    log : SensorLog
-
     Returns
     -------
     list of Noticed

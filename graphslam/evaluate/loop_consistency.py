@@ -103,11 +103,6 @@ def find_loops(
         Of more pairs of submaps an even selection is taken: memory and time grow with the square.
     covariance_scale : float
         Factor on every submap's covariance, as in the graph.
-
-    Raises
-    ------
-    DataError
-        Poses do not fit the chain, or there is no loop at all.
     """
     X = np.asarray(poses, dtype=np.float64)
     if X.shape != (len(submaps) + 1, 3):
@@ -260,7 +255,6 @@ class LoopConsistency:
 
     Parameters
     ----------
-    loops : Loops
     d2 : (l, l)
         Off the diagonal ``D²_ij = (e_i - e_j)ᵀ (Σ_ii + Σ_jj - Σ_ij - Σ_ji)⁻¹ (e_i - e_j)``, on it ``e_iᵀ Σ_ii⁻¹ e_i``;
         each χ² of three degrees of freedom if the submaps are honest and the landmarks rightly paired. ``nan`` where

@@ -23,7 +23,6 @@ class MapError:
 
     Parameters
     ----------
-    quantity : str
     gauge : {"first-base", "rigid"}
         ``first-base``: both are in the frame of the first base; nothing is fitted. ``rigid``: the estimate was moved
         onto the truth by least squares first, without scale.
@@ -99,13 +98,7 @@ def landmark_error(
     *,
     gauge: Gauge = "first-base",
 ) -> MapError:
-    """Distances of estimated landmarks ``(n, dim)`` to the true ones of the same id.
-
-    Raises
-    ------
-    DataError
-        No landmark has a truth, or too few for an alignment.
-    """
+    """Distances of estimated landmarks ``(n, dim)`` to the true ones of the same id."""
     p, q = np.asarray(positions, dtype=np.float64), np.asarray(truth_positions, dtype=np.float64)
     i, j = match_ids(ids, truth_ids)
     if not len(i):

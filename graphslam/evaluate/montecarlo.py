@@ -28,8 +28,6 @@ class Measurement:
 
     Parameters
     ----------
-    algorithm, quantity : str
-    value : float
     submap : int
         Submap (or step) the figure belongs to; -1 for a figure of the whole run.
     timing : bool
@@ -102,13 +100,6 @@ def run_trials(
     DataFrame
         Columns ``run, algorithm, submap, quantity, value``, rows in order of trial: the same table whatever the
         executor.
-
-    Raises
-    ------
-    TrialError
-        A trial failed; its number, its seed and the error are in the message, its traceback in a note.
-    ConfigError
-        Unknown executor, a trial listed twice, or one that cannot be sent to another process.
     """
     numbers = list(range(trials)) if isinstance(trials, int) else [int(k) for k in trials]
     if len(set(numbers)) != len(numbers):

@@ -92,13 +92,6 @@ def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> Path
         In the same frame, at stamps of the path.
     chart : {"group", "cartesian"}
         See :func:`map_errors`.
-
-    Raises
-    ------
-    DataError
-        No covariances, another dimension, or no stamp in common.
-    CovarianceError
-        A covariance that is none.
     """
     if path.covariances is None:
         raise DataError("the path has no covariances", wanted="covariances")

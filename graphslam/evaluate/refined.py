@@ -56,8 +56,6 @@ def refined_truth_metrics(
     ----------
     m : GlobalMap
         With the refined nodes.
-    refinement : Refinement
-    submaps : sequence of Submap
     truth : MapTruth
         Gravity-aligned (:func:`upright_truth`), as ``path``.
     path : Trajectory, optional

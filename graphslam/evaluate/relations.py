@@ -61,14 +61,8 @@ def relation_error(estimate: Trajectory, reference: Trajectory, pairs: tuple[Ind
     ----------
     estimate : Trajectory
         Covers the stamps of the reference; interpolated at them.
-    reference : Trajectory
     pairs : (m,) and (m,)
         Places in the reference.
-
-    Raises
-    ------
-    DataError
-        Different dimensions, no pairs, or stamps that the estimate does not cover.
     """
     if estimate.dim != reference.dim:
         raise DataError("trajectories differ in dimension", got=estimate.dim, wanted=reference.dim)
@@ -106,13 +100,7 @@ def consecutive_pairs(n: int) -> tuple[Index, Index]:
 
 
 def random_pairs(n: int, pairs: int, rng: np.random.Generator) -> tuple[Index, Index]:
-    """Pairs of different poses, drawn evenly ``(pairs,)``.
-
-    Raises
-    ------
-    DataError
-        Fewer than two poses.
-    """
+    """Pairs of different poses, drawn evenly ``(pairs,)``."""
     if n < 2:
         raise DataError("too few poses for a pair", got=n, wanted="at least 2")
     i = rng.integers(n, size=pairs)

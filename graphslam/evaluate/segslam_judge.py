@@ -68,7 +68,6 @@ def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None)
 
     Parameters
     ----------
-    path : Trajectory
     truth : (n, 7) or (n, 3)
     final_pose : (7,) or (3,), optional
         The estimate of the last pose, in the frame that the path is in; default the path's own.
@@ -311,10 +310,8 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
 
     Parameters
     ----------
-    result : SegSlamResult
     truth : (n, 7) or (n, 3)
         At the steps.
-    drift : FilterDrift
     """
     segmap, steps = result.segmap, result.steps
     g = segmap.group
@@ -347,7 +344,6 @@ def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
 
     Parameters
     ----------
-    submap : Submap
     truth : (n, 7)
         At the steps.
     """

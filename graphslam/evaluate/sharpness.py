@@ -72,7 +72,6 @@ def sharpness(
 
     Parameters
     ----------
-    clouds : PointClouds
     paths : mapping of str to Trajectory
         Begin with the one that the others are compared with.
     used : Scans, optional
@@ -87,12 +86,6 @@ def sharpness(
         Least and greatest range of a point [m].
     apart : float
         [s]
-    seed : int
-
-    Raises
-    ------
-    DataError
-        No two scans see the same surfaces.
     """
     rng = np.random.default_rng(seed)
     first, last = max(p.times[0] for p in paths.values()), min(p.times[-1] for p in paths.values())

@@ -25,13 +25,7 @@ class ErrorStatistics:
 
     @classmethod
     def of(cls, errors: ArrayLike) -> ErrorStatistics:
-        """Statistics of ``(n,)`` errors.
-
-        Raises
-        ------
-        DataError
-            If there are none, or one is not finite: an empty score is no score.
-        """
+        """Statistics of ``(n,)`` errors."""
         e = np.asarray(errors, dtype=np.float64).ravel()
         if not len(e):
             raise DataError("no errors to summarise", got=0, wanted="at least one pair of estimate and reference")

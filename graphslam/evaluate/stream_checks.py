@@ -28,7 +28,6 @@ class Noticed:
     ----------
     stream : str
         Its name: what is wrong with a stream that a run does not use does not spoil its map.
-    finding : Finding
     """
 
     stream: str
@@ -47,10 +46,6 @@ def check_speeds(wheels: VelocityControls, name: str) -> list[Finding]:
 
 def check_streams(log: SensorLog) -> list[Noticed]:
     """Look at every stream of a log.
-
-    Parameters
-    ----------
-    log : SensorLog
 
     Returns
     -------

@@ -35,7 +35,6 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
 
     Parameters
     ----------
-    gps : Gps
     name : str
         Of the stream.
     log : SensorLog

@@ -38,7 +38,6 @@ def check_imu(imu: Imu, name: str) -> list[Finding]:
 
     Parameters
     ----------
-    imu : Imu
     name : str
         For the sentences.
     """
@@ -120,7 +119,6 @@ class TurnAgreement:
         By which the gyro is later than the wheels [s].
     correlation : float
         At that lag.
-    windows : int
     """
 
     slope: float
@@ -180,8 +178,6 @@ def check_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
 
     Parameters
     ----------
-    imu : Imu
-    wheels : VelocityControls
     name : str
         Of the IMU, for the sentences.
     """

@@ -91,8 +91,6 @@ class Hypothesis:
 
     Parameters
     ----------
-    text : str
-    speed, turn, ranges, bearings : float
     yaw : float
         Added to bearings [rad].
     """

@@ -34,16 +34,10 @@ def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[
 
     Parameters
     ----------
-    z : LandmarkObservations
     name : str
         Of the stream.
     log : SensorLog
         Its motion tells the way between sightings.
-
-    Raises
-    ------
-    DataError
-        Ranges that hardly change while the robot drives: every map of them is a point.
     """
     if len(z.ranges) == 0:
         return []

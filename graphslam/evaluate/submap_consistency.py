@@ -22,7 +22,6 @@ class SubmapNees:
 
     Parameters
     ----------
-    key : int
     exit : float
         Of the exit pose, 3 or 6 degrees of freedom.
     landmark_ids : (n,) int64
@@ -33,7 +32,6 @@ class SubmapNees:
         Of exit and landmarks together, in the map's own chart.
     joint_plain : float
         The same of the plain vector: larger where the map is right about a bent world.
-    joint_dof : int
     without_truth : int
         Landmarks left out because their identity is unknown or not in the truth.
     """
@@ -52,11 +50,6 @@ def true_submap(submap: Submap, truth: Truth) -> tuple[Array, np.ndarray, Array]
     """What the submap should have said: true exit pose, mask of landmarks with known truth, their true positions.
 
     Everything in the submap's base frame.
-
-    Raises
-    ------
-    DataError
-        If the truth does not span the submap's interval, or differs in dimension.
     """
     if truth.trajectory.dim != submap.dim:
         raise DataError(f"truth is {truth.trajectory.dim}-D", where=f"submap {submap.key}", wanted=f"{submap.dim}-D")

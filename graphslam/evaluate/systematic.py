@@ -125,9 +125,6 @@ class Systematic:
 
     Parameters
     ----------
-    windows : int
-    chi2 : float
-    dof : int
     error, sigma : (p,)
         Each error of :data:`KINDS` as if it were the only one, and its σ.
     taken : (p,)

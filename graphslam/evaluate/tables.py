@@ -29,13 +29,7 @@ def summarise(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def values_of(table: pd.DataFrame, algorithm: str, quantity: str) -> tuple[Array, Array]:
-    """Submap numbers ``(k,)`` and values ``(runs, k)`` of one curve; nan where a run has no figure.
-
-    Raises
-    ------
-    DataError
-        No such figures, or one stands twice.
-    """
+    """Submap numbers ``(k,)`` and values ``(runs, k)`` of one curve; nan where a run has no figure."""
     rows = table[(table["algorithm"] == algorithm) & (table["quantity"] == quantity)]
     if rows.empty:
         raise DataError(f"table has no {quantity!r} of {algorithm!r}", wanted=sorted(set(table["quantity"])))
@@ -87,13 +81,7 @@ class PairedRatio:
 
 
 def paired_ratio(table: pd.DataFrame, quantity: str, a: str, b: str, *, submap: int = -1) -> PairedRatio:
-    """Ratio of a positive figure of algorithms ``a`` and ``b``, run by run: runs differ far more than algorithms.
-
-    Raises
-    ------
-    DataError
-        Fewer than two common runs, or a figure that is not positive.
-    """
+    """Ratio of a positive figure of algorithms ``a`` and ``b``, run by run: runs differ far more than algorithms."""
     rows = table[(table["quantity"] == quantity) & (table["submap"] == submap)]
     wide = rows.pivot(index="run", columns="algorithm", values="value")
     for name in (a, b):
@@ -133,7 +121,6 @@ def consistency_table(
 
     Parameters
     ----------
-    table : DataFrame
     quantity : str
         A NEES.
     dof : float or str
@@ -204,11 +191,6 @@ def ratio_table(
     -------
     DataFrame
         ``world, quantity, a, b`` and the fields of :class:`PairedRatio`.
-
-    Raises
-    ------
-    DataError
-        A figure is not positive.
     """
     pairs = list(pairs)
     rows = table[(table["submap"] == submap) & table["value"].notna()]

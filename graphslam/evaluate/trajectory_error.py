@@ -171,7 +171,6 @@ def ate(
 
     Parameters
     ----------
-    estimate, reference : Trajectory
     alignment : {"none", "origin", "se", "sim"}
         See :func:`fit_alignment`.
     max_diff : float
@@ -246,11 +245,6 @@ def rpe(
         Every pose starts a pair (overlapping), instead of a chain.
     scale : bool
         Correct the estimate's scale first (monocular methods).
-
-    Raises
-    ------
-    DataError
-        No poses, or no pairs ``delta`` apart.
     """
     if not delta > 0:
         raise DataError("RPE needs a positive delta", got=delta, wanted="> 0")

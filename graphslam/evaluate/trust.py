@@ -135,7 +135,6 @@ def trust(rows: Sequence[Evidence], *, fixes: bool, nonlinearity: float = 0.0) -
 
     Parameters
     ----------
-    rows : sequence of Evidence
     fixes : bool
         Fixes are in the graph: a decision must rest on a row of them, too.
     nonlinearity : float

@@ -69,7 +69,6 @@ class ClassConsistency:
 
     Parameters
     ----------
-    name : str
     factors, rows : int
         Factors, and scalars that they measure.
     leverage : float
@@ -82,7 +81,6 @@ class ClassConsistency:
         ``Σ rᵀ Λ r``, without kernels.
     mean_weight, least_weight : float
         Weights that the kernels gave; 1 where there are none.
-    confidence : float
     """
 
     name: str

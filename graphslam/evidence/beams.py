@@ -31,11 +31,6 @@ class BeamModel:
         Bounds of a voxel's probability: they let a map change its mind, and keep memory small.
     threshold : float
         A known voxel of at least this probability is occupied.
-
-    Raises
-    ------
-    ConfigError
-        A figure outside (0, 1), on the wrong side of 0.5, or beyond the ±16 of log-odds a voxel can hold.
     """
 
     hit: float = 0.7

@@ -93,11 +93,6 @@ def compact(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> CompactReport:
     -------
     CompactReport
         What was saved.
-
-    Raises
-    ------
-    GridError
-        Grids of different pools.
     """
     several = list(grids) if isinstance(grids, Sequence) else [grids]
     if not several:

@@ -73,15 +73,9 @@ def box_query(grid: EvidenceGrid, lower: Any, upper: Any) -> BoxCounts:
 
     Parameters
     ----------
-    grid : EvidenceGrid
     lower, upper : (m, dim)
         Corners in the grid's frame [m]; may be infinite. A voxel that a box only touches is not of it; a box of no
         extent along an axis overlaps the voxels it lies in. Voxels outside the addressable cube are not there.
-
-    Raises
-    ------
-    GridError
-        Wrong shapes, NaN, or a lower corner above the upper one.
     """
     a = point_rows(lower, grid.dim, grid.voxel_size, "lower corners")
     b = point_rows(upper, grid.dim, grid.voxel_size, "upper corners")
@@ -139,7 +133,6 @@ def occupied_cloud(grid: EvidenceGrid, *, with_log_odds: bool = False) -> Any:
 
     Parameters
     ----------
-    grid : EvidenceGrid
     with_log_odds : bool
         Give their log-odds too.
 
@@ -158,16 +151,10 @@ def binned_cloud(grid: EvidenceGrid, level: int, *, minimum: int = 1) -> BinnedC
 
     Parameters
     ----------
-    grid : EvidenceGrid
     level : int
         0 gives every voxel by itself. Cells are those of the octree: the lattice of cells contains the origin.
     minimum : int
         Cells with fewer occupied voxels are left out.
-
-    Raises
-    ------
-    GridError
-        Another level than 0 … the height of the tree.
     """
     height = int(grid.pool.half).bit_length()
     if not (isinstance(level, (int, np.integer)) and 0 <= level <= height):

@@ -78,17 +78,11 @@ def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: 
 
     Parameters
     ----------
-    grid : EvidenceGrid
     bounds : (2, dim) int, optional
         First voxel and the one after the last; may reach beyond the map and its addressable cube. Default: the box of
         the known voxels.
     dtype : int16 or float32
         Units of `layout.STEP`, or log-odds.
-
-    Raises
-    ------
-    GridError
-        Impossible bounds or type, or an array of more than `DENSE_LIMIT` bytes.
     """
     kind = np.dtype(dtype)
     if kind not in (np.dtype(np.int16), np.dtype(np.float32)):
@@ -144,13 +138,6 @@ def from_dense(dense: DenseGrid, *, model: BeamModel | None = None, pool: GridPo
     ----------
     dense : DenseGrid
         float32 and float64 are log-odds, rounded to the nearest multiple of `layout.STEP`; int16 is taken as it is.
-    model : BeamModel, optional
-    pool : GridPool, optional
-
-    Raises
-    ------
-    GridError
-        Impossible shape or type, log-odds that are infinite or beyond ±16, voxels outside the addressable cube.
     """
     values: npt.NDArray[Any] = np.asarray(dense.values)
     dim = values.ndim
@@ -214,17 +201,9 @@ def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> E
 
     Parameters
     ----------
-    path : path
     pool : GridPool, optional
         Storage to read into, whatever its number of levels, so long as the map fits; default a new one of as many
         levels as the map was made with.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        No such file; truncated, corrupt or impossible in some field.
-    GridError
-        The map does not fit the pool.
     """
     where = str(path)
     arrays = read_npz(path, fmt=FORMAT)

@@ -45,7 +45,6 @@ class EvidenceGrid:
     ----------
     voxel_size : float
         Edge of a voxel [m].
-    model : BeamModel, optional
     pool : GridPool, optional
         Storage shared with other grids; default a pool of its own.
     dim : {3, 2}

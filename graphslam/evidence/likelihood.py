@@ -42,10 +42,6 @@ class EndpointLikelihood:
     interpolation : {"trilinear", "nearest"}
     unknown : float
         Probability of occupancy where the map knows nothing.
-
-    Raises
-    ------
-    ConfigError
     """
 
     exponent: float
@@ -89,10 +85,6 @@ class CastLikelihood:
         counts as ``unknown`` standard deviations off, unless it was measured to end nearer than that.
     unknown : float, optional
         See there; default ``clip``, so that a map is not rewarded for knowing nothing.
-
-    Raises
-    ------
-    ConfigError
     """
 
     exponent: float
@@ -116,7 +108,6 @@ class CastLikelihood:
             Of a `Cast`.
         measured : (n,)
             Ranges [m]; `max_range` or more where a beam met nothing, NaN for beams to leave out, which give 0.
-        max_range : float
         """
         status = np.asarray(status)
         m = np.minimum(np.asarray(measured, dtype=np.float64), max_range)
@@ -155,16 +146,11 @@ def log_weights(
     points, origin, max_range, returns
         The scan, as in `update_grids`. Beams that are not finite, and of no length, tell nothing. Casting needs the
         maximum range.
-    likelihood : EndpointLikelihood or CastLikelihood
 
     Returns
     -------
     (P,) float64
         Sums over the beams, times the exponent; the same for any number of threads.
-
-    Raises
-    ------
-    GridError, GeometryError, ConfigError
     """
     if not len(grids):
         return np.zeros(0)

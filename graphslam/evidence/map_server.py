@@ -30,17 +30,6 @@ def save_map_server(grid: EvidenceGrid, path: str | os.PathLike[str]) -> tuple[P
         Of dimension 2.
     path : path
         Ending in ``.yaml``.
-
-    Returns
-    -------
-    (yaml, image) : paths
-
-    Raises
-    ------
-    GridError
-        A 3-D grid, or one in which nothing is known (an image of no pixel cannot be read).
-    FormatError
-        Another ending.
     """
     target = Path(path)
     if target.suffix != ".yaml":

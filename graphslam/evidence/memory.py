@@ -58,15 +58,6 @@ def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
     Parameters
     ----------
     grids : EvidenceGrid, or several of one pool
-
-    Returns
-    -------
-    Memory
-
-    Raises
-    ------
-    GridError
-        Grids of different pools.
     """
     several = list(grids) if isinstance(grids, Sequence) else [grids]
     if not several:
@@ -102,7 +93,6 @@ def shared_bricks(grid: EvidenceGrid, others: Sequence[EvidenceGrid]) -> npt.NDA
 
     Parameters
     ----------
-    grid : EvidenceGrid
     others : sequence of EvidenceGrid
         Of the same pool.
 

@@ -32,12 +32,6 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
         Of one voxel size and dimension.
     pose : (7,), (4, 4), or (3,) in 2-D
         ``T_grid_other``; default identity.
-
-    Raises
-    ------
-    GridError
-        Other voxel size or dimension, or a map that would reach out of the addressable cube; nothing was written.
-    GridLockedError
     """
     grid.check_writable()
     if other.voxel_size != grid.voxel_size or other.dim != grid.dim:

@@ -78,7 +78,6 @@ def read_octomap(
 
     Parameters
     ----------
-    path : path
     model : BeamModel, optional
         The files name none. Leaves of a ``.bt`` get its clamping values, as in OctoMap.
     pool : GridPool, optional
@@ -88,15 +87,6 @@ def read_octomap(
     -------
     EvidenceGrid
         Log-odds of a ``.ot`` are rounded to the nearest multiple of `layout.STEP` and cut at ±16.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Not an ``OcTree``, truncated, corrupt; names the byte.
-    GridError
-        The map reaches beyond the pool's addressable cube.
     """
     where = str(path)
     data = read_bytes(path)
@@ -234,13 +224,6 @@ def write_octomap(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
     path : path
         Ending in ``.ot``: log-odds, exact. Ending in ``.bt``: known voxels are occupied or free by the model's
         threshold (maximum likelihood), and nothing more is kept of them.
-
-    Raises
-    ------
-    FormatError
-        Another ending.
-    GridError
-        Known voxels outside OctoMap's ±32,768.
     """
     suffix = Path(path).suffix
     if suffix not in (".bt", ".ot"):

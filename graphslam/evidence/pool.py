@@ -56,11 +56,6 @@ class GridPool:
     levels : int
         Levels of nodes over the bricks, 2 … 7: the addressable cube has ``8·4**levels`` voxels a side (8,192 at the
         default of 5, which is 819 m of 0.1 m voxels).
-
-    Raises
-    ------
-    GridError
-        An impossible number of levels.
     """
 
     def __init__(self, levels: int = DEFAULT_LEVELS) -> None:

@@ -98,7 +98,6 @@ def cast(
 
     Parameters
     ----------
-    grid : EvidenceGrid
     origins : (3,) or (n, 3), (2,) or (n, 2) in 2-D, or None for 0
         In the frame of the scan [m].
     directions : (n, 3) or (n, 2)
@@ -116,11 +115,6 @@ def cast(
     -------
     Cast
         Arrays ``(n, …)``.
-
-    Raises
-    ------
-    GridError, GeometryError
-        Impossible shapes, pose or maximum range.
     """
     rows = pose_row(pose, grid.dim)[None]
     found = _cast([grid], rows, origins, directions, max_range, ignore_unknown, voxels, 1)
@@ -153,11 +147,6 @@ def cast_grids(
     -------
     Cast
         Arrays ``(P, n, …)``.
-
-    Raises
-    ------
-    GridError, GeometryError, ConfigError
-        As :func:`cast`; grids that do not belong together; fewer threads than one.
     """
     if not len(grids):
         n = len(np.asarray(directions))
@@ -227,10 +216,6 @@ def endpoint_log_odds(
     -------
     (P, n) float32
         Exact; NaN where nothing is known, outside the cube, and for points that are not finite.
-
-    Raises
-    ------
-    GridError, GeometryError, ConfigError
     """
     return _look_up(grids, _rows(grids, poses), points, _log_odds_table(), False, threads)
 
@@ -260,10 +245,6 @@ def endpoint_probability(
     -------
     (P, n) float32
         NaN for points that are not finite.
-
-    Raises
-    ------
-    GridError, GeometryError, ConfigError
     """
     if interpolation not in ("nearest", "trilinear"):
         raise ConfigError(f"interpolation {interpolation!r}; wanted 'nearest' or 'trilinear'")
@@ -322,13 +303,7 @@ def _look_up(
 
 
 def check_together(grids: Sequence[EvidenceGrid], *, same_threshold: bool = False) -> EvidenceGrid:
-    """Refuse grids that cannot be read in one call; returns the first.
-
-    Raises
-    ------
-    GridError
-        Different pools, voxel sizes or dimensions, or (``same_threshold``) rules of what is occupied.
-    """
+    """Refuse grids that cannot be read in one call; returns the first."""
     first = grids[0]
     for k, g in enumerate(grids):
         if g.pool is not first.pool or g.voxel_size != first.voxel_size or g.dim != first.dim:

@@ -59,12 +59,6 @@ def pose_row(pose: Any, dim: int) -> Array:
     Parameters
     ----------
     pose : (7,) x y z qx qy qz qw, (3,) x y θ in 2-D, (4, 4), or None for the identity
-    dim : int
-
-    Raises
-    ------
-    GeometryError
-        Another shape, a figure that is not finite, or a quaternion or matrix that is no rotation.
     """
     if pose is None:
         return _IDENTITY
@@ -151,13 +145,7 @@ def point_rows(points: Any, dim: int, voxel_size: float, what: str = "points") -
 def scan_rows(
     points: Any, origin: Any, returns: Any, max_range: float | None, dim: int, voxel_size: float
 ) -> tuple[Array, Array, npt.NDArray[np.uint8], float]:
-    """A scan as the kernels want it: points ``(n, 3)``, origins ``(n, 3)`` or ``(1, 3)``, returns, maximum range.
-
-    Raises
-    ------
-    GridError
-        Shapes that do not fit, or an impossible maximum range.
-    """
+    """A scan as the kernels want it: points ``(n, 3)``, origins ``(n, 3)`` or ``(1, 3)``, returns, maximum range."""
     p = point_rows(points, dim, voxel_size)
     if origin is None:
         o = _ZERO if dim == 3 else np.array([[0.0, 0.0, 0.5 * voxel_size]])

@@ -72,7 +72,6 @@ def shelved(grid: EvidenceGrid, shelf: Shelf | None = None) -> EvidenceGrid:
 
     Parameters
     ----------
-    grid : EvidenceGrid
     shelf : Shelf, optional
         By default that of the process.
     """

@@ -19,12 +19,7 @@ from graphslam.evidence.shelved import shelved
 
 
 class GridView:
-    """A `graphslam.core.dense.MapView` of an evidence grid.
-
-    Parameters
-    ----------
-    grid : EvidenceGrid
-    """
+    """A `graphslam.core.dense.MapView` of an evidence grid."""
 
     cloud: CloudMap | None = None
     knows_space = True
@@ -59,7 +54,6 @@ class CloudView:
 
     Parameters
     ----------
-    cloud : CloudMap
     grid : EvidenceGrid, optional
         Of the same submap, where the front end made one.
     """
@@ -115,13 +109,7 @@ class CloudView:
 
 
 def view_of(submap: Submap) -> MapView:
-    """The dense map of a submap.
-
-    Raises
-    ------
-    DataError
-        It has none.
-    """
+    """The dense map of a submap."""
     grid = submap.grid
     if submap.cloud is not None and (grid is None or isinstance(grid, EvidenceGrid)):
         return CloudView(submap.cloud, grid)

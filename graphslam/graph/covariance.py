@@ -25,14 +25,8 @@ class JointCovariance:
 
     Parameters
     ----------
-    layout : Layout
     A : (n, n) dense or CSC
         Gauss-Newton matrix.
-
-    Raises
-    ------
-    IndeterminateError
-        If ``A`` is singular. :meth:`PoseGraph.diagnose` then says which variables and why.
     """
 
     def __init__(self, layout: Layout, A: Array | sp.csc_matrix) -> None:

@@ -76,7 +76,6 @@ def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diag
 
     Parameters
     ----------
-    flat : FlatGraph
     values : Values
         Where to linearise.
     waiting_fixes : int

@@ -79,7 +79,6 @@ class FlatGraph:
     ----------
     records : sequence of Record
         One batch is made for each kind.
-    layout : Layout
     batches : sequence of FactorBatch, optional
         Factors that came as arrays; they count behind the records.
     """

@@ -95,7 +95,6 @@ def add_odometer(
     ----------
     graph : GraphRecord
         In space, with the first base alone.
-    odometry : Odometry
     stream : str
         Its name in the ledger.
 
@@ -103,10 +102,6 @@ def add_odometer(
     -------
     (n,) int64
         Node of every record.
-
-    Raises
-    ------
-    GeometryError, DataError, CovarianceError
     """
     cfg = config or OdometerConfig()
     if graph.dim != 3 or odometry.increments.shape[1] != 7:
@@ -150,24 +145,17 @@ def add_pseudoranges(
     ----------
     graph : GraphRecord
         In space, with nodes that have start values.
-    ranges : Pseudoranges
     plane : TangentPlane
         East, north and up of the GPS frame.
     nodes : (n,) int
         Node of every epoch; -1: the epoch is left out, and counted.
     stream : str
         Its name in the ledger.
-    config : PseudorangeConfig, optional
 
     Returns
     -------
     list of int
         Factor ids, one a pseudorange that was used.
-
-    Raises
-    ------
-    GeometryError, DataError, EvidenceReusedError
-        Nothing is changed then.
     """
     cfg, at = config or PseudorangeConfig(), np.asarray(nodes, dtype=np.int64)
     if graph.dim != 3:
@@ -312,11 +300,6 @@ def antenna_positions(graph: GraphRecord, nodes: npt.ArrayLike, arm: Array) -> t
         Counted from the origin of the GPS frame.
     covariances : (k, dim, dim)
         Of nodes, datum and tilt together.
-
-    Raises
-    ------
-    DataError
-        The graph has no datum.
     """
     values, at = graph.values, np.asarray(nodes, dtype=np.int64)
     if values.datum is None:

@@ -239,10 +239,6 @@ class GpsFixes:
 
     A fix at ``t`` belongs to the submap with ``t_start <= t < t_end``: exactly on a boundary it belongs to the later
     one. The very last instant of a finished graph belongs to the last submap.
-
-    Parameters
-    ----------
-    graph : GraphRecord
     """
 
     def __init__(self, graph: GraphRecord) -> None:

@@ -36,9 +36,7 @@ class BetweenBlock:
 
     Parameters
     ----------
-    first_id : int
     ends, T_ij, whiteners : (m, 2), (m, 3|7), (m, d, d)
-    group : str
     kept : (m,) bool
         Those that were not removed since.
     """
@@ -297,11 +295,6 @@ class GraphRecord:
         -------
         int
             Id of the new landmark, which stands where the submap saw it.
-
-        Raises
-        ------
-        DataError
-            No such submap factor or entry, or nothing else sees its landmark.
         """
         record = self.records.get(factor_id)
         if not isinstance(record, SubmapRecord) or not 0 <= entry < len(record.landmark_ids):
@@ -330,13 +323,7 @@ class GraphRecord:
             self.records[inner.factor_id] = replace(path, landmark_ids=ids)
 
     def set_values(self, values: Values) -> None:
-        """Take a solver's values (same variables).
-
-        Raises
-        ------
-        DataError
-            If they are not finite or are of other variables.
-        """
+        """Take a solver's values (same variables)."""
         if not values.is_finite():
             raise DataError("values of the graph are not finite", wanted="finite numbers")
         if values.layout() != self.structure.layout():
@@ -354,13 +341,7 @@ class GraphRecord:
         return self.submap(submap_key).node
 
     def submap(self, submap_key: int) -> SubmapNode:
-        """A submap's nodes, by its key.
-
-        Raises
-        ------
-        DataError
-            It is not in the graph.
-        """
+        """A submap's nodes, by its key."""
         if submap_key in self._place:
             return self.submaps[self._place[submap_key]]
         raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")

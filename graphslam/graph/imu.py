@@ -48,12 +48,7 @@ class ImuUse:
 
 
 class ImuUnits:
-    """The IMUs of a graph in space.
-
-    Parameters
-    ----------
-    graph : GraphRecord
-    """
+    """The IMUs of a graph in space."""
 
     def __init__(self, graph: GraphRecord) -> None:
         self.graph = graph

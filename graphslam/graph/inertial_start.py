@@ -44,11 +44,6 @@ def inertial_start(imu: Imu, times: Array, positions: Array) -> tuple[Array, Arr
         Quaternion of the body in the frame of the positions at the first of ``times``.
     bias : (3,)
         [rad/s]
-
-    Raises
-    ------
-    DataError
-        Fewer than four positions, or readings do not cover them.
     """
     n = len(times)
     if n < 4:

@@ -69,7 +69,6 @@ def cut_submap(submap: Submap, spacing: float | None) -> Cut:
 
     Parameters
     ----------
-    submap : Submap
     spacing : float or None
         Metres of the way between nodes; None: no inner nodes.
     """

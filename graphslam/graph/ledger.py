@@ -87,17 +87,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return None
 
     def check(self, factor: str, streams: Iterable[str], interval: tuple[float, float], kind: str = EXCLUSIVE) -> None:
-        """Raise if :meth:`spend` would.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A stream of an exclusive factor is already spent over an overlapping interval.
-        ConfigError
-            The kind was not declared.
-        DataError
-            The interval is not finite or runs backwards.
-        """
+        """Raise if :meth:`spend` would."""
         t0, t1 = interval
         if not (np.isfinite(t0) and np.isfinite(t1) and t0 <= t1):
             raise DataError(f"interval of {factor} cannot be entered in the ledger", got=interval, wanted="t0 <= t1")

@@ -61,13 +61,7 @@ def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGra
 
 
 def network_of(flat: FlatGraph, values: Values) -> PoseNetwork:
-    """A problem of relative poses as a network: for what knows nothing else (chordal starts, the certificate).
-
-    Raises
-    ------
-    SolverError
-        The problem holds factors of other kinds, which are named, or robust kernels.
-    """
+    """A problem of relative poses as a network: for what knows nothing else (chordal starts, the certificate)."""
     others = sorted({name for f in flat.batches if not isinstance(f, BetweenBatch) for name, _ in f.classes()})
     if others or flat.has_kernels:
         what = f"factors of other kinds ({', '.join(others)})" if others else "robust kernels"

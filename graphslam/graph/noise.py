@@ -30,11 +30,6 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
         Wanted d.
     scale : float
         Factor on the covariance (> 0): 5 says that the front end is over-confident by a factor of 5 in variance.
-
-    Raises
-    ------
-    CovarianceError
-        Says which entry is wrong, or that the matrix is singular to working precision.
     """
     if not (np.isfinite(scale) and scale > 0):
         raise CovarianceError(f"scale of the {what} is not usable", got=scale, wanted="> 0")
@@ -77,11 +72,6 @@ def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: 
     -------
     (count, dim, dim)
         A view of one matrix where all share it.
-
-    Raises
-    ------
-    CovarianceError
-        Names the first one that is not finite, symmetric and positive definite.
     """
     P = np.asarray(covariances, dtype=np.float64)
     if P.shape == (dim, dim):

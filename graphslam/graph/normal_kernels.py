@@ -69,10 +69,8 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
     Parameters
     ----------
     poses : (m + 1, 3); points : (n, 2)
-    submaps : SubmapArrays
     hessian : bool
         Fill H as well.
-    out : SubmapBlocks
     """
     start, entry_offset, entry_row, z, z_offset, info, info_offset, group, constant = submaps
     H, H_offset, g, g_offset, chi2 = out

@@ -135,12 +135,7 @@ class _Beacon:
 
 
 class Readings:
-    """Compasses and beacons of a graph.
-
-    Parameters
-    ----------
-    graph : GraphRecord
-    """
+    """Compasses and beacons of a graph."""
 
     def __init__(self, graph: GraphRecord) -> None:
         self.graph = graph

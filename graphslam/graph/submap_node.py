@@ -57,7 +57,6 @@ class InnerPoints:
 
     Parameters
     ----------
-    path : PathPoints
     mean, joint : (n,), (n, n)
         Of exit and landmarks, as the submap states them.
     scale : float
@@ -100,7 +99,6 @@ class SubmapNode:
 
     Parameters
     ----------
-    key : int
     node : int
         Node at its base.
     interval : (t_start, t_end)
@@ -179,11 +177,6 @@ class SubmapNode:
         T_node_body : (q, 3|7)
         covariance : (q, d, d) or None
             Right tangent at the body; None where the path has none.
-
-        Raises
-        ------
-        DataError
-            Outside the path.
         """
         assert self.trajectory is not None
         path = self.trajectory
@@ -198,13 +191,7 @@ class SubmapNode:
         return self._seen(path.times[rows], path.poses[rows], P, at)
 
     def between(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> Bridge:
-        """The path's own instants ``rows`` between the nodes ``at`` and the next ones: what each of the two says.
-
-        Raises
-        ------
-        DataError
-            The path has no covariances.
-        """
+        """The path's own instants ``rows`` between the nodes ``at`` and the next ones: what each of the two says."""
         T, Q = self.local_rows(rows, at)
         if self.trajectory is None or Q is None:
             raise DataError(f"path of submap {self.key} has no covariances", wanted="covariances")

@@ -134,13 +134,7 @@ for _kind in (
 
 @lru_cache(maxsize=4096)
 def split_name(name: str) -> tuple[VariableKind, int]:
-    """Kind and number (0 of a single one) of a variable's name.
-
-    Raises
-    ------
-    SolverError
-        No such name.
-    """
+    """Kind and number (0 of a single one) of a variable's name."""
     if name in KINDS and KINDS[name].single:
         return KINDS[name], 0
     word = name.rstrip("0123456789")
@@ -453,13 +447,7 @@ class Layout:
         return [name for name in self.names() for _ in range(split_name(name)[0].dof(self.dim))]
 
     def columns(self, name: str) -> npt.NDArray[np.intp]:
-        """Columns of one variable; none for the fixed ``x0``.
-
-        Raises
-        ------
-        SolverError
-            Unknown variable.
-        """
+        """Columns of one variable; none for the fixed ``x0``."""
         kind, k = split_name(name)
         row = self.row_of.get(k, -1) if kind.word == "l" else k
         if not 0 <= row < self.count(kind.word):

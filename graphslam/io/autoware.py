@@ -47,11 +47,6 @@ def write_autoware(
         [deg, WGS 84]; its height is 0.
     tile : float
         Side of a tile [m], a whole number.
-
-    Raises
-    ------
-    DataError
-        No point, or a tile whose side is no whole number of metres.
     """
     p = np.asarray(points, dtype=np.float64)
     if not len(p):

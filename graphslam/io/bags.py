@@ -415,14 +415,6 @@ def read_bag(
     floor, per_metre, per_radian : float
         σ of one motion of the odometry: at least metres, radians; per metre driven: of position [m/m] and heading
         [rad/m]; of the heading per radian turned.
-    name : str, optional
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError
-        No such bag, a package is missing, or no topic holds a scanner or odometry.
-    FormatError, DataError, ConfigError
     """
     values = [*floor, 1.0 if max_range is None else max_range]
     if not (all(np.isfinite(v) and v > 0 for v in values) and min(*per_metre, per_radian) >= 0):

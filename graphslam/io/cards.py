@@ -73,7 +73,6 @@ class Card:
 
     Parameters
     ----------
-    name, title : str
     kind : str
         One of :data:`KINDS`.
     folder : str
@@ -82,11 +81,8 @@ class Card:
         What it holds, in words.
     source, obtained_from : str
         The original page, and where our copy came from.
-    citation, licence, terms : str
     caveats : tuple of str
         Traps.
-    files : tuple of CardFile
-    archives : tuple of CardArchive
     reader : str or None
         Name of a reader (:mod:`graphslam.io.readers`).
     options : mapping of str to float
@@ -137,13 +133,7 @@ class Card:
 
 
 def cards_folder() -> Path:
-    """Folder of the cards: inside the installed package, or ``datasets`` beside it in a checkout.
-
-    Raises
-    ------
-    MissingDataError
-        The installation holds no cards.
-    """
+    """Folder of the cards: inside the installed package, or ``datasets`` beside it in a checkout."""
     package = Path(graphslam.__file__).resolve().parent
     for folder in (package / "cards", package.parent / "datasets"):
         if any(folder.glob("*.toml")):
@@ -172,13 +162,7 @@ def card(name: str) -> Card:
 
 
 def read_card(path: Path) -> Card:
-    """Read and check one card.
-
-    Raises
-    ------
-    FormatError
-        Names the file and the key.
-    """
+    """Read and check one card."""
     where = str(path)
     try:
         content = tomllib.loads(read_text(path))

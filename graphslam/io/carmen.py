@@ -84,18 +84,12 @@ def read_carmen(
         σ of the heading per radian turned.
     most_mended : float
         Farthest that a stamp may be moved [s].
-    name : str, optional
-    drops : DropCounter, optional
 
     Returns
     -------
     SensorLog
         Streams ``laser``, ``odometry`` (one motion a scan; none if the log tells no pose) and, with a corrected log,
         ``reference``: a Trajectory of the base. It is the output of another SLAM, not truth.
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError, ConfigError
     """
     for what, values in (("max_range", [max_range or 1.0]), ("floor", floor), ("most_mended", [most_mended])):
         if not all(np.isfinite(v) and v > 0 for v in values) or max_range == 0:
@@ -164,12 +158,6 @@ def mend_stamps(stamps: Array, most: float, *, where: str) -> tuple[Array, int]:
         Finite [s].
     most : float
         Farthest that any may move [s].
-    where : str
-
-    Raises
-    ------
-    DataError
-        A stamp is too far off: the clock was set, or lines are out of order. Names it.
     """
     if np.all(np.diff(stamps) > 0):
         return stamps, 0

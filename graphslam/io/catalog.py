@@ -47,15 +47,7 @@ def find_file(folder: Path, file: CardFile) -> Path | None:
 
 
 def locate(data: Card | str) -> Path:
-    """Folder that holds the data set's needed files.
-
-    Raises
-    ------
-    UnknownNameError
-        No such card.
-    MissingDataError
-        Says what is missing, where it was looked for and how to get it.
-    """
+    """Folder that holds the data set's needed files."""
     c = card(data) if isinstance(data, str) else data
     needed = [f for f in c.files if not f.optional]
     roots = data_roots()
@@ -101,13 +93,7 @@ def check_file(folder: Path, file: CardFile) -> FileCheck:
 
 
 def check(data: Card | str) -> list[FileCheck]:
-    """Compare every file with the card, in the first root that holds any of them.
-
-    Raises
-    ------
-    UnknownNameError
-        No such card.
-    """
+    """Compare every file with the card, in the first root that holds any of them."""
     c = card(data) if isinstance(data, str) else data
     folders = [root / c.folder for root in data_roots()]
     folder = next((d for d in folders if any(find_file(d, f) for f in c.files)), folders[-1])

@@ -71,11 +71,6 @@ def usable_records(
     Returns
     -------
     (n,) bool
-
-    Raises
-    ------
-    DataError
-        No record, or more than ``limit`` of them bad: names the most frequent reason and the first record.
     """
     n = len(times)
     if n == 0:

@@ -83,14 +83,8 @@ def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
 
     Parameters
     ----------
-    path : path
     columns : int
         Of float32 in a BIN file, x, y and z first: 4 in KITTI, 5 in nuScenes.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        No such file, truncated, or without x, y and z; a package for LAS is missing.
     """
     p = Path(path)
     raw = read_bytes(p)
@@ -159,13 +153,8 @@ def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
 
     Parameters
     ----------
-    path : path
     columns : int
         As for :func:`read_cloud`.
-
-    Raises
-    ------
-    MissingDataError, FormatError
     """
     p = Path(path)
     if plain_name(p) != p.name.lower():  # compressed: its size is known when it is unpacked
@@ -385,12 +374,7 @@ def _pcd(raw: bytes, where: str) -> Cloud:
 
 
 def lzf(data: bytes, size: int, where: str) -> bytes:
-    """Unpack LZF (as liblzf of PCL packs) to ``size`` bytes.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Unpack LZF (as liblzf of PCL packs) to ``size`` bytes."""
     out = bytearray()
     at, end = 0, len(data)
     try:

@@ -56,7 +56,6 @@ class FileClouds:
 
     Parameters
     ----------
-    paths : list of Path
     columns : int
         Of BIN files.
     scale : float
@@ -131,7 +130,6 @@ def read_clouds(
 
     Parameters
     ----------
-    path : path
     period : float, optional
         Seconds from scan to scan; by default stamps come from ``times.txt``, from the poses, from names that are
         stamps, or else scans are 0.1 s apart.
@@ -144,12 +142,6 @@ def read_clouds(
         Use times of points, where files have them.
     odometry_sigmas : (float, float)
         σ of one motion from scan to scan, per axis: metres, radians.
-    name : str, optional
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError, ConfigError
     """
     root = Path(path)
     if not root.is_dir():
@@ -431,12 +423,6 @@ def read_kitti(
         ``calib.txt``.
     odometry_sigmas : (float, float)
         σ of one motion from scan to scan, per axis: metres, radians.
-    name : str, optional
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError, ConfigError
     """
     root = Path(path)
     if not root.is_dir():

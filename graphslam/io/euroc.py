@@ -67,10 +67,6 @@ def read_euroc(
         Of the log.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
-
-    Raises
-    ------
-    ConfigError, MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     if not root.is_dir():

@@ -28,7 +28,6 @@ def fetch(data: Card | str, *, progress: bool = False) -> Path:
 
     Parameters
     ----------
-    data : Card or str
     progress : bool
         Show a bar for every download.
 
@@ -36,15 +35,6 @@ def fetch(data: Card | str, *, progress: bool = False) -> Path:
     -------
     Path
         Folder that holds the files: the cache, or where they already were.
-
-    Raises
-    ------
-    UnknownNameError
-        No such card.
-    MissingDataError
-        The card has no direct download (says where to get the data), or the server does not answer.
-    DataError
-        What came is not what the card says.
     """
     c = card(data) if isinstance(data, str) else data
     log.info("%s: %s", c.name, c.title)
@@ -131,13 +121,7 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, mo
 
 
 def _stream(url: str, file: str, most: int, progress: bool) -> None:
-    """Write what an address gives, no more than ``most`` bytes of it; every redirect must be to an allowed scheme.
-
-    Raises
-    ------
-    DataError
-        Another scheme, too many redirects, or more data than the card says.
-    """
+    """Write what an address gives, no more than ``most`` bytes of it; every redirect must be to an allowed scheme."""
     import requests
     from tqdm import tqdm
 

@@ -53,13 +53,6 @@ def read_g2o(path: str | os.PathLike[str], *, repair: bool = False, create_missi
     create_missing : bool
         Make vertices that only edges name, without an initial pose, instead of refusing them. A file of edges alone
         is read in any case.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        With file and line.
-    CovarianceError
-        Names the edges whose information is impossible.
     """
     return parse_g2o(path, read_text(path), repair=repair, create_missing=create_missing)
 
@@ -114,11 +107,6 @@ def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:
     """Write a network as g2o with 17 significant digits; ``.xz``, ``.gz`` and ``.bz2`` compress.
 
     Poses without an initial value are left out, as in a file of edges only.
-
-    Raises
-    ------
-    DataError
-        For bearing-range observations with correlated noise, which the ``BR`` record cannot hold.
     """
     vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if network.dim == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
     lines = [

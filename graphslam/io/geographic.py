@@ -30,7 +30,6 @@ class GeographicMap:
 
     Parameters
     ----------
-    name, description : str
     path : (n, 2)
     landmarks : (k, 2)
     landmark_ids : (k,) int64

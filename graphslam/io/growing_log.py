@@ -34,7 +34,6 @@ class GrowingLog(Feed):
 
     Parameters
     ----------
-    name : str
     folder : path
         For the beams; must stay as long as the log is used.
     meta : mapping, optional
@@ -47,15 +46,7 @@ class GrowingLog(Feed):
         self._whole: SensorLog | None = None
 
     def add(self, stream: str, records: Stream) -> None:
-        """Take records that follow those of the stream so far.
-
-        Raises
-        ------
-        DataError
-            The log has ended; they are of another kind or sensor, or are not later than those before them.
-        FormatError
-            Records of an unknown kind.
-        """
+        """Take records that follow those of the stream so far."""
         if self.ended:
             raise DataError("records after the end of the log", where=f"{self._name}/{stream}")
         if not len(records.times):

@@ -54,10 +54,6 @@ def read_isam_graph(
         Project impossible matrices instead of refusing them.
     create_missing : bool
         Make vertices that only edges name, where others are given, instead of refusing them.
-
-    Raises
-    ------
-    MissingDataError, FormatError, CovarianceError
     """
     return parse_isam_graph(path, read_text(path), noise=noise, repair=repair, create_missing=create_missing)
 

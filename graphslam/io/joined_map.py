@@ -55,7 +55,6 @@ def write_joined(
 
     Parameters
     ----------
-    folder : path
     times : (m + 1,)
     poses : (m + 1, 3|7)
     landmark_ids : (n,)
@@ -93,12 +92,7 @@ def write_joined(
 
 
 def read_joined(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Arrays of a joined map: ``times, poses, landmark_ids, landmarks``, and the uncertainty where the file has it.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """Arrays of a joined map: ``times, poses, landmark_ids, landmarks``, and the uncertainty where the file has it."""
     file = Path(folder) / "joined.npz"
     where = str(file)
     found = read_arrays(file)
@@ -123,13 +117,7 @@ def read_joined(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def information_of(joined: dict[str, np.ndarray]) -> sp.csc_matrix | None:
-    """Information matrix ``(s, s)`` of a joined map that was read; None where it has none.
-
-    Raises
-    ------
-    FormatError
-        Its parts are not those of a square matrix.
-    """
+    """Information matrix ``(s, s)`` of a joined map that was read; None where it has none."""
     names = [f"information_{part}" for part in ("data", "indices", "indptr")]
     if not any(name in joined for name in names):
         return None

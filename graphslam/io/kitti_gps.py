@@ -39,17 +39,12 @@ def read_kitti_gps(
 
     Parameters
     ----------
-    folder : path
     sigma : float
         Of a coordinate of a fix [m].
     name : str
         Of the log.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
-
-    Raises
-    ------
-    ConfigError, MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     if not root.is_dir():

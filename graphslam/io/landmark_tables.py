@@ -64,7 +64,6 @@ class Header:
     ----------
     columns : dict of str to (int, float)
         Column and factor to SI units, by our name.
-    separator : str or None
     width : int
         Columns in all.
     line : int
@@ -194,12 +193,6 @@ def read_landmark_tables(
     floor, per_metre, per_radian : float
         σ of one motion between poses: at least metres, radians; per metre driven; of the heading per radian turned.
         Velocities carry none, it is an option of the front end.
-    name : str, optional
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError, ConfigError
     """
     root = Path(path)
     if not root.exists():

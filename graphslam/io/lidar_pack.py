@@ -58,11 +58,6 @@ class PackedClouds:
     offsets : (n + 1,) int64
     step : float
         Metres of one unit.
-
-    Raises
-    ------
-    FormatError
-        Not such an array, or of another size than the offsets say.
     """
 
     def __init__(self, path: Path, offsets: npt.NDArray[np.int64], step: float) -> None:
@@ -87,13 +82,7 @@ class PackedClouds:
         return self._points is not None
 
     def cloud(self, k: int) -> Array:
-        """Points ``(m, 3)`` of scan k [m], missing returns left out.
-
-        Raises
-        ------
-        FormatError
-            The file is truncated or corrupt.
-        """
+        """Points ``(m, 3)`` of scan k [m], missing returns left out."""
         with self._lock:
             if self._points is None:
                 self._points = self._read()
@@ -140,7 +129,6 @@ def read_lidar_pack(
 
     Parameters
     ----------
-    folder : path
     step : float
         Metres of one unit of the coordinates. The files do not say it; the card of a data set does.
     period : float, optional
@@ -160,13 +148,6 @@ def read_lidar_pack(
     SensorLog
         A scan whose stamp or pose is unusable is dropped and counted. Points that are missing returns are left out
         when a cloud is decoded; ``PointClouds.counts`` has them.
-
-    Raises
-    ------
-    ConfigError
-        No step, no stamps and no period, or an impossible number.
-    MissingDataError, FormatError, DataError
-        Files that are absent, truncated, or do not match each other.
     """
     root = Path(folder)
     if not root.is_dir():

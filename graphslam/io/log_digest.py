@@ -22,10 +22,6 @@ def log_digest(log: SensorLog) -> dict[str, str]:
     Nothing is decoded: a lidar stream whose points are still packed is told by its packed bytes, so that the same scans
     in memory have another digest. Counts of records and the rest of ``meta`` do not matter.
 
-    Parameters
-    ----------
-    log : SensorLog
-
     Returns
     -------
     dict of str to str

@@ -30,16 +30,10 @@ def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tupl
 
     Parameters
     ----------
-    log : SensorLog
     path : path
         Folder; made if missing.
     mesh : (v, 3), (t, 3), optional
         Vertices in the frame of the truth [m], and triangles.
-
-    Raises
-    ------
-    FormatError, GeometryError
-        A stream, a name, a meta or a mesh that cannot be stored.
     """
     root = Path(path)
     root.mkdir(parents=True, exist_ok=True)
@@ -56,24 +50,12 @@ def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tupl
 
 
 def read_log_folder(path: str | os.PathLike[str]) -> SensorLog:
-    """Read a log written by :func:`write_log_folder`; the mesh stays on disk (:func:`read_log_mesh`).
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        Names the file.
-    """
+    """Read a log written by :func:`write_log_folder`; the mesh stays on disk (:func:`read_log_mesh`)."""
     return load_log(path)
 
 
 def read_log_mesh(path: str | os.PathLike[str]) -> tuple[Array, Triangles] | None:
-    """Mesh of a log folder: vertices ``(v, 3)`` in the truth's frame and triangles ``(t, 3)``; None if it has none.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        The mesh is named and missing, damaged, or not the one that the log names.
-    """
+    """Mesh of a log folder: vertices ``(v, 3)`` in the truth's frame and triangles ``(t, 3)``; None if it has none."""
     root = Path(path)
     entry = _meta(root).get("mesh")
     if not isinstance(entry, dict) or "file" not in entry:

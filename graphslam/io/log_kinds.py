@@ -40,7 +40,6 @@ class Kind:
 
     Parameters
     ----------
-    cls : type
     fields : mapping of str to Field
         Arrays stored under the name of a field of the class.
     pack : callable
@@ -62,13 +61,7 @@ class Kind:
         return {**{f: getattr(stream, f) for f in self.fields}, **self.pack(stream)}
 
     def stream(self, arrays: Arrays, where: str) -> Any:
-        """Inverse of :meth:`arrays`; what the class refuses is raised as it is.
-
-        Raises
-        ------
-        FormatError
-            An array is missing, of another type or shape, or not finite; names the file.
-        """
+        """Inverse of :meth:`arrays`; what the class refuses is raised as it is."""
         arrays = check_arrays(arrays, {**self.fields, **self.more}, where)
         return self.cls(**{f: arrays[f] for f in self.fields}, **self.unpack(arrays))
 
@@ -234,13 +227,7 @@ KINDS: dict[str, Kind] = {
 
 
 def kind_name(stream: Any, where: str | None = None) -> str:
-    """Name of the kind of a stream.
-
-    Raises
-    ------
-    FormatError
-        A stream of another class.
-    """
+    """Name of the kind of a stream."""
     for name, kind in KINDS.items():
         if type(stream) is kind.cls:
             return name

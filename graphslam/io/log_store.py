@@ -30,13 +30,7 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
-    """Write ``log`` into ``folder`` (made if missing; an older log there is replaced).
-
-    Raises
-    ------
-    FormatError
-        A stream's name is no file name, its kind is unknown, or ``meta`` is not JSON.
-    """
+    """Write ``log`` into ``folder`` (made if missing; an older log there is replaced)."""
     root = Path(folder)
     root.mkdir(parents=True, exist_ok=True)
     (root / INDEX_NAME).unlink(missing_ok=True)  # from here to the last line the folder is no log
@@ -65,15 +59,7 @@ def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
 
 
 def load_log(folder: str | os.PathLike[str]) -> SensorLog:
-    """Read a log written by :func:`save_log`.
-
-    Raises
-    ------
-    MissingDataError
-        No such folder, no ``log.json`` in it, or a listed file is not there.
-    FormatError
-        Unknown format or kind, truncated or corrupt file, or a record that its own class refuses; names the file.
-    """
+    """Read a log written by :func:`save_log`."""
     root = Path(folder)
     index_path = inside(root, INDEX_NAME, str(root))
     where = str(index_path)

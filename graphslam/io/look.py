@@ -38,12 +38,7 @@ class Claim:
 
 @dataclass
 class Look:
-    """A file or folder.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """A file or folder."""
 
     path: Path
     _heads: dict[Path, bytes] = field(default_factory=dict, repr=False)

@@ -28,16 +28,7 @@ _COMPLEX = 0x0800
 
 
 def read_mat(path: str | os.PathLike[str], *names: str) -> tuple[Array, ...]:
-    """The real arrays ``names`` of a ``.mat`` file, as float64; a number may be infinite or NaN, but not too large.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Truncated, corrupt, of another format, without one of the arrays, or with something else under its name; or
-        more data than is read of one file.
-    """
+    """The real arrays ``names`` of a ``.mat`` file, as float64; a number may be infinite or NaN, but not too large."""
     where = str(path)
     raw = read_bytes(path)
     found: dict[str, npt.NDArray[np.generic] | None] = {}

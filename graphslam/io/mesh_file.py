@@ -31,16 +31,10 @@ def write_mesh(path: str | os.PathLike[str], vertices: Any, triangles: Any) -> N
 
     Parameters
     ----------
-    path : path
     vertices : (v, 3)
         [m]
     triangles : (t, 3)
         Rows of ``vertices``.
-
-    Raises
-    ------
-    GeometryError
-        Impossible shapes, vertices that are not finite, triangles that name no vertex.
     """
     v, t = check_mesh(vertices, triangles, where=str(path))
     faces = np.empty(len(t), _FACE)
@@ -57,13 +51,6 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Triangles]:
     Returns
     -------
     (v, 3), (t, 3) int32
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Another kind of PLY, truncated or too long, or a mesh that :func:`write_mesh` would refuse.
     """
     where = str(path)
     data = read_bytes(path)

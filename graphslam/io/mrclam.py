@@ -86,10 +86,6 @@ def read_mrclam(
         The log is called ``<name>/robot<k>``; by default ``name`` is that of the folder.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
-
-    Raises
-    ------
-    ConfigError, MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     if not root.is_dir():

@@ -77,24 +77,12 @@ class NetworkBuilder:
     repaired: int = 0
 
     def add_vertices(self, ids: Ids, poses: Array, lines: Ids) -> None:
-        """Poses ``(n, 3 | 7)``; 3-D quaternions are normalised here.
-
-        Raises
-        ------
-        FormatError
-            Given twice, or with a quaternion of length zero.
-        """
+        """Poses ``(n, 3 | 7)``; 3-D quaternions are normalised here."""
         self._unique(ids, lines, "vertex given twice", "vertex ")
         self.vertices = ids, self._unit(poses, lines)
 
     def add_landmarks(self, ids: Ids, positions: Array, lines: Ids) -> None:
-        """Landmark positions ``(l, 2)``.
-
-        Raises
-        ------
-        FormatError
-            Given twice.
-        """
+        """Landmark positions ``(l, 2)``."""
         self._unique(ids, lines, "landmark given twice", "")
         self.marks = ids, positions
 
@@ -158,13 +146,7 @@ class NetworkBuilder:
         return np.asarray(np.linalg.inv(covariances))
 
     def build(self) -> PoseNetwork:
-        """The network, vertices in order of their ids.
-
-        Raises
-        ------
-        FormatError
-            No records, an id that is both a pose and a landmark, or an edge to a vertex that is not there.
-        """
+        """The network, vertices in order of their ids."""
         width, d = (3, 3) if self.dim == 2 else (7, 6)
         pairs, measurements, information = self.edges or (_no_ids(0, 2), _none(0, width), _none(0, d, d))
         seen, values, seen_information = self.sightings or (_no_ids(0, 2), _none(0, 2), _none(0, 2, 2))

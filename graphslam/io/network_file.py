@@ -36,10 +36,6 @@ def read_network(
         Make vertices that only edges name instead of refusing them.
     max_size : int, optional
         Bytes that are read at most, after decompression; default :data:`~graphslam.core.reading.MAX_SIZE`.
-
-    Raises
-    ------
-    MissingDataError, FormatError, CovarianceError
     """
     with size_limit(max_size):
         text = read_text(path)

@@ -56,10 +56,6 @@ def read_plaza(
         Of the log; the prefix in small letters by default.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
-
-    Raises
-    ------
-    ConfigError, MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     if not root.is_dir():

@@ -45,13 +45,7 @@ class Reader:
     preset: str = ""
 
     def function(self) -> Callable[..., Any]:
-        """The function itself.
-
-        Raises
-        ------
-        MissingDataError
-            A package is not installed.
-        """
+        """The function itself."""
         module, _, function = self.target.partition(":")
         return typing.cast(Callable[..., Any], getattr(importlib.import_module(module), function))
 
@@ -65,13 +59,7 @@ class Reader:
         return "name" in inspect.signature(self.function()).parameters
 
     def __call__(self, path: Path, **given: Any) -> Any:
-        """Read.
-
-        Raises
-        ------
-        ConfigError
-            An option that the reader has not, or of the wrong type.
-        """
+        """Read."""
         function = self.function()
         known, hints = self.options(), typing.get_type_hints(function)
         values = {}

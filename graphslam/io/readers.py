@@ -28,13 +28,7 @@ GROUP = "graphslam.readers"
 
 @cache
 def readers() -> dict[str, Reader]:
-    """All readers by name: those of other packages first, then our own, in the order in which they are asked.
-
-    Raises
-    ------
-    GraphSlamError
-        An entry point that cannot be imported, or is no reader.
-    """
+    """All readers by name: those of other packages first, then our own, in the order in which they are asked."""
     out: dict[str, Reader] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
         try:
@@ -48,12 +42,7 @@ def readers() -> dict[str, Reader]:
 
 
 def reader(name: str) -> Reader:
-    """The reader of that name.
-
-    Raises
-    ------
-    UnknownNameError
-    """
+    """The reader of that name."""
     try:
         return readers()[name]
     except KeyError:
@@ -78,15 +67,7 @@ class Recognised:
 
 
 def recognise(path: Path) -> Recognised:
-    """The first reader that can read a source.
-
-    Raises
-    ------
-    MissingDataError
-        A reader knows it, but something is missing: what was found, what is missing, what would work.
-    FormatError
-        No reader knows it: what was found, and what is read.
-    """
+    """The first reader that can read a source."""
     look = Look(path)
     whole: list[tuple[str, Claim]] = []
     nearly: list[tuple[str, Claim]] = []

@@ -33,13 +33,7 @@ def pose_of(pose: Any) -> list[float]:
 
 
 def point_cloud(m: Any) -> Cloud:
-    """Points of ``sensor_msgs/PointCloud2``, in the units of the message.
-
-    Raises
-    ------
-    ValueError
-        The fields do not fit the data.
-    """
+    """Points of ``sensor_msgs/PointCloud2``, in the units of the message."""
     order = ">" if m.is_bigendian else "<"
     step, width, height = int(m.point_step), int(m.width), int(m.height)
     n = width * height
@@ -78,12 +72,7 @@ class LivoxCloud:
 
 
 def livox_cloud(raw: bytes, *, ros2: bool) -> LivoxCloud:
-    """Points of ``livox_ros_driver/CustomMsg`` from its bytes.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Points of ``livox_ros_driver/CustomMsg`` from its bytes."""
     try:
         if ros2:
             if raw[1] != 1:

@@ -36,13 +36,6 @@ def read_slsjf_local_maps(folder: str | os.PathLike[str]) -> list[Submap]:
     list of Submap
         Keys 0, 1, …; landmark ids are feature ids; without a clock the interval of submap k is [k, k + 1]. The
         covariance is as published, rounding asymmetry averaged away.
-
-    Raises
-    ------
-    MissingDataError
-        No map, or a hole in the numbering: the chain would be broken.
-    FormatError, CovarianceError
-        Names the file.
     """
     root = Path(folder)
     inner = root / "slsjf_200_local_maps"
@@ -64,12 +57,7 @@ def read_slsjf_local_maps(folder: str | os.PathLike[str]) -> list[Submap]:
 
 
 def read_slsjf_local_map(path: str | os.PathLike[str], key: int) -> Submap:
-    """One local map as submap ``key``.
-
-    Raises
-    ------
-    MissingDataError, FormatError, CovarianceError
-    """
+    """One local map as submap ``key``."""
     where = str(path)
     state, P = read_mat(path, "localmap_st", "localmap_P")
     if state.ndim != 2 or state.shape[1] != 2 or len(state) < 3 or len(state) % 2 == 0:

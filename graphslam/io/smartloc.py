@@ -49,10 +49,6 @@ def read_smartloc(
         Of the log.
     drops : DropCounter, optional
         Counts into this one, besides ``SensorLog.dropped``.
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     if not root.is_dir():

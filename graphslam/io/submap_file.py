@@ -92,15 +92,7 @@ def _plain(value: Any) -> Any:
 
 
 def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
-    """The submap that :func:`submap_arrays` wrote down; optional arrays may be missing.
-
-    Raises
-    ------
-    FormatError
-        An array is missing or of the wrong kind.
-    DataError
-        Its values are impossible (the particular kind of :class:`DataError` is kept); names the file.
-    """
+    """The submap that :func:`submap_arrays` wrote down; optional arrays may be missing."""
 
     a = check_arrays(arrays, _FIELDS, where)
     try:

@@ -57,12 +57,7 @@ class SubmapStore:
 
     @property
     def entries(self) -> list[dict[str, Any]]:
-        """The index: key, file, interval and number of landmarks of every submap. Empty where there is none yet.
-
-        Raises
-        ------
-        FormatError
-        """
+        """The index: key, file, interval and number of landmarks of every submap. Empty where there is none yet."""
         if self._entries is None:
             file = inside(self.path, INDEX, str(self.path))
             self._entries = _read_index(file) if file.exists() else []
@@ -72,13 +67,7 @@ class SubmapStore:
         return len(self.entries)
 
     def __getitem__(self, k: int) -> Submap:
-        """Submap k of the index (not: of key k).
-
-        Raises
-        ------
-        FormatError, MissingDataError, DataError
-            Names the file.
-        """
+        """Submap k of the index (not: of key k)."""
         entry = self.entries[k]
         file = inside(self.path, entry["file"], str(self.path / INDEX))
         submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT, old=OLD_FORMATS), where=str(file))
@@ -98,13 +87,7 @@ class SubmapStore:
         return list(self)
 
     def append(self, submap: Submap) -> None:
-        """Write one submap, then the index that names it.
-
-        Raises
-        ------
-        DataError
-            Keys must rise, and the dimension must stay.
-        """
+        """Write one submap, then the index that names it."""
         entries = self.entries
         if entries and submap.key <= entries[-1]["key"]:
             raise DataError(
@@ -209,13 +192,6 @@ def read_submaps(path: str | os.PathLike[str], *, load_grid: GridLoader | None =
         The folder ``submaps/``, or its parent (a run folder).
     load_grid : callable, optional
         See :class:`SubmapStore`.
-
-    Raises
-    ------
-    MissingDataError
-        No store there.
-    FormatError, DataError
-        Names the file.
     """
     store = SubmapStore(path, load_grid=load_grid)
     if not (store.path / INDEX).is_file():
@@ -246,11 +222,6 @@ def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
     ----------
     path : path
         The folder ``submaps/``, its parent, or the file.
-
-    Raises
-    ------
-    FormatError, GeometryError
-        Names the file.
     """
     root = Path(path)
     candidates = [root] if root.suffix == ".npz" else [root / TRUTH, root.parent / TRUTH]

@@ -27,12 +27,7 @@ _WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gz
 
 
 def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
-    """``name`` in ``folder``, plain or compressed.
-
-    Raises
-    ------
-    MissingDataError
-    """
+    """``name`` in ``folder``, plain or compressed."""
     for ending in ("", *_WRITERS):
         path = Path(folder) / (name + ending)
         if path.is_file():
@@ -48,8 +43,6 @@ def read_table(
 
     Parameters
     ----------
-    path : path
-    columns : int
     separator : str, optional
         What stands between numbers, and perhaps after the last one; white space by default.
     skip : int
@@ -62,13 +55,6 @@ def read_table(
         decides what to drop.
     lines : (n,) int64
         Line of every row, counted from 1, for messages.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        A line with another number of values, or with something that is no number: names file and line.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -150,11 +136,6 @@ class Records:
     Attributes
     ----------
     rows : dict of str to Rows
-
-    Raises
-    ------
-    FormatError
-        With file and line.
     """
 
     def __init__(

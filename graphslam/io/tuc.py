@@ -54,7 +54,6 @@ class TucLog:
     truth : (k, 2)
         Position [m].
     dropped : dict of str to int
-    source : str
     """
 
     times: Array
@@ -97,13 +96,6 @@ class TucLog:
             Values are dead reckoning. Odometry first, then the candidates in the order of the file.
         times : (m,)
             Of the nodes.
-
-        Raises
-        ------
-        ConfigError
-            A σ or spacing that is not positive.
-        DataError
-            The stamps span too long a time, or a covariance is singular.
         """
         if not (place_sigma > 0 and spacing > 0 and (heading_sigma is None or heading_sigma > 0)):
             raise ConfigError(f"σ and spacing must be positive, got {place_sigma}, {heading_sigma}, {spacing}")
@@ -166,15 +158,6 @@ def read_tuc(folder: str | os.PathLike[str], *, drops: DropCounter | None = None
         Holds ``Lecture_Hall_Input.txt`` and ``Lecture_Hall_GT.txt``, plain or compressed.
     drops : DropCounter, optional
         Counts into this one, besides ``TucLog.dropped``.
-
-    Raises
-    ------
-    MissingDataError
-        No such folder or file.
-    FormatError
-        An unknown record, or one with another number of values: names file and line.
-    DataError
-        Fewer than two usable odometry records, or no truth.
     """
     root = Path(folder)
     if not root.is_dir():

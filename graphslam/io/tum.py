@@ -60,14 +60,6 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
         Lines that are empty or start with ``#`` are skipped.
     dim : 2, 3 or None
         None: 2 if every pose has z = 0 and rotates about z only, else 3.
-
-    Raises
-    ------
-    MissingDataError
-        No such file.
-    FormatError
-        Wrong number of columns, not a number, not finite, no unit quaternion, time not increasing, or poses out of
-        the plane with ``dim=2``; names the line.
     """
     where = str(path)
     text = read_text(path)
@@ -122,11 +114,6 @@ def read_tum_log(
         The table, or a folder that holds one.
     odometry_sigmas : (float, float)
         σ of one motion, per axis: metres, radians; the table states none.
-    name : str, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, ConfigError
     """
     if not all(np.isfinite(v) and v > 0 for v in odometry_sigmas):
         raise ConfigError(f"tum: odometry_sigmas are {odometry_sigmas}; wanted positive numbers")

@@ -87,11 +87,6 @@ def read_victoria_park(
     SensorLog
         "victoria-park" with streams ``laser``, ``controls`` and (unless "none") ``gps``: x east, y north from the
         first fix, lever = the laser.
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError
-        See the module.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -128,15 +123,7 @@ def read_victoria_park(
 
 
 def read_numbers(path: Path, columns: int) -> Array:
-    """Whitespace-separated numbers of a text file as ``(n, columns)``; line breaks carry no meaning.
-
-    Raises
-    ------
-    MissingDataError
-        Neither the file nor its ``.gz`` is there.
-    FormatError
-        Truncated compression, something that is no number, or a number of values that is no multiple of ``columns``.
-    """
+    """Whitespace-separated numbers of a text file as ``(n, columns)``; line breaks carry no meaning."""
     file = next((p for p in (path, path.with_name(path.name + ".gz")) if p.is_file()), None)
     if file is None:
         raise MissingDataError("no such file", where=str(path), wanted=f"{path.name} or {path.name}.gz")

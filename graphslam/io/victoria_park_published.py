@@ -48,11 +48,6 @@ def read_ufastslam_detections(
         (plain or ``.gz``).
     range_sigma, bearing_sigma : float
         The files state none; the defaults are those usual for this log [m, rad].
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError
     """
     root = Path(folder)
     distance = read_numbers(root / "ufastslam_ObservationDistance.txt", _UFASTSLAM_SLOTS)
@@ -94,11 +89,6 @@ def read_slsjf_observations(
         Holds ``slsjf_data_sensor_clean_clean.mat``.
     range_sigma, bearing_sigma : float
         The file states none [m, rad].
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    MissingDataError, FormatError, DataError
     """
     path = Path(folder) / "slsjf_data_sensor_clean_clean.mat"
     (table,) = read_mat(path, "data_sensor_clean_clean")
@@ -133,10 +123,6 @@ def read_slsjf_network(folder: str | os.PathLike[str]) -> PoseNetwork:
     ----------
     folder : path
         Holds ``slsjf_VicPark_clean_data.mat``.
-
-    Raises
-    ------
-    MissingDataError, FormatError, CovarianceError
     """
     path = Path(folder) / "slsjf_VicPark_clean_data.mat"
     (table,) = read_mat(path, "VicPark_clean_data")

@@ -52,7 +52,6 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
 
     Parameters
     ----------
-    a, b : JoinedMap
     match : (L_b,)
         Landmark of A that each landmark of B is, or -1 for a new one. Several of B may not be one of A.
     times : JoinTimes, optional

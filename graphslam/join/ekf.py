@@ -119,11 +119,6 @@ class DenseMap:
             Which of its landmarks each entry of the original submap became.
         match : (L,)
             Landmark of the map that each is, or -1.
-
-        Raises
-        ------
-        CovarianceError
-            If the innovation covariance is not positive definite.
         """
         n, Q, z = self._n, submap.dense_covariance(), submap.mean
         old, new = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
@@ -213,7 +208,6 @@ def join_ekf(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     association : Association, optional
         Recognise landmarks; default: by the ids they bear.
     form : "square" or "naive"
@@ -222,10 +216,6 @@ def join_ekf(
         See :func:`~graphslam.join.order.join_sequential`.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    DataError, CovarianceError, ConfigError
     """
     identified = association is None
     check_chain(submaps, identified=identified)

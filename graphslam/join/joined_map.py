@@ -118,12 +118,7 @@ def landmark_scalars(at: Index) -> Index:
 
 
 def check_chain(submaps: Sequence[Submap], *, identified: bool) -> None:
-    """Refuse an empty chain, and landmarks without an id where ids are to be trusted.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse an empty chain, and landmarks without an id where ids are to be trusted."""
     if identified:
         check_identified(submaps)
     elif not submaps:
@@ -270,7 +265,6 @@ class JoinedMap:
 
         Parameters
         ----------
-        submap : Submap
         identified : bool
             Entries of one id are fused. Otherwise ids are ignored and every entry is a landmark of its own.
         """
@@ -336,7 +330,6 @@ class JoinResult(SubmapEstimate):
 
     Parameters
     ----------
-    method : str
     times : mapping of str to float
         CPU seconds: association, update, recovery, and polish where there was one. (``seconds`` is wall time.)
         Evaluating the objective of the unpolished map is in neither.

@@ -279,7 +279,6 @@ def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
 
     Parameters
     ----------
-    m : BlockMap
     anchor : (N,)
         Pose that each node hangs on; of a pose itself.
     x : (n,)

@@ -93,7 +93,6 @@ def join_online(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     policy : RelinearisationPolicy, optional
         With ``every=1`` the map is the least-squares optimum of the submaps so far after each of them.
     association : Association, optional

@@ -35,7 +35,6 @@ def join_sequential(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     association : Association, optional
         Recognise landmarks; default: by the ids they bear.
     on_join : callable, optional
@@ -45,10 +44,6 @@ def join_sequential(
         Join as the paper does, whatever the chart of the submaps: Cartesian, each join linearised once.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    DataError, CovarianceError
     """
     identified = association is None
     check_chain(submaps, identified=identified)
@@ -101,12 +96,6 @@ def join_tree(
     -------
     JoinResult
         ``times`` are CPU seconds of all that took part, ``seconds`` the longest way up the tree.
-
-    Raises
-    ------
-    DataError, CovarianceError, ConfigError
-    GraphSlamError
-        If a cluster is asked for and ``distributed`` is not installed.
     """
     identified = association is None
     check_chain(submaps, identified=identified)

@@ -23,7 +23,6 @@ def polish(
     ----------
     submaps : sequence of Submap
         Those that were joined; their ids are replaced by ``joined.submap_ids``.
-    joined : JoinResult
     rtol, max_iterations
         See :func:`~graphslam.join.submap_solver.minimise`.
 

@@ -30,11 +30,6 @@ class PoseFilter:
     ----------
     problem : PoseProblem
         What it has to have room for.
-
-    Raises
-    ------
-    DataError
-        Too much.
     """
 
     def __init__(self, problem: PoseProblem) -> None:
@@ -61,13 +56,7 @@ class PoseFilter:
         return self._P[np.ix_(order, order)]
 
     def join(self, leaf: PoseMap, ties: Ties) -> None:
-        """Append a submap, then one measurement update.
-
-        Raises
-        ------
-        CovarianceError
-            If the innovation covariance is not positive definite.
-        """
+        """Append a submap, then one measurement update."""
         d, n, P = self._d, self._n, self._P
         Q = dense_inverse(leaf.matrix())
         g, k = leaf.group, d * (len(leaf.poses) - 1)

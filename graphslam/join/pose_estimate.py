@@ -121,10 +121,6 @@ def polish_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
     -------
     PoseEstimate
         Poses and information of the optimum; ``objective`` stays that of the joined map.
-
-    Raises
-    ------
-    IndeterminateError, SolverError
     """
     start, cpu = time.perf_counter(), time.process_time()
     best = optimise(SparseProblem(problem.flat), problem.values(joined.poses, joined.tilt), POLISH)

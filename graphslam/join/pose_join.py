@@ -76,16 +76,10 @@ def join_poses_sequential(problem: PoseProblem, *, passes: int = 1, progress: bo
 
     Parameters
     ----------
-    problem : PoseProblem
     passes : int
         How often the ties of a join are linearised.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    IndeterminateError
-        A submap whose own ties do not determine its nodes.
     """
     ties, times = Sorted(problem), JoinTimes()
     leaves = leaves_of(problem, ties, times, progress)
@@ -102,10 +96,6 @@ def join_poses_tree(problem: PoseProblem, *, passes: int = 1, progress: bool = F
     ----------
     problem, passes, progress
         As in :func:`join_poses_sequential`.
-
-    Raises
-    ------
-    IndeterminateError
     """
     ties, times = Sorted(problem), JoinTimes()
     leaves = leaves_of(problem, ties, times, progress)
@@ -128,14 +118,7 @@ def join_poses_tree(problem: PoseProblem, *, passes: int = 1, progress: bool = F
 
 
 def join_poses_ekf(problem: PoseProblem, *, progress: bool = False) -> PoseEstimate:
-    """Join submaps one after the other with a dense extended Kalman filter.
-
-    Raises
-    ------
-    DataError
-        Its covariance would be too large (:data:`~graphslam.join.pose_ekf.MOST`).
-    IndeterminateError, CovarianceError
-    """
+    """Join submaps one after the other with a dense extended Kalman filter."""
     ties, times = Sorted(problem), JoinTimes()
     dense = PoseFilter(problem)
     leaves = leaves_of(problem, ties, times, progress)
@@ -149,12 +132,7 @@ def join_poses_ekf(problem: PoseProblem, *, progress: bool = False) -> PoseEstim
 
 
 def solve_poses(problem: PoseProblem, *, polish: bool = True, progress: bool = False) -> PoseEstimate:
-    """Least squares of everything at once, from the chain alone: at its optimum whatever ``polish`` says.
-
-    Raises
-    ------
-    IndeterminateError, SolverError
-    """
+    """Least squares of everything at once, from the chain alone: at its optimum whatever ``polish`` says."""
     load_kernels()
     t0 = time.perf_counter()
     begun = estimate(problem, problem.start, None, method="batch", seconds=time.perf_counter() - t0)

@@ -172,13 +172,7 @@ class PoseMap:
         return T
 
     def solve(self, A: Blocks, gradient: Array) -> Array:
-        """Step ``(n + 1, d)`` of ``A ξ = -gradient`` with the base held.
-
-        Raises
-        ------
-        IndeterminateError
-            Ties do not determine every node.
-        """
+        """Step ``(n + 1, d)`` of ``A ξ = -gradient`` with the base held."""
         n, d = len(self.poses), self.group.dof
         N = n - 1 + (self.up is not None)
         width = np.full(N, d, dtype=np.int64)
@@ -212,7 +206,6 @@ class PoseMap:
 
         Parameters
         ----------
-        ties : Ties
         times : JoinTimes
             Where to add the time spent.
         passes : int
@@ -253,10 +246,8 @@ def join_poses(a: PoseMap, b: PoseMap, ties: Ties, times: JoinTimes, *, passes: 
 
     Parameters
     ----------
-    a, b : PoseMap
     ties : Ties
         Nodes counted from the base of A; node ``len(a.poses) - 1`` is the base of B, ``len(a.poses)`` its next one.
-    times : JoinTimes
     passes : int
         How often the ties are linearised.
     """

@@ -263,12 +263,7 @@ class PoseProblem(Ties):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PoseProblem:
-        """Inverse of :meth:`save`.
-
-        Raises
-        ------
-        MissingDataError, FormatError, DataError
-        """
+        """Inverse of :meth:`save`."""
         arrays: dict[str, Any] = read_npz(path, fmt=PROBLEM_FORMAT, fields=PROBLEM)
         return cls(**arrays)
 
@@ -276,13 +271,7 @@ class PoseProblem(Ties):
 
     @classmethod
     def of_network(cls, network: PoseNetwork, poses: int) -> PoseProblem:
-        """A pose-graph file, cut into submaps of so many steps along the numbers of its vertices.
-
-        Raises
-        ------
-        DataError
-            It has landmarks, several fixed vertices, or no edge between two neighbours.
-        """
+        """A pose-graph file, cut into submaps of so many steps along the numbers of its vertices."""
         name, n = network.source, len(network)
         if poses < 1:
             raise DataError("a submap has no step", where=name, got=poses, wanted="at least 1 pose")
@@ -300,13 +289,7 @@ class PoseProblem(Ties):
 
     @classmethod
     def of_graph(cls, graph: PoseGraph) -> PoseProblem:
-        """The relative poses and levelled bases of a graph of dense submaps, ties at the weight of their kernels there.
-
-        Raises
-        ------
-        DataError
-            It holds no submaps, several chains, or submaps with landmarks.
-        """
+        """The relative poses and levelled bases of a graph of dense submaps, ties at the weight of their kernels there."""
         chain = graph.submaps
         if not chain:
             raise DataError("there are no submaps", got=0, wanted="at least one")
@@ -341,12 +324,7 @@ class PoseProblem(Ties):
     def of_submaps(
         cls, submaps: Sequence[Submap], *, covariance_scale: float = 1.0, match_support: float = 0.5
     ) -> PoseProblem:
-        """Dense submaps by themselves: their exits, and the matches that so large a share of the particles took.
-
-        Raises
-        ------
-        DataError, GeometryError, CovarianceError
-        """
+        """Dense submaps by themselves: their exits, and the matches that so large a share of the particles took."""
         if not submaps:
             raise DataError("there are no submaps", got=0, wanted="at least one")
         check_dense(submaps)
@@ -360,12 +338,7 @@ class PoseProblem(Ties):
 
 
 def check_dense(submaps: Sequence[Submap]) -> None:
-    """Refuse landmarks in space.
-
-    Raises
-    ------
-    GeometryError
-    """
+    """Refuse landmarks in space."""
     bad = next((s for s in submaps if s.landmarks is not None), None)
     if bad is not None:
         raise GeometryError(f"submap {bad.key} has landmarks in space", wanted="landmark submaps in the plane")

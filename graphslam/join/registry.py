@@ -59,12 +59,7 @@ class Methods(NamedTuple):
     polish: Callable[[Any, Any], Any]
 
     def check(self, method: str) -> None:
-        """Refuse an unknown name.
-
-        Raises
-        ------
-        UnknownNameError
-        """
+        """Refuse an unknown name."""
         if method not in self.joiners and method not in self.solvers:
             raise UnknownNameError("method", method, [*self.joiners, *self.solvers])
 
@@ -94,12 +89,7 @@ def methods_for(material: Material) -> Methods:
 
 
 def prepared(submaps: Material, *, associate: str | Association = "given", covariance_scale: float = 1.0) -> Material:
-    """Submaps with their covariances as they are to be joined; dense ones with the matches that tie them.
-
-    Raises
-    ------
-    ConfigError, DataError, GeometryError
-    """
+    """Submaps with their covariances as they are to be joined; dense ones with the matches that tie them."""
     association = association_of(associate)
     if isinstance(submaps, Sequence) and not is_dense(submaps):
         if association is not None and in_space(submaps):

@@ -98,7 +98,6 @@ class SpaceProblem:
 
     Parameters
     ----------
-    submaps : sequence of Submap
     leaves : list of SpaceMap
         In the chart of the submaps.
     ids : (L,) int64
@@ -117,14 +116,7 @@ class SpaceProblem:
 
     @classmethod
     def of(cls, submaps: Sequence[Submap]) -> SpaceProblem:
-        """The problem of a chain of submaps.
-
-        Raises
-        ------
-        DataError
-            There are no submaps, some lie in the plane or carry matches, or a landmark has no id or stands twice.
-        CovarianceError
-        """
+        """The problem of a chain of submaps."""
         if not submaps:
             raise DataError("there are no submaps", got=0, wanted="at least one")
         flat = [s.key for s in submaps if s.dim != 3]
@@ -280,11 +272,6 @@ def join_space_sequential(
         In order, with landmarks that are identified.
     classical : bool
         Cartesian, each join linearised once.
-    progress : bool
-
-    Raises
-    ------
-    DataError, CovarianceError, IndeterminateError
     """
     problem, times = SpaceProblem.of(submaps), JoinTimes()
     first, *rest = _leaves(problem, classical)

@@ -29,13 +29,7 @@ Index = npt.NDArray[np.int64]
 
 
 def landmark_map_of(submap: Submap) -> LandmarkMap:
-    """The landmark map of a 2-D submap; one without landmarks measures its end pose alone.
-
-    Raises
-    ------
-    DataError
-        If the submap is not two-dimensional.
-    """
+    """The landmark map of a 2-D submap; one without landmarks measures its end pose alone."""
     if submap.dim != 2:
         raise DataError(f"submap {submap.key} has the wrong dimension", got=submap.dim, wanted="2 (landmark joining)")
     if submap.landmarks is not None:
@@ -50,13 +44,7 @@ def landmark_map_of(submap: Submap) -> LandmarkMap:
 
 
 def dense_information(landmarks: LandmarkMap, *, what: str) -> Array:
-    """Information matrix ``(3 + 2n, 3 + 2n)``, proven positive definite on the way.
-
-    Raises
-    ------
-    CovarianceError
-        Naming ``what``.
-    """
+    """Information matrix ``(3 + 2n, 3 + 2n)``, proven positive definite on the way."""
     P = landmarks.covariance
     M = landmarks.dense_information() if P is None else P
     factor, info = lapack.dpotrf(M, lower=1)
@@ -111,12 +99,7 @@ def fuse_repeated(landmarks: LandmarkMap, *, what: str = "submap") -> LandmarkMa
 
 
 def check_identified(submaps: Sequence[Submap]) -> None:
-    """Refuse an empty chain and landmarks that nobody has identified.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse an empty chain and landmarks that nobody has identified."""
     if not submaps:
         raise DataError("there are no submaps", got=0, wanted="at least one")
     for s in submaps:
@@ -153,13 +136,6 @@ class SubmapProblem:
         Of all submaps; "cartesian" where they differ.
     measurements : int
         Rows of the residual; ``measurements - size`` are the degrees of freedom of the objective.
-
-    Raises
-    ------
-    DataError
-        No submap, an id of -1, a 3-D submap, or a scale that is not positive.
-    CovarianceError
-        A submap whose information is not positive definite.
     """
 
     def __init__(
@@ -371,13 +347,7 @@ def _check_scale(scale: ArrayLike, m: int) -> Array:
 
 
 def scale_covariances(submaps: Sequence[Submap], factor: ArrayLike) -> list[Submap]:
-    """The same submaps with their covariances multiplied by ``factor`` (one number, or one a submap).
-
-    Raises
-    ------
-    DataError
-        If a factor is not a positive number.
-    """
+    """The same submaps with their covariances multiplied by ``factor`` (one number, or one a submap)."""
     factors = _check_scale(factor, len(submaps))
     scaled = []
     for s, f in zip(submaps, factors):

@@ -47,11 +47,6 @@ def solve_submaps_isam2(
     -------
     SubmapEstimate
         ``seconds`` counts everything, ``iterations`` the updates.
-
-    Raises
-    ------
-    DataError
-        No submap, or a landmark without an id.
     """
     check_identified(submaps)
     start = time.perf_counter()

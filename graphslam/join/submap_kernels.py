@@ -82,7 +82,6 @@ def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[
         Offset of the block of each listed pair; both directions of a pair share it.
     flip : (nb,)
         1 where the block is stored the other way round (rows of the neighbour).
-    size : int
     """
     block = np.empty(len(idx), np.int64)
     flip = np.zeros(len(idx), np.int64)
@@ -221,8 +220,6 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
     Parameters
     ----------
     poses : (m, 3)
-    submaps : SubmapArrays
-    where : Slots
     r : (rows,)
         ``H(X) - z`` of every submap in Cartesian coordinates.
     g, value

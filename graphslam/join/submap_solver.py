@@ -60,7 +60,6 @@ class SubmapEstimate:
         ``Σ rᵀ P⁻¹ r`` of this map (before polishing, where there is a polish).
     objective_polished : float or None
         The same at the least-squares optimum, where that was asked for.
-    iterations : int
     converged : bool
         Whether the map stands at its least-squares optimum.
     seconds : float
@@ -181,10 +180,8 @@ class Minimum:
     ----------
     x : (n,)
         Values in the order of :class:`~graphslam.join.submap_blocks.SubmapProblem`.
-    objective : float
     iterations : int
         Linearisations whose step was tried.
-    converged : bool
     data : (nnz,)
         Values of ``JᵀΩJ`` at ``x`` in the problem's pattern.
     history : list of float
@@ -211,16 +208,8 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
 
     Parameters
     ----------
-    problem : SubmapProblem
     x : (n,)
         Values to start from.
-    rtol : float
-    max_iterations : int
-
-    Raises
-    ------
-    SolverError
-        If the objective is not finite.
     """
     x = np.array(x, dtype=np.float64)
     headings = np.arange(2, 3 * problem.m, 3)
@@ -291,10 +280,6 @@ def solve_submaps(
         Factor on the covariance of each submap.
     rtol, max_iterations
         See :func:`minimise`.
-
-    Raises
-    ------
-    DataError, CovarianceError, SolverError
     """
     start = time.perf_counter()
     problem = SubmapProblem(submaps, scale=scale)

@@ -81,12 +81,6 @@ class BlockSymbolic:
             Where the block of each pair of ``neighbours`` begins in ``value``: rows of the node whose list it is in,
             columns of the neighbour, row-major. Of a pair the one of the node that is eliminated first is read.
         value : (k,)
-        damping : float
-
-        Raises
-        ------
-        IndeterminateError
-            If the matrix is not positive definite.
         """
         L = np.empty(self._entries)
         matrix = analysis.Blocks(self._ptr, self._idx, block, value)

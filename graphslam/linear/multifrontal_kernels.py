@@ -317,9 +317,6 @@ def factorise(analysis: Analysis, matrix: Blocks, damping: float, L: Array) -> i
 
     Parameters
     ----------
-    analysis : Analysis
-    matrix : Blocks
-    damping : float
     L : (panel_ptr[-1],)
         Out. Column by column of every panel: all its rows, those above the diagonal are rubbish.
 

@@ -57,7 +57,6 @@ class SpaceMap:
         Row of ``poses`` on which each point hangs; :data:`ORIGIN`: on the base.
     information : sparse (6 m + 3 n, 6 m + 3 n)
         Of turns about the axes of the base [rad] and shifts [m], a pose after the other, then the points.
-    chart : str
     """
 
     poses: Array
@@ -73,7 +72,6 @@ class Placed:
 
     Parameters
     ----------
-    map : SpaceMap
     base : int
         Pose of the problem from which it is seen, or :data:`ORIGIN`.
     poses : (m,) int64
@@ -219,15 +217,7 @@ class SpaceMinimum:
 def minimise(
     maps: Sequence[Placed], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
 ) -> SpaceMinimum:
-    """Damped Gauss–Newton; it ends when the decrease that the linear model promises is below ``rtol · max(f, 1)``.
-
-    Raises
-    ------
-    SolverError
-        If the objective is not finite at the start.
-    IndeterminateError
-        If something is not determined by the maps.
-    """
+    """Damped Gauss–Newton; it ends when the decrease that the linear model promises is below ``rtol · max(f, 1)``."""
     from graphslam.linear.symmetric_factor import SymmetricFactor
 
     f, g, H = normal_equations(maps, poses, points)

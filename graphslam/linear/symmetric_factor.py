@@ -28,11 +28,6 @@ class SymmetricFactor:
     ----------
     matrix : csc_matrix (n, n)
         Both triangles.
-
-    Raises
-    ------
-    IndeterminateError
-        If the matrix is singular.
     """
 
     def __init__(self, matrix: sp.csc_matrix) -> None:
@@ -95,7 +90,6 @@ def elimination_order(rows: Index, columns: Index, n: int) -> Index:
     ----------
     rows, columns : (k,)
         Repeated entries are welcome.
-    n : int
 
     Returns
     -------

@@ -56,10 +56,8 @@ def appearance_candidates(
 
     Parameters
     ----------
-    places : Places
     descriptors : Descriptors
         Of these places.
-    config : AppearanceConfig, optional
     exclude : collection of (int, int)
         Pairs of submaps, either way round, that are not tried.
 

@@ -146,20 +146,14 @@ def proximity_candidates(
 
     Parameters
     ----------
-    places : Places
     relative : Relative
         Of the graph, asked for the nodes of places.
-    config : CandidateConfig, optional
     exclude : collection of (int, int)
         Pairs of submaps (either way round) that are not tried: their maps hold the same scans.
     tried : sequence of (int, int)
         Pairs of places that were tried before: their stretches are not tried again.
     since : int
         Only pairs whose later place lies in this submap of the chain or a later one.
-
-    Returns
-    -------
-    list of Candidate
     """
     c = CandidateConfig() if config is None else config
     n = len(places)

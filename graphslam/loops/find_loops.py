@@ -107,10 +107,6 @@ class LoopSearch:
     A look compares the submaps that came since the one before with all of them. The last look takes all pairs, also
     those that were refused, for the graph knows more of them by then; and it takes what asks for the whole chain:
     places that look alike, ties.
-
-    Parameters
-    ----------
-    config : FindConfig, optional
     """
 
     def __init__(self, config: FindConfig | None = None) -> None:

@@ -27,13 +27,7 @@ class GraphSolver(Protocol):
 
 
 def places_of_graph(graph: PoseGraph) -> Places:
-    """Bases and inner nodes of all submaps of a graph of one chain; place k is node k.
-
-    Raises
-    ------
-    DataError
-        No submap, one without nodes of its own, or more than one session.
-    """
+    """Bases and inner nodes of all submaps of a graph of one chain; place k is node k."""
     if not graph.submaps:
         raise DataError("a graph without submaps has no places")
     for k, s in enumerate(graph.submaps):
@@ -51,11 +45,6 @@ def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
     """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
 
     The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
-
-    Raises
-    ------
-    DataError
-        A factor of the chain was removed.
     """
     T: list[Array] = []
     P: list[Array] = []
@@ -78,11 +67,6 @@ class GraphLoops:
         Of one chain of dense submaps; may hold GPS and attitudes too.
     solver : GraphSolver
         Of that graph.
-
-    Raises
-    ------
-    DataError
-        See :func:`places_of_graph`.
     """
 
     def __init__(self, graph: PoseGraph, solver: GraphSolver) -> None:
@@ -133,12 +117,7 @@ class GraphLoops:
 
 
 class GraphRelative:
-    """A :class:`~graphslam.loops.places.Relative` of a graph at its values, which must be its optimum.
-
-    Parameters
-    ----------
-    graph : GraphRecord
-    """
+    """A :class:`~graphslam.loops.places.Relative` of a graph at its values, which must be its optimum."""
 
     def __init__(self, graph: GraphRecord) -> None:
         self.graph = graph

@@ -119,13 +119,7 @@ class LoopLedger:
 
     @classmethod
     def from_events(cls, events: Iterable[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
-        """The ledger of a run from its events; those of other kinds are passed over.
-
-        Raises
-        ------
-        DataError
-            A loop event that is none.
-        """
+        """The ledger of a run from its events; those of other kinds are passed over."""
         out = []
         names = set(Decision.__slots__)
         for k, e in enumerate(events):
@@ -154,13 +148,7 @@ class LoopLedger:
         return [last[k] for k in sorted(last)]
 
     def of(self, loop: int) -> Decision:
-        """The decision in force of one loop.
-
-        Raises
-        ------
-        DataError
-            There is no such loop.
-        """
+        """The decision in force of one loop."""
         for d in reversed(self.decisions):
             if d.loop == loop:
                 return d

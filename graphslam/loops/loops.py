@@ -49,10 +49,8 @@ class LoopCloser:
 
     Parameters
     ----------
-    graph : LoopGraph
     increments, covariances : (n, 7|3), (n, d, d)
         The chain alone, from node to node, right tangents: what pairwise consistency goes by.
-    config : LoopConfig, optional
     ledger : LoopLedger, optional
         To go on with.
     judge : callable, optional
@@ -122,11 +120,6 @@ class LoopCloser:
         -------
         list of Decision
             In force for the new ones, in their order.
-
-        Raises
-        ------
-        CovarianceError
-            A loop that passed its gates without a covariance.
         """
         first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
         numbers = list(range(first, first + len(loops)))
@@ -143,13 +136,7 @@ class LoopCloser:
         return [self.ledger.of(n) for n in numbers]
 
     def undo(self, loop: int, why: str = "asked for") -> Decision:
-        """Take a loop out of the graph, and solve without it.
-
-        Raises
-        ------
-        DataError
-            It is not in the graph.
-        """
+        """Take a loop out of the graph, and solve without it."""
         d = self.ledger.of(loop)
         if d.verdict != "accepted":
             raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")

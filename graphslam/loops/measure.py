@@ -65,8 +65,6 @@ class LoopMeasurer:
     ----------
     submaps : sequence of Submap
         With dense maps.
-    places : Places
-    config : PairConfig, optional
     """
 
     def __init__(self, submaps: Sequence[Submap], places: Places, config: PairConfig | None = None) -> None:
@@ -83,13 +81,7 @@ class LoopMeasurer:
         self._maps.clear()
 
     def prepared(self, k: int) -> PreparedMap:
-        """The map of submap ``k`` of the chain.
-
-        Raises
-        ------
-        DataError
-            It has none.
-        """
+        """The map of submap ``k`` of the chain."""
         found = self._maps.pop(k, None)
         self._maps[k] = found = PreparedMap(view_of(self.submaps[k]), self.config) if found is None else found
         return found

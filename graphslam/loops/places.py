@@ -74,13 +74,7 @@ class Places:
         return np.flatnonzero(self.submap == k).astype(np.int64)
 
     def nearest(self, submap: int, position: Array) -> int:
-        """The place of a submap nearest to a position ``(dim,)`` in the frame of its base.
-
-        Raises
-        ------
-        DataError
-            The submap has no place.
-        """
+        """The place of a submap nearest to a position ``(dim,)`` in the frame of its base."""
         at = self.of_submap(submap)
         if not len(at):
             raise DataError(f"submap {submap} has no place")
@@ -92,11 +86,6 @@ def places_of(submaps: Sequence[Submap], spacing: float = 3.0) -> Places:
     """Places about every ``spacing`` [m] of the paths of a chain of submaps; nodes are numbered as they come.
 
     The exit of a submap is the base of the next; that of the last is no place, for nothing was mapped there yet.
-
-    Raises
-    ------
-    DataError
-        A submap without a path.
     """
     stretches = []
     for s in submaps:
@@ -147,7 +136,6 @@ class ChainRelative:
 
     Parameters
     ----------
-    submaps : sequence of Submap
     places : Places
         Of these submaps, their nodes numbered as they come.
 
@@ -181,13 +169,7 @@ class ChainRelative:
 
 
 def chain_increments(submaps: Sequence[Submap], places: Places) -> tuple[Array, Array]:
-    """Relative poses ``(n, 7|3)`` from each place to the next, the last to the end of the chain, and covariances.
-
-    Raises
-    ------
-    DataError
-        A path without covariances.
-    """
+    """Relative poses ``(n, 7|3)`` from each place to the next, the last to the end of the chain, and covariances."""
     T_all, Q_all = [], []
     for k, s in enumerate(submaps):
         at = places.of_submap(k)

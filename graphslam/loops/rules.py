@@ -55,7 +55,6 @@ def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
 
     Parameters
     ----------
-    loop : Loop
     T_ij : (7,) or (3,)
         Relative pose at the solution with the loop.
     P : (d, d)

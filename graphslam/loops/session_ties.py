@@ -81,11 +81,6 @@ class SessionMap:
         Dense, with paths and maps.
     spacing : float
         Of the nodes [m]; node k is the k-th that a graph would have which begins with these submaps at this spacing.
-
-    Raises
-    ------
-    DataError
-        No submaps, or one without a path or a map.
     """
 
     def __init__(self, submaps: Sequence[Submap], spacing: float = 3.0) -> None:
@@ -246,7 +241,6 @@ class TwoSessions:
         ----------
         loops : sequence of Loop
             From :meth:`measure`.
-        config : TieConfig
 
         Returns
         -------
@@ -324,7 +318,6 @@ def start_of(ties: Sequence[Loop], known: Array, new: Array) -> Array:
 
     Parameters
     ----------
-    ties : sequence of Loop
     known : (n, 7|3)
         Nodes of the map, in its frame.
     new : (m, 7|3)

@@ -60,11 +60,6 @@ def align_by_identity(
     reference_ids, reference : (m,), (m, 2)
     tolerance : float
         Common landmarks farther apart than this after the motion do not agree [m].
-
-    Raises
-    ------
-    DataError
-        Fewer than two common landmarks, or no two of them that agree in their distance.
     """
     p, q = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     _, i, j = np.intersect1d(np.asarray(ids), np.asarray(reference_ids), return_indices=True)
@@ -96,11 +91,6 @@ def align_by_constellation(
         So many landmarks must come together.
     margin : float
         A motion elsewhere (1 m or 10° away) may bring at most this share of them together.
-
-    Raises
-    ------
-    DataError
-        Too few come together, or two motions do about as well: the pattern is ambiguous.
     """
     p, q = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     T = _motions(p, q, np.ones((len(p), len(q)), dtype=np.bool_), tolerance)

@@ -74,13 +74,11 @@ def tie_candidates(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     places : Places
         Of these.
     entries : collection of (int, int)
         Re-entries that are believed: keys of target and submap. The submap is one that went on in the target's map
         (its ``report["holds"]`` names the target).
-    config : TieConfig, optional
 
     Returns
     -------

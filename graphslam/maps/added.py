@@ -63,10 +63,6 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
     slack : {0, 1}
         1: a voxel that both know did not change if one beside it has its value in the earlier map. For maps that were
         put on lattices of their own, each, from a third one: rounding twice is not rounding once.
-
-    Raises
-    ------
-    GridError, GeometryError
     """
     if grid.voxel_size != earlier.voxel_size or grid.dim != earlier.dim:
         raise GridError(
@@ -109,11 +105,6 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     grids : by key
     entered : by key
         Key of the submap whose map was taken out, of those that had one.
-
-    Raises
-    ------
-    DataError
-        A submap without a map.
     """
     whole = {s.key: grid_of(s) for s in submaps}
     grids, entered = dict(whole), {}
@@ -138,12 +129,6 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
 
 
 def grid_of(submap: Submap) -> EvidenceGrid:
-    """The evidence of a submap's dense map.
-
-    Raises
-    ------
-    DataError
-        It has none.
-    """
+    """The evidence of a submap's dense map."""
     grid: EvidenceGrid = view_of(submap).evidence()
     return grid

@@ -44,11 +44,8 @@ class Alternative:
 
     Parameters
     ----------
-    name : str
     graph : PoseGraph
         At its solution.
-    solution : Solution
-    candidate : Candidate
     facts : mapping of str
         What else is to be told of it, JSON-serialisable.
     """
@@ -76,7 +73,6 @@ class Judged:
     ----------
     number : int
         Of the alternative as given.
-    alternative : Alternative
     chi2, dof : float, int
         Of its graph; of matches and loops without their kernels, under which a wrong one hardly counts.
     contradicted : bool
@@ -182,7 +178,6 @@ def choose(
         Ways in which the grid stands when entropies are taken.
     contradiction : float
         See :data:`CONTRADICTION`.
-    progress : bool
 
     Raises
     ------

@@ -28,12 +28,10 @@ def fused_points(
 
     Parameters
     ----------
-    submaps : sequence of Submap
     nodes : mapping of key to ((m,), (m, 3|7))
         Times of the graph's nodes in each submap [s], its base first, and ``T_world_node``.
     level_nodes : bool
         As in `graphslam.maps.submaps.divide_submaps`.
-    config : DivisionConfig, optional
     """
     made, cells = [], []
     for s in submaps:

@@ -48,13 +48,7 @@ class Clarity:
 
 
 def clarity_of(maps: Iterable[EvidenceGrid | FusedMap]) -> Clarity:
-    """Mean entropy and known volume of some maps.
-
-    Raises
-    ------
-    DataError
-        No map.
-    """
+    """Mean entropy and known volume of some maps."""
     found = [(m.entropy(), m.known_volume()) for m in maps]
     if not found:
         raise DataError("there is no map whose entropy could be taken", wanted="one at least")
@@ -88,11 +82,6 @@ def clarity(
     """Entropy of pieces fused at ``T_world_node``, in grids that stand in ``count`` different ways.
 
     Where the voxels lie counts: a floor in the middle of its layer is clear, one between two layers is not.
-
-    Raises
-    ------
-    DataError
-        No pieces, or a piece without a pose.
     """
     if not pieces:
         raise DataError("the entropy of no pieces", wanted="one at least")
@@ -161,7 +150,6 @@ def disagreement(
 
     Parameters
     ----------
-    piece_a, piece_b : Piece
     T_a, T_b : (7,) or (3,)
         ``T_world_node`` of each.
     model : BeamModel, optional
@@ -171,14 +159,6 @@ def disagreement(
         passed.
     slack : int
         Surfaces that lie so many voxels apart along each axis agree: what rounding to two lattices does to one surface.
-
-    Raises
-    ------
-    GridError
-        Another voxel size or dimension.
-    ConfigError
-        Impossible doubt or slack.
-    GeometryError
     """
     if piece_a.voxel_size != piece_b.voxel_size or piece_a.dim != piece_b.dim:
         raise GridError(

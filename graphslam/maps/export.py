@@ -28,11 +28,6 @@ def save_ply(grid: EvidenceGrid, path: str | os.PathLike[str]) -> Path:
     """Write the centres of the occupied voxels as points with their log-odds; of a 2-D grid at height 0.
 
     Binary PLY: float32 ``x``, ``y``, ``z``, ``log_odds``.
-
-    Raises
-    ------
-    FormatError
-        Another ending than ``.ply``.
     """
     target = Path(path)
     if target.suffix != ".ply":
@@ -67,11 +62,6 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
         3-D.
     low, high : float
         The band [m]: voxels whose centres lie in it.
-
-    Raises
-    ------
-    GridError
-        A 2-D grid, an empty band, or one that holds no centre of a voxel.
     """
     if grid.dim != 3:
         raise GridError("a 2-D grid is a floor plan already", got="2-D", wanted="3-D")
@@ -110,11 +100,6 @@ def storeys(positions: Array, *, gap: float = STOREY_GAP, shortest: float = 5.0)
         Between storeys at least [m].
     shortest : float
         Of level way on a storey [m].
-
-    Raises
-    ------
-    GridError
-        Another shape.
     """
     p = np.asarray(positions, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 3 or not np.all(np.isfinite(p)):
@@ -144,7 +129,6 @@ def save_maps(
 
     Parameters
     ----------
-    grid : EvidenceGrid
     folder : path
         Made if it is not there.
     name : str
@@ -156,11 +140,6 @@ def save_maps(
     -------
     list of paths written; a band in which nothing is known is left out. Floor plans of too many pixels, and a map that
     reaches beyond OctoMap's cube, are of larger voxels (:mod:`graphslam.maps.coarse`), as the files themselves say.
-
-    Raises
-    ------
-    GridError
-        An empty map.
     """
     target = Path(folder)
     if grid.voxel_counts().known == 0:

@@ -86,13 +86,6 @@ class FusedMap:
     threads : int
         That put pieces on the lattice; the map is the same with any number.
 
-    Raises
-    ------
-    GridError
-        Impossible voxel size or dimension.
-    ConfigError
-        Impossible tolerance.
-
     Examples
     --------
     >>> import numpy as np
@@ -240,15 +233,6 @@ class FusedMap:
         tolerance : float, optional
             Instead of the map's own [voxels]. ``move(map.wanted, tolerance=0)`` puts every piece where it was last
             wanted, exactly.
-
-        Raises
-        ------
-        DataError
-            A name that is not there, is there already, or has no pose.
-        GeometryError
-            An impossible pose.
-        GridError
-            Another voxel size or dimension, or a piece that would reach out of the addressable cube.
         """
         add, poses = dict(add or {}), dict(poses or {})
         limit = self.tolerance if tolerance is None else float(tolerance)
@@ -411,15 +395,7 @@ def fuse(
     pool: GridPool | None = None,
     threads: int = 1,
 ) -> FusedMap:
-    """A fused map of pieces at ``T_world_node``, from scratch.
-
-    Raises
-    ------
-    DataError
-        No pieces (then there is no voxel size), or a piece without a pose.
-    GridError, GeometryError
-        See :meth:`FusedMap.update`.
-    """
+    """A fused map of pieces at ``T_world_node``, from scratch."""
     if not pieces:
         raise DataError("a fused map of no pieces has no voxel size", wanted="a FusedMap, and pieces later")
     first = next(iter(pieces.values()))

@@ -35,7 +35,6 @@ class Candidate:
     poses : mapping of name to (7,) or (3,)
         ``T_world_node`` of all of them. Candidates of one gauge (the first base fixed) share more, and differ by less
         that means nothing: where the lattice lies makes a difference, too.
-    name : str
     """
 
     pieces: Mapping[PieceId, Piece]
@@ -51,7 +50,6 @@ class Ranked:
     ----------
     index : int
         Of the candidate as given.
-    name : str
     clarity : Clarity
         Its entropy, by which the order is, and known volume beside it.
     changed : int
@@ -94,20 +92,10 @@ def rank_by_entropy(
 
     Parameters
     ----------
-    candidates : sequence of Candidate
-    model : BeamModel, optional
     count : int
         Ways in which the grid stands; entropy is the mean over them (`entropy.placements`).
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    DataError
-        No candidates, or one without pieces or with a piece that has no pose.
-    ConfigError
-        No placement.
-    GridError, GeometryError
     """
     if not candidates:
         raise DataError("there are no candidates to choose the clearest of", wanted="one at least")
@@ -150,12 +138,7 @@ def rank_by_entropy(
 
 
 def visiting_order(signatures: Sequence[frozenset[Any]]) -> list[int]:
-    """An order of sets in which each differs little from the one before: always the nearest of those left.
-
-    Parameters
-    ----------
-    signatures : sequence of frozenset
-    """
+    """An order of sets in which each differs little from the one before: always the nearest of those left."""
     left = list(range(1, len(signatures)))
     way = [0]
     while left:

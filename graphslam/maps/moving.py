@@ -74,7 +74,6 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
         neither ask nor answer.
     bases : (n, 7)
         ``T_world_base``, z up.
-    config : MovingConfig, optional
 
     Returns
     -------
@@ -119,7 +118,6 @@ class MovedThings:
     ----------
     moved : (m, 3)
         Points that moved, in a frame whose z axis points upwards [m].
-    config : MovingConfig, optional
     """
 
     def __init__(self, moved: Array, config: MovingConfig | None = None) -> None:

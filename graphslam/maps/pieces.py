@@ -122,13 +122,6 @@ class Piece:
         In units of `evidence.layout.STEP`, x fastest; `layout.UNKNOWN` where the piece knows nothing.
     T_base_node : (7,) or (3,)
         Pose of the node in the base's frame; default the identity: a submap in one piece, led by its base.
-
-    Raises
-    ------
-    GridError
-        Shapes that do not fit, a brick twice, 2-D bricks off the layer 0, or a piece too wide.
-    GeometryError
-        An impossible pose.
     """
 
     __slots__ = ("T_base_node", "_bricks", "corners", "dim", "first", "known", "nbytes", "voxel_size")
@@ -211,13 +204,7 @@ class Piece:
 
 
 def checked_poses(poses: Any, dim: int) -> Array:
-    """Poses ``(..., 7)``, or ``(..., 3)`` in 2-D, as floats, quaternions of unit length.
-
-    Raises
-    ------
-    GeometryError
-        Another shape, not finite, or no rotation.
-    """
+    """Poses ``(..., 7)``, or ``(..., 3)`` in 2-D, as floats, quaternions of unit length."""
     T = np.array(poses, dtype=np.float64)
     size = 7 if dim == 3 else 3
     if T.ndim < 1 or T.shape[-1] != size:
@@ -234,7 +221,6 @@ def whole(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
 
     Parameters
     ----------
-    grid : EvidenceGrid
     T_base_node : (7,) or (3,), optional
         Default the identity.
     """
@@ -267,19 +253,11 @@ def divide(
         Ascending, within the path [s].
     T_base_nodes : (m, 7) or (m, 3), optional
         Poses of the nodes; default the body's at those times.
-    config : DivisionConfig, optional
 
     Returns
     -------
     list of Piece
         As many as nodes, in their order; a node that owns nothing has an empty piece.
-
-    Raises
-    ------
-    DataError
-        No nodes, times that do not ascend or lie outside the path, or another dimension of the path.
-    GeometryError
-        Impossible poses of nodes.
     """
     config = DivisionConfig() if config is None else config
     times = np.asarray(node_times, dtype=np.float64)
@@ -341,13 +319,7 @@ def owning_places(path: Trajectory, node_times: Array, config: DivisionConfig) -
 
 
 def node_times_every(path: Trajectory, distance: float) -> Array:
-    """Times ``(m,)`` along a path about every ``distance`` metres, beginning at its first.
-
-    Raises
-    ------
-    ConfigError
-        A distance that is not positive.
-    """
+    """Times ``(m,)`` along a path about every ``distance`` metres, beginning at its first."""
     if not (np.isfinite(distance) and distance > 0):
         raise ConfigError(f"nodes every {distance} m; wanted > 0")
     arc = arc_length(path.positions)
@@ -375,12 +347,6 @@ def pieces_of_submap(
     T_base_nodes : (m, 7) or (m, 3), optional
     names : sequence, optional
         Default ``(key, 0)``, ``(key, 1)`` …
-    config : DivisionConfig, optional
-
-    Raises
-    ------
-    DataError
-        No map, no path where it is needed, or names that differ in number from the nodes.
     """
     grid = view_of(submap).evidence()
     if node_times is None:

@@ -84,13 +84,7 @@ class Poser:
         self._sums = np.empty((0, BRICK_VOXELS), np.int16)
 
     def pose(self, piece: Piece, T: Array, T_world_node: Array) -> Posed:
-        """A piece at ``T`` ``(12,)``, which is T_world_base: rotation row by row, then translation [m].
-
-        Raises
-        ------
-        GridError
-            It would reach out of the addressable cube.
-        """
+        """A piece at ``T`` ``(12,)``, which is T_world_base: rotation row by row, then translation [m]."""
         R, t = np.ascontiguousarray(T[:9].reshape(3, 3)), T[9:] / self.voxel_size
         keys = self._met(piece, R, t)
         if len(self._entries) < BRICK_VOXELS * len(keys) + 1:  # one more: of a voxel that is not known, written over

@@ -31,13 +31,7 @@ SAME = 1e-3
 
 
 def steps_at(refinement: Refinement, times: Array) -> Index:
-    """Numbers ``(k,)`` of the steps at some times.
-
-    Raises
-    ------
-    DataError
-        There is none at one of them.
-    """
+    """Numbers ``(k,)`` of the steps at some times."""
     t = refinement.times
     j = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
     j = np.where(times - t[j - 1] < t[j] - times, j - 1, j)
@@ -53,11 +47,6 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
     """The solved map with the refined path in place of the graph's.
 
     Nodes keep their places relative to the body: a base may stand level beside it.
-
-    Raises
-    ------
-    DataError
-        Nodes that are at no step.
     """
     g = group_of(refinement.poses)
     at = steps_at(refinement, m.node_times)
@@ -90,13 +79,6 @@ def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinem
         With evidence grids, whose model is kept.
     m : GlobalMap
         Refined (:func:`refined_map`).
-    refinement : Refinement
-    scans : Scans
-
-    Raises
-    ------
-    DataError
-        Submaps that begin or end at no step, or have no grid.
     """
     bases = base_frames(m)
     g = group_of(bases)

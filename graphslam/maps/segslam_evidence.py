@@ -31,16 +31,10 @@ def own_evidence_of(
 
     Parameters
     ----------
-    segmap : SegMap
     chain : sequence of int
         The segments, as `settle` got them.
     submaps : sequence of Submap
         As `settle` gave them, with grids.
-
-    Raises
-    ------
-    DataError
-        Chain and submaps differ in number, or a submap has no grid.
     """
     if len(chain) != len(submaps):
         raise DataError("segments and submaps differ in number", got=len(submaps), wanted=len(chain))

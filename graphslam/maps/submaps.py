@@ -42,24 +42,12 @@ class DividedSubmaps:
     level_nodes: bool
 
     def along(self, path: Trajectory) -> dict[PieceId, Array]:
-        """``T_world_node`` where a path ``T_world_body(t)`` has the body at the times of the nodes.
-
-        Raises
-        ------
-        DataError
-            A node outside the path's time.
-        """
+        """``T_world_node`` where a path ``T_world_body(t)`` has the body at the times of the nodes."""
         poses = path.interpolate(np.array(list(self.times.values())))
         return dict(zip(self.times, level(poses) if self.level_nodes else poses))
 
     def from_bases(self, bases: dict[int, Array]) -> dict[PieceId, Array]:
-        """``T_world_node`` from ``T_world_base`` by key: submaps that stay rigid.
-
-        Raises
-        ------
-        DataError
-            A submap without a pose.
-        """
+        """``T_world_node`` from ``T_world_base`` by key: submaps that stay rigid."""
         missing = sorted({name[0] for name in self.pieces} - set(bases))  # type: ignore[index]
         if missing:
             raise DataError("submaps have no pose", got=missing)
@@ -97,11 +85,6 @@ def divide_submaps(
     nodes : mapping of key to (m,), optional
         Times of a graph's nodes in each submap [s], in place of ``every``. The first is the base itself, not the body.
         A submap of one node is one piece.
-
-    Raises
-    ------
-    DataError
-        No submaps, or one without a map or, where it is divided, without a path.
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
@@ -135,13 +118,7 @@ def divide_submaps(
 
 
 def local_nodes(s: Submap, times: Array, level_nodes: bool) -> Array:
-    """``T_base_node (m, 3|7)`` of a graph's nodes in a submap, of which the first is its base.
-
-    Raises
-    ------
-    DataError
-        A submap without a path.
-    """
+    """``T_base_node (m, 3|7)`` of a graph's nodes in a submap, of which the first is its base."""
     path = _path(s)
     out = _poses(path, _clipped(path, times), level_nodes)
     out[0] = group_of(out).identity

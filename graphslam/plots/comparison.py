@@ -37,7 +37,6 @@ def plot_comparison(
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame or sequence of mappings
         One row per method.
     value : str

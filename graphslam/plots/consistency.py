@@ -28,7 +28,6 @@ def plot_consistency(
 
     Parameters
     ----------
-    ax : Axes or None
     curves : mapping of label to Consistency
         One per algorithm, of the same quantity; columns are submaps.
     submaps : (k,), optional

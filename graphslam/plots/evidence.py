@@ -62,13 +62,10 @@ def plot_section(
 
     Parameters
     ----------
-    grid : EvidenceGrid
-    ax : Axes or None
     axis : {"z", "x", "y"}
         The plane's normal.
     at : float
         Where the plane lies on that axis [m].
-    title : str, optional
     """
     ax = style.new_axes(ax)
     p, extent = section(grid, axis, at)
@@ -90,10 +87,8 @@ def plot_heights(
     ----------
     grid : EvidenceGrid
         3-D.
-    ax : Axes or None
     below : float, optional
         Leave out voxels above this height [m]: takes the roof off a building.
-    title : str, optional
     """
     if grid.dim != 3:
         raise ConfigError("a 2-D grid has no heights; use plot_section")
@@ -140,11 +135,8 @@ def plot_sharing(
 
     Parameters
     ----------
-    grid : EvidenceGrid
     others : sequence of EvidenceGrid
         Of the same pool.
-    ax : Axes or None
-    title : str, optional
     """
     ax = style.new_axes(ax)
     at, shared = grid.brick_coordinates(), shared_bricks(grid, others)

@@ -26,17 +26,14 @@ def draw_exits(
 
     Parameters
     ----------
-    ax : Axes
     ends : mapping of label to ((2,), (2, 2))
         Positions and covariances in one frame.
     colours : sequence of str
         Taken in turn.
     truth : (2,) or more, optional
         Position first.
-    truth_label : str
     confidence : float
         Of the ellipses.
-    title : str, optional
     """
     for k, (label, (at, P)) in enumerate(ends.items()):
         colour = colours[k % len(colours)]

@@ -39,12 +39,10 @@ def plot_storey(
         3-D.
     low, high : float
         The band [m].
-    ax : Axes or None
     path : Trajectory, optional
         ``T_world_body``; drawn where it is in the band, or less than 1.5 m below.
     truth : Trajectory, optional
         The true path in the same frame, drawn in the same way.
-    title : str, optional
 
     Raises
     ------
@@ -91,11 +89,6 @@ def slab(grid: EvidenceGrid, axis: int, low: float, high: float) -> tuple[Array,
     Returns
     -------
     probabilities, extent : of the other horizontal axis and of heights [m]
-
-    Raises
-    ------
-    ConfigError
-        A 2-D grid, another axis, or an empty slab.
     """
     size = grid.voxel_size
     first, last = (int(np.ceil(v / size - 0.5)) for v in (low, high))
@@ -136,14 +129,12 @@ def plot_cut(
         3-D.
     path : Trajectory
         ``T_world_body``.
-    ax : Axes or None
     thickness : float
         Of the slab [m].
     stretch : float
         Of heights in the picture.
     truth : Trajectory, optional
         The true path in the same frame.
-    title : str, optional
 
     Raises
     ------

@@ -26,7 +26,6 @@ def plot_gap_along(ax: Axes | None, table: pd.DataFrame, *, title: str | None = 
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of :func:`graphslam.evaluate.gap.gap_along`. Submaps whose optimum is below 1 (nothing was seen twice yet) are
         left out.
@@ -56,7 +55,6 @@ def plot_tree_gap(ax: Axes | None, table: pd.DataFrame, *, value: str = "own", t
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of :func:`graphslam.evaluate.gap.gap_by_tree`.
     value : {"own", "gap"}
@@ -96,7 +94,6 @@ def plot_convergence(
 
     Parameters
     ----------
-    ax : Axes or None
     histories : mapping of start to (k,)
         Objectives, e.g. of :func:`graphslam.evaluate.gap.polish_history`.
     optimum : float, optional

@@ -23,8 +23,6 @@ def plot_gps_vectors(
 
     Parameters
     ----------
-    ax : Axes or None
-    residuals : GpsResiduals
     scale : float
         Enlargement of the arrows; the legend says it.
     gap : float

@@ -26,8 +26,6 @@ def plot_local_map(
 
     Parameters
     ----------
-    ax : Axes or None
-    submap : Submap
     truth : Truth, optional
         True exit and landmarks are drawn over it, in the same frame: nothing is aligned.
     confidence : float

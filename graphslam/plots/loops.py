@@ -34,7 +34,6 @@ def plot_loops(
 
     Parameters
     ----------
-    ax : Axes or None
     path : (n, ≥ 2)
         Positions along the path [m].
     nodes : (m, ≥ 2)
@@ -43,11 +42,6 @@ def plot_loops(
         Nodes and ``accepted``, ``rejected``, ``switched-off`` or ``undone``.
     names : sequence, optional
         One a loop, written beside those that are in the graph or were.
-
-    Raises
-    ------
-    DataError
-        A loop of a node that is not there, or an unknown verdict.
     """
     p, x = np.asarray(path, dtype=np.float64), np.asarray(nodes, dtype=np.float64)
     for i, j, verdict in loops:

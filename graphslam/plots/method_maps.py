@@ -43,13 +43,10 @@ def plot_method_maps(
     maps : mapping of label to SubmapEstimate or Submap
         Joined maps, or single maps over the whole run. Features bear the identities of the truth; those without are
         left out.
-    truth : Truth
     start : float
         Stamp of the first base [s].
     confidence : float
         Of the ellipses.
-    columns : int
-    axes : list of Axes, optional
 
     Returns
     -------

@@ -39,7 +39,6 @@ def plot_exit(
 
     Parameters
     ----------
-    ax : Axes or None
     handovers : mapping of label to Submap
         2-D landmark submaps of the same scans.
     particles : ParticleSet, optional
@@ -142,7 +141,6 @@ def plot_lineage(
 
     Parameters
     ----------
-    ax : Axes or None
     particles : ParticleSet
         At the end of the submap.
     submap : Submap
@@ -179,7 +177,6 @@ def plot_histories(ax: Axes | None, sets: Mapping[str, ParticleSet], *, title: s
 
     Parameters
     ----------
-    ax : Axes or None
     sets : mapping of label to ParticleSet
     """
     if not sets:
@@ -212,7 +209,6 @@ def plot_ancestry(
     ----------
     result : RbpfResult or SegSlamResult
         Its run must have kept the lineages that died out (``prune_every=0``) for them to be shown.
-    ax : Axes or None
     segment_boundaries : sequence of float, optional
         Times [s] at which segments end. Only within a segment does it matter that the particles have met: across a
         boundary any of them may follow any other.
@@ -254,11 +250,6 @@ def plot_ancestry(
 def plot_effective(result: RbpfResult, ax: Axes | None, *, title: str | None = None) -> Axes:
     """How many particles are effective after each scan (SegSLAM eq. 7), when they were resampled, and how many
     ancestors of each step are left.
-
-    Parameters
-    ----------
-    result : RbpfResult
-    ax : Axes or None
     """
     times, n = np.asarray(result.times) - result.times[0], result.ancestry.particles
     ax = style.new_axes(ax, (8.0, 3.2))
@@ -288,10 +279,8 @@ def plot_pasts(rbpf: RbpfResult, segslam: SegSlamResult, ax: Axes | None, *, tit
 
     Parameters
     ----------
-    rbpf : RbpfResult
     segslam : SegSlamResult
         Of the same steps.
-    ax : Axes or None
     """
     stamps = np.asarray(segslam.steps.times)
     if len(rbpf.times) != len(stamps):

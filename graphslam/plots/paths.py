@@ -52,7 +52,6 @@ def plot_paths(
 
     Parameters
     ----------
-    ax : Axes or None
     paths : mapping of label to Trajectory
         Those of :data:`graphslam.plots.style.NAMES`, "RBPF" and "SegSLAM" have colours of their own.
     truth : Trajectory or (n, ≥ dim), optional

@@ -24,11 +24,8 @@ def plot_before_after(
 
     Parameters
     ----------
-    ax : Axes or None
     graph, refined : Trajectory
         Where the refinement began, and its result. Covariances of the result are drawn as the σ that it claims.
-    truth : Trajectory, optional
-    title : str, optional
 
     Raises
     ------
@@ -66,10 +63,8 @@ def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike, *, title: str | None = 
 
     Parameters
     ----------
-    ax : Axes or None
     knots : (k, 2)
         Time [s] and bias [rad/s].
-    title : str, optional
     """
     t, bias = np.asarray(knots, dtype=np.float64).reshape(-1, 2).T
     ax = style.new_axes(ax, (8.0, 2.4))

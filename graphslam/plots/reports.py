@@ -28,8 +28,6 @@ def plot_report(
 
     Parameters
     ----------
-    ax : Axes or None
-    submaps : sequence of Submap
     key : str
         Name of a number in the reports, e.g. ``min_ess``, ``scans``.
     label : str, optional
@@ -57,7 +55,6 @@ def plot_submap_chi2(
 
     Parameters
     ----------
-    ax : Axes or None
     submaps : sequence of Submap
         Their reports hold ``chi2`` and ``dof``.
     confidence : float

@@ -49,7 +49,6 @@ def plot_scan(
 
     Parameters
     ----------
-    ax : Axes or None
     time : float
         Instant [s].
     scans : LaserScans, optional

@@ -30,7 +30,6 @@ def plot_segmap(ax: Axes | None, segmap: SegMap, *, sample: MapSample | None = N
 
     Parameters
     ----------
-    ax : Axes or None
     segmap : SegMap
         Only segments that are viable are drawn.
     sample : MapSample, optional
@@ -86,8 +85,6 @@ def plot_expansion(
 
     Parameters
     ----------
-    ax : Axes or None
-    segmap : SegMap
     sample : MapSample
         In whose root's frame the paths are drawn.
     plane : {"xy", "xz", "yz"}
@@ -133,7 +130,6 @@ def plot_score_map(
 
     Parameters
     ----------
-    ax : Axes or None
     positions : (n, dim)
         Of the body [m].
     scores : (n,)

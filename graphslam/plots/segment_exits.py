@@ -34,7 +34,6 @@ def plot_segment_exit(
 
     Parameters
     ----------
-    ax : Axes or None
     handovers : mapping of label to Submap
         Of one segment, with different covariances.
     exits : (n, 7) or (n, 3), optional
@@ -76,7 +75,6 @@ def plot_exit_nees(
 
     Parameters
     ----------
-    ax : Axes or None
     scores : mapping of label to Nees
         Of the same segments, in order.
     confidence : float

@@ -51,7 +51,6 @@ def plot_scores(
 
     Parameters
     ----------
-    ax : Axes or None
     lengths, scores : (n,)
         Metres driven; share of the look-ahead beams that the maps predict, NaN where there is none.
     boundaries : sequence of (length, reason)
@@ -115,7 +114,6 @@ def plot_segments(
 
     Parameters
     ----------
-    ax : Axes or None
     paths : sequence of Trajectory or (n, dim)
         In one frame and in the order of time; :func:`sample_paths` makes them from a map sample.
     ties : sequence of Tie
@@ -162,8 +160,6 @@ def sample_paths(
 
     Parameters
     ----------
-    segmap : SegMap
-    sample : MapSample
     frame : {"root", "first"}
         In the frame of the sample's root, or of its first segment in time.
 
@@ -217,7 +213,6 @@ def plot_samples(
 
     Parameters
     ----------
-    ax : Axes or None
     trajectories : sequence of Trajectory or (n, dim)
         Of the samples, in one frame.
     best : int, optional
@@ -260,12 +255,10 @@ def plot_entropies(
 
     Parameters
     ----------
-    ax : Axes or None
     entropies : mapping of label to (n,)
         A single value is drawn as a line.
     bins : int
         Of all histograms together, so that areas compare.
-    unit : str
 
     Raises
     ------

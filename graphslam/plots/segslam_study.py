@@ -54,7 +54,6 @@ def plot_by_particles(
 
     Parameters
     ----------
-    ax : Axes or None
     curves : mapping of family to Curve
         ``rbpf``, ``segslam`` have their own colours and are beside each other.
     label : str

@@ -65,11 +65,8 @@ def plot_solid(
 
     Parameters
     ----------
-    world : World
-    ax : Axes or None
     below : float
         The cut [m]; parts of the way above it are left out.
-    view : View, optional
     margin : float
         What is shown beside the way [m].
     pixels : int
@@ -129,8 +126,6 @@ def plot_cloud(
     ----------
     points : (n, 3)
         [m]
-    ax : Axes or None
-    view : View, optional
     size : float
         Of a point.
     path : (m, 3), optional

@@ -60,7 +60,6 @@ def plot_ci(
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of one world.
     quantity : str
@@ -132,7 +131,6 @@ def plot_error_band(
 
     Parameters
     ----------
-    ax : Axes or None
     submaps, error, sigma : (k,)
     """
     x, e, s = (np.asarray(v, dtype=np.float64) for v in (submaps, error, sigma))
@@ -216,7 +214,6 @@ def plot_rms(
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of one world.
     factor : float

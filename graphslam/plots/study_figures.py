@@ -29,7 +29,6 @@ def save_paper_figures(table: pd.DataFrame, timings: pd.DataFrame, folder: Path)
     ----------
     table, timings : DataFrame
         ``world, run, algorithm, submap, quantity, value`` in the vocabulary of the study ``combined-slam``.
-    folder : path
 
     Returns
     -------

@@ -48,7 +48,6 @@ def plot_error_growth(
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of one world, with ``error_x``, ``error_y``, ``error_heading`` or ``feature_rms`` along the run.
     component : {"position", "heading", "features"}

@@ -31,7 +31,6 @@ def plot_local_honesty(
 
     Parameters
     ----------
-    ax : Axes or None
     table : DataFrame
         Of one world, with ``local_joint_nees`` and ``local_joint_dof``.
     """

@@ -11,13 +11,7 @@ from graphslam.plots.algorithms import in_order
 
 
 def algorithms_with(table: pd.DataFrame, quantity: str, *, online: bool) -> list[str]:
-    """Algorithms that have a quantity, along the run (``online``) or of the whole run, in the order of drawing.
-
-    Raises
-    ------
-    DataError
-        None has it, or the table holds several worlds.
-    """
+    """Algorithms that have a quantity, along the run (``online``) or of the whole run, in the order of drawing."""
     if "world" in table and table["world"].nunique() > 1:
         raise DataError("a figure is of one world", got=", ".join(sorted(set(table["world"]))), wanted="rows of one")
     of = (table["quantity"] == quantity) & ((table["submap"] >= 0) == online)

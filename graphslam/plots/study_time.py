@@ -30,7 +30,6 @@ def plot_cumulative_time(
 
     Parameters
     ----------
-    ax : Axes or None
     timings : DataFrame
         Of one world: ``seconds_cumulative`` along the run, or ``seconds_total``.
     """

@@ -44,8 +44,6 @@ def plot_submap_chain(
 
     Parameters
     ----------
-    ax : Axes or None
-    submaps : sequence of Submap
     node_poses : (m, 3) or (m + 1, 3), optional
         World poses of the bases, as solved; default the chain of exits from the origin.
     confidence : float

@@ -57,8 +57,6 @@ def plot_surface(
         Counter-clockwise as seen from the free side.
     values : (v,)
         That the colours show; grey where they are not finite.
-    ax : Axes, optional
-    label, title : str
     slant : float
         Of the view below the vertical [deg]: 0 is from above.
     width : int

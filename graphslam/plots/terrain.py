@@ -41,13 +41,10 @@ def plot_terrain(
 
     Parameters
     ----------
-    found : TerrainMap
-    ax : Axes, optional
     path : (n, 2), optional
         Way of the vehicle, drawn over it [m].
     plain : bool
         Three colours only: green free, red a hazard, white unknown.
-    title : str
     """
     ax = style.new_axes(ax)
     classes = found.classes.astype(np.int64)
@@ -93,10 +90,8 @@ def plot_bands(
 
     Parameters
     ----------
-    found : TerrainMap
     cells : sequence of float
         Widths of the cells of the bands [m], the finest first.
-    ax : Axes, optional
     place : (2,), optional
         Of the vehicle [m].
 

@@ -22,7 +22,6 @@ def plot_gps_residuals(
 
     Parameters
     ----------
-    ax : Axes or None
     residuals : GpsResiduals, or mapping of label to GpsResiduals
     """
     ax = style.new_axes(ax, (7.0, 3.2))

@@ -79,9 +79,6 @@ class FixModel:
 
     Parameters
     ----------
-    gps : Gps
-    config : GpsConfig
-    motion : MotionModel
     poses : (n, 7) or (n, 3)
         Where the refinement starts.
     """

@@ -50,7 +50,6 @@ class Terms:
     nodes : (f, s) int
         Of each slot of columns.
     widths : (s,) int
-    name : str
     """
 
     r: Array
@@ -67,7 +66,6 @@ class MotionModel:
 
     Parameters
     ----------
-    steps : Scans
     knot : float
         Time between knots of the yaw bias [s].
     bridge : (n,), optional

@@ -27,7 +27,6 @@ def find_nodes(steps: Scans, spacing: float, turn: float) -> Index:
 
     Parameters
     ----------
-    steps : Scans
     spacing, turn : float
         Way [m] and turn [rad] by the odometry from node to node; a step is one as soon as either is reached.
     """
@@ -137,7 +136,6 @@ def path_between(
 
     Parameters
     ----------
-    steps : Scans
     nodes : (m,)
     poses : (m, 7|3)
         Of the nodes.

@@ -91,8 +91,6 @@ class Solved:
 
     Parameters
     ----------
-    pattern : Pattern
-    factor : BlockFactor
     parts : dict of str to float
         Objective by kind of factor, ``Σ rᵀ Λ r`` at the point of linearisation.
     """
@@ -148,7 +146,6 @@ def point_information(pairs: Association, residuals: Array, noise: Array, least:
 
     Parameters
     ----------
-    pairs : Association
     residuals : (k,) [m]
     noise : (3,)
         Variances of a range and of the surfaces [m²], and 1 (:func:`pair_noise`).
@@ -177,8 +174,6 @@ def alike(found: Association, cloud: Cloud, residuals: Array, noise: Array) -> f
 
     Parameters
     ----------
-    found : Association
-    cloud : Cloud
     residuals : (k,) [m]
     noise : (3,)
         See :func:`pair_noise`.
@@ -225,10 +220,6 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     direction whose information is h times what is feigned, the share 1 - 1/h of each derivative is held, which leaves
     ``(h - 1)² / h``: what an estimate without that pull is worth. In a corridor this is nothing of the way along it, in
     a round room nothing of the turn, over a plain neither.
-
-    Returns
-    -------
-    Held
     """
     pairs, group = found.pairs, found.whose
     d = cloud.points.shape[1]
@@ -257,11 +248,8 @@ class Problem:
 
     Parameters
     ----------
-    motion : MotionModel
-    cloud : Cloud
     held : (7,) or (3,)
         Where the first pose is held.
-    fixes : FixModel, optional
     """
 
     def __init__(self, motion: MotionModel, cloud: Cloud, held: Array, fixes: FixModel | None = None) -> None:

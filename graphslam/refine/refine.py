@@ -117,7 +117,6 @@ class Refinement:
         Time [s] and bias of the yaw rate [rad/s] at the knots.
     constants : dict of str to (value, σ)
         ``scale``, ``side``, ``rise``, ``clock``, ``roll``, ``pitch``; ``bend``, ``turn``.
-    rounds : tuple of Round
     parts : dict of str to float
         Objective by kind of factor at the end.
     refused : (m, 2)
@@ -210,21 +209,12 @@ def refine(
 
     Parameters
     ----------
-    steps : Scans
     start : (n, 7) or (n, 3)
         Poses of the base at the stamps of the steps; in space the frame is level.
-    config : RefineConfig, optional
     gps : (Gps, GpsConfig), optional
         Fixes that hold the path, too, and how they enter.
     progress : callable, optional
         Told each round in words.
-
-    Raises
-    ------
-    GeometryError
-        The start does not fit the steps.
-    DataError
-        Too few steps or points to refine anything.
     """
     config = config or RefineConfig()
     g = steps.group

@@ -58,8 +58,6 @@ class Scans:
         Roll and pitch by gravity [rad].
     tilt_sigma, tilt_time : float
         Of their fading error [rad], [s].
-    lasting : LastingSigmas
-    name : str
     """
 
     times: Array
@@ -140,12 +138,7 @@ class Scans:
 
     @classmethod
     def load(cls, file: Path, name: str = "scans") -> Scans:
-        """Read ``scans.npz``.
-
-        Raises
-        ------
-        MissingDataError, FormatError
-        """
+        """Read ``scans.npz``."""
         a = read_npz(file, fmt=SCANS_FORMAT, fields=FIELDS)
         s = a["scalars"]
         try:

@@ -256,7 +256,6 @@ class Association:
 
     Parameters
     ----------
-    pairs : Pairs
     whose : (k,)
         Number of the chunk pair of each.
     once : (k, 3)

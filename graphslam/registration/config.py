@@ -83,7 +83,6 @@ class RegistrationConfig:
     floor_sigma, floor_turn : float
         σ added to the covariance, per axis [m, rad]: what is wrong with the map itself. The defaults are for maps whose
         scans are placed to 2 cm and 2 mrad; for 30 m of dead reckoning 5 cm and 5 mrad fit.
-    gates : Gates
     """
 
     radii: tuple[float, ...] = (2.0, 0.5)

@@ -120,10 +120,8 @@ def match_fails(
 
     Parameters
     ----------
-    found : Registration
     T_prior : (7,) or (3,)
         Where it was expected.
-    limits : MatchLimits
     rules : RegistrationConfig
         Whose own gates are asked too; their tilt is that against the prediction.
     sigma : float
@@ -172,7 +170,6 @@ def second_modes(found: Sequence[Registration], maps: npt.ArrayLike, apart: floa
     found : sequence of m Registration
     maps : (m,) int
         Which map each was matched to.
-    apart : float
     """
     m = len(found)
     out = np.ones(m)

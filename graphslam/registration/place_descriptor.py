@@ -70,7 +70,6 @@ class Descriptors:
         Share of the band that is occupied, 0 where unknown.
     known : (n, rings, sectors)
         Whether the map knows the bin, 0 … 1.
-    config : DescriptorConfig
     """
 
     values: Array
@@ -92,10 +91,8 @@ def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | 
 
     Parameters
     ----------
-    view : MapView
     T_base_place : (n, 7) or (n, 3)
         In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
-    config : DescriptorConfig, optional
     """
     c = DescriptorConfig() if config is None else config
     T = level(np.asarray(T_base_place, dtype=np.float64))
@@ -144,10 +141,8 @@ def similarity(query: Descriptors, which: int, others: Descriptors, rows: Ints) 
 
     Parameters
     ----------
-    query : Descriptors
     which : int
         A row of it.
-    others : Descriptors
     rows : (m,) int
         Of ``others``.
 

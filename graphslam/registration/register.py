@@ -113,10 +113,8 @@ def register(
     source : (m, dim) or Target
         Points in the source frame [m]; what is not finite is left out. Prepare a ``Target`` of it to match it from
         several starts.
-    target : Target
     T_target_source : (3,) or (7,)
         Start.
-    config : RegistrationConfig, optional
     known : (m,) bool, or function of points (m, dim) to (m,) bool, optional
         Which of the source points fall into known space; a function is asked for points in the *target* frame, at the
         result (``EvidenceGrid.known_at`` is one). A mask goes with the points of a source that was not thinned, and
@@ -126,13 +124,6 @@ def register(
     -------
     Registration
         Never an exception because a match fails: ``why`` says what is the matter.
-
-    Raises
-    ------
-    GeometryError
-        A start or a shape that is impossible, or clouds of different dimension.
-    DataError
-        A mask, or an answer of ``known``, of another length than the source.
 
     Notes
     -----
@@ -207,7 +198,6 @@ def distinct(results: Iterable[Registration], apart: tuple[float, float] = (0.5,
 
     Parameters
     ----------
-    results : iterable of Registration
     apart : (float, float)
         See :func:`register_starts`.
     """

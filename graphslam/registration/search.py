@@ -61,7 +61,6 @@ class SearchConfig:
         Source points used: one a cell of the field, of these so many, evenly from first to last.
     apart : float
         Two starts nearer than this [m], and turned by less than ``turned`` [rad], are one mode.
-    turned : float
     score_sigma : float
         What a score may fall short of 1 by at the true place; only matters against a prior.
     refine : bool
@@ -114,10 +113,6 @@ class Lattice:
 def make_lattice(field: SearchField, half_widths: Sequence[float], steps: Sequence[float], reach: float) -> Lattice:
     """The offsets within ``half_widths``; arguments as for :func:`correlative_search`, ``reach`` for a heading step of
     0 [m].
-
-    Raises
-    ------
-    ConfigError
     """
     n = field.dim + 1
     names = ("x", "y", "z", "heading")[: n - 1] + ("heading",) if n == 4 else ("x", "y", "heading")
@@ -147,9 +142,7 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lat
     ----------
     points : (n, dim)
         In the source frame, finite [m].
-    field : SearchField
     around : (3,) or (7,)
-    lattice : Lattice
 
     Returns
     -------
@@ -224,18 +217,12 @@ def correlative_search(
     coarse : SearchField, optional
         Of the same map, with larger cells and σ, made for the steps of the lattice: few points are scored on it, and
         only the best modes in ``field``. What is searched may then be some ten times as wide for the same time.
-    config : SearchConfig, optional
 
     Returns
     -------
     list of Start
         Local maxima of the lattice, of which none is near a better one. Empty without points, and where nothing of
         the map lies under any point.
-
-    Raises
-    ------
-    ConfigError, GeometryError
-        Impossible numbers or shapes.
 
     Notes
     -----

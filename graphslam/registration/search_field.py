@@ -28,15 +28,6 @@ class SearchField:
     sigma : float
         The field is ``exp(-d² / 2σ²)`` at distance d [m] from the centre of the nearest occupied cell, in 255 steps,
         and 0 beyond 3 σ. Half the steps of the lattice to be searched, or more: what falls between them is not found.
-
-    Raises
-    ------
-    GeometryError
-        Points of an impossible shape.
-    DataError
-        No finite point, or points so far apart that the field would not fit into memory.
-    ConfigError
-        An impossible number.
     """
 
     def __init__(self, points: Any, *, cell: float = 0.2, sigma: float = 0.3) -> None:

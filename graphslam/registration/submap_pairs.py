@@ -38,7 +38,6 @@ class PreparedMap:
     ----------
     view : MapView
         In the frame of the submap's base.
-    config : PairConfig
     """
 
     def __init__(self, view: MapView, config: PairConfig) -> None:
@@ -161,7 +160,6 @@ def match_pair(
 
     Parameters
     ----------
-    source, target : PreparedMap
     T_base_place : (7,) or (3,)
         The place in the frame of the source's base.
     T_target_place : (7,) or (3,)
@@ -175,11 +173,6 @@ def match_pair(
     -------
     PairMatch
         ``T_target_source`` is that of the place. Never an exception because a match fails.
-
-    Raises
-    ------
-    CovarianceError, GeometryError
-        An impossible prediction.
     """
     c = target.config if config is None else config
     g = group_of(T_target_place)
@@ -284,7 +277,6 @@ def contradiction(
 
     Parameters
     ----------
-    source, target : PreparedMap
     T_base_place, T_target_place : (7,) or (3,)
         The place in both.
     points : (m, dim)

@@ -65,7 +65,6 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfi
         Rows of the places that are asked for.
     near : (m,)
         Rows of the places that may be neighbours, ``own`` among them.
-    config : SurfaceConfig
 
     Returns
     -------

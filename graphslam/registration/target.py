@@ -39,11 +39,6 @@ class Target:
         Points that the shape around a point is taken from, itself included.
     drops : DropCounter, optional
         Counts the points left out too.
-
-    Raises
-    ------
-    GeometryError
-        Points of an impossible shape. No points at all are no error here: a registration to them is refused.
     """
 
     def __init__(

@@ -46,8 +46,6 @@ class Balancing(Motion):
     ----------
     way : Way
         Of the base: the middle of the axle.
-    speed : float
-    config : DriveConfig
     lean : float
         Greatest pitch [rad].
     rate : float
@@ -187,7 +185,6 @@ def simulate_campus(
 
     Parameters
     ----------
-    config : CampusConfig
     seed : int
         Of every error, and of what moves.
     world_seed : int, optional
@@ -203,12 +200,6 @@ def simulate_campus(
         level, and ``moving``, which beams met cars and people. ``meta``: every figure, what was drawn,
         ``T_world_frame`` (7,), ``indoor`` (times ``[from, to]`` under a roof), ``corridors`` (angle between the two
         legs of each [rad], and the times in each leg), ``movers``.
-
-    Raises
-    ------
-    ConfigError, GeometryError, DataError
-    GraphSlamError
-        Open3D is not there.
     """
     c, place = config, seed if world_seed is None else world_seed
     world = campus(c, seed=place)

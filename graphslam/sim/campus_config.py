@@ -211,12 +211,7 @@ PRESETS: dict[str, Mapping[str, Any]] = {
 
 
 def campus_preset(name: str = "full", **changes: Any) -> CampusConfig:
-    """A preset with figures changed.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-    """
+    """A preset with figures changed."""
     if name not in PRESETS:
         raise UnknownNameError("preset of the campus", name, PRESETS)
     known = {f.name for f in dataclasses.fields(CampusConfig)}

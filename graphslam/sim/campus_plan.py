@@ -39,7 +39,6 @@ class Block:
 
     Parameters
     ----------
-    column, row : int
     area : (x0, y0, x1, y1)
         Without the streets [m].
     open : bool
@@ -109,7 +108,6 @@ class Campus:
         Middle lines of the streets [m].
     street : float
         Width of a street [m].
-    blocks : tuple of Block
     """
 
     xs: Array
@@ -160,13 +158,7 @@ def plan_campus(config: CampusConfig, seed: int) -> Campus:
 
 
 def plan_session(campus: Campus, config: CampusConfig, seed: int) -> tuple[Array, list[Block]]:
-    """Way of a session: points ``(k, 3)`` that it drives over, and the blocks whose buildings it goes through.
-
-    Raises
-    ------
-    ConfigError
-        There is no open building where it drives.
-    """
+    """Way of a session: points ``(k, 3)`` that it drives over, and the blocks whose buildings it goes through."""
     rows = len(campus.ys) - 1
     if config.far:
         mine = range(rows - FAR_ROWS, rows)

@@ -41,7 +41,6 @@ def campus(config: CampusConfig, *, seed: int = 0) -> World:
 
     Parameters
     ----------
-    config : CampusConfig
     seed : int
         Of the place; sessions of one seed share it.
 

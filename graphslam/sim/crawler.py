@@ -47,10 +47,8 @@ def simulate_crawler(world: World, seed: int, config: CrawlerConfig = DEFAULTS, 
 
     Parameters
     ----------
-    world : World
     seed : int
         Of every error drawn.
-    config : CrawlerConfig
     progress : bool
         Show a progress bar on stderr.
 

@@ -152,12 +152,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def crawler_preset(name: str = "light", **changes: Any) -> CrawlerConfig:
-    """A preset with figures changed.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-    """
+    """A preset with figures changed."""
     if name not in PRESETS:
         raise UnknownNameError("preset of the crawler", name, PRESETS)
     known = {f.name for f in dataclasses.fields(CrawlerConfig)}

@@ -40,12 +40,8 @@ def scan_world(
 
     Parameters
     ----------
-    motion : Motion
-    caster : RayCaster
-    config : CrawlerConfig
     mount : (7,)
         T_base_mount.
-    seeds : SeedTree
     progress : bool
         Show a progress bar on stderr.
     """
@@ -84,10 +80,6 @@ def cast_scans(
     ----------
     scans : RangeScans
         Stamps, directions and angles of the head; its ranges are not read.
-    motion : Posed
-    caster : RayCaster
-    config : CrawlerConfig
-    seeds : SeedTree
     nearer : callable, optional
         Given the first scan of a part, its rays ``(k · m, 6)``, their times and their exact ranges, both ``(k · m,)``
         (NaN: nothing met), returns the ranges where something that moves is in front.
@@ -134,17 +126,13 @@ def measure_imu(
 
     Parameters
     ----------
-    motion : Motion
-    config : CrawlerConfig
     yaw_bias : float
         Constant bias of the rate about the unit's z axis [rad/s].
     nominal_bias : float
         What the unit's data sheet says of it, a σ [rad/s].
-    seeds : SeedTree
 
     Returns
     -------
-    Imu
     dict
         The constants that were drawn.
     """
@@ -193,7 +181,6 @@ def true_inertia(motion: Motion, times: Array, mount: ArrayLike) -> tuple[Array,
 
     Parameters
     ----------
-    motion : Motion
     times : (n,)
     mount : (7,)
         T_base_imu.
@@ -267,7 +254,6 @@ def end_error(motion: Motion, yaw_bias: ArrayLike, *, step: float = 0.2) -> Arra
 
     Parameters
     ----------
-    motion : Motion
     yaw_bias : array_like
         [rad/s]
     step : float

@@ -123,12 +123,6 @@ class Motion:
         Smooth (:func:`smooth_way`).
     speed : float
         Cruise [m/s].
-    config : DriveConfig
-
-    Raises
-    ------
-    DataError
-        An impossible speed.
     """
 
     def __init__(self, way: Way, speed: float, config: DriveConfig) -> None:
@@ -275,8 +269,6 @@ def drive(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster |
 
     Parameters
     ----------
-    world : World
-    config : DriveConfig
     caster : RayCaster, optional
         Of the world's mesh.
 
@@ -284,10 +276,5 @@ def drive(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster |
     -------
     Trajectory
         In the frame of the world, ``config.rate`` poses a second.
-
-    Raises
-    ------
-    GeometryError, DataError
-        A way or a speed that cannot be driven.
     """
     return drive_motion(world, config, caster).trajectory()

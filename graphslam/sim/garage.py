@@ -34,11 +34,6 @@ def garage(layout: str = "A", *, seed: int = 0) -> World:
         "A", "B" or "C"; "D" is kept for tests that nothing was tuned on; "drawn-17" is drawn by that number.
     seed : int
         Moves parked cars and clutter; building and way stay.
-
-    Raises
-    ------
-    UnknownNameError
-        For another layout.
     """
     g = garage_layout(layout)
     mesh = MeshBuilder()

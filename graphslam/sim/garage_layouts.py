@@ -45,7 +45,6 @@ class GarageLayout:
         y of the aisle driven on the lower level.
     ramp : (foot, top, y)
         x of its foot and top, y of its middle line; the foot is the eastern end.
-    ramp_width : float
     first_aisle, turn, last_aisle : float
         Upper level: y of the first aisle, x where the way turns, y of the last aisle, which leads out to the west.
     road : float

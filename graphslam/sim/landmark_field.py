@@ -134,7 +134,6 @@ def simulate_landmark_field(config: LandmarkFieldConfig, seed: int) -> SensorLog
 
     Parameters
     ----------
-    config : LandmarkFieldConfig
     seed : int
         Same seed, same bytes. Layout and each stream's noise hang from branches of their own, so switching GPS or
         clutter on does not change the rest, and ``config.layout_seed`` holds the features over runs.

@@ -70,15 +70,7 @@ PRESETS: Mapping[str, LandmarkFieldConfig] = {
 
 
 def landmark_field_preset(name: str, **changes: Any) -> LandmarkFieldConfig:
-    """The preset of that name with some fields changed.
-
-    Raises
-    ------
-    UnknownNameError
-        Unknown preset.
-    ConfigError
-        Unknown field or impossible value.
-    """
+    """The preset of that name with some fields changed."""
     if name not in PRESETS:
         raise UnknownNameError("landmark-field preset", name, PRESETS)
     known = {f.name for f in dataclasses.fields(LandmarkFieldConfig)}

@@ -33,8 +33,6 @@ class LapsConfig:
 
     Parameters
     ----------
-    poses : int
-    laps : int
     spacing : float
         Way between poses [m].
     begin, reach : int
@@ -82,8 +80,6 @@ class Laps:
 
     Parameters
     ----------
-    config : LapsConfig
-    truth : Poses
     first : (N + 1,)
     shared : (S, begin) bool
     met : (laps + 1, S) uint64
@@ -197,13 +193,7 @@ class Laps:
 
 
 def draw_laps(config: LapsConfig | None = None, seed: int = 0) -> Laps:
-    """Draw route, landmarks and which of them are recognised when.
-
-    Parameters
-    ----------
-    config : LapsConfig, optional
-    seed : int
-    """
+    """Draw route, landmarks and which of them are recognised when."""
     c = config or LapsConfig()
     rng = SeedTree(seed).child("laps", "world").generator()
     S = -(-c.poses // c.laps)

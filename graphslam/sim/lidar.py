@@ -124,10 +124,8 @@ def simulate_lidar(world: World, seed: int, config: LidarConfig = LidarConfig(),
 
     Parameters
     ----------
-    world : World
     seed : int
         Of every error drawn.
-    config : LidarConfig
     most : float
         Stop after so much time [s].
 

@@ -30,11 +30,6 @@ from graphslam.sim.vehicle import follow_route
 def local_map_world(count: int, *, scans: int = 59, preset: str = "A") -> LandmarkFieldConfig:
     """A landmark field in which ``count`` submaps of ``scans`` scans make two laps, as dense with features as the
     preset.
-
-    Raises
-    ------
-    ConfigError
-        Fewer than two submaps, or no scan in a submap.
     """
     if count < 2 or scans < 1:
         raise ConfigError(f"{count} local maps of {scans} scans; wanted at least 2 of at least 1")
@@ -66,11 +61,6 @@ def simulate_local_maps(
         Keys from 0, landmarks with their true ids in the order of ids, intervals [s].
     truth : MapTruth
         In the frame of the first base.
-
-    Raises
-    ------
-    ConfigError
-        If the vehicle of ``config`` does not drive far enough.
     """
     c = config or local_map_world(count, scans=scans)
     steps = count * scans * c.scan_stride

@@ -86,7 +86,6 @@ class MeshBuilder:
             Of its middle line in the plan [m].
         low, high : float
             Heights of its foot and of its top [m].
-        thickness : float
         openings : iterable of (from, to, bottom, top)
             Distances along the wall and heights [m]: doors and windows.
         """

@@ -120,7 +120,6 @@ def draw_movers(
         Half of them cars, where there are lines for them.
     times, positions : (n,), (n, 3)
         Of the robot: all of it, and close together.
-    rng : Generator
     distance : float
         None comes nearer to the robot's middle than this [m].
     """
@@ -165,7 +164,6 @@ class Passers:
 
     Parameters
     ----------
-    movers : sequence of Mover
     shape : (int, int)
         Scans and beams.
     reach : float

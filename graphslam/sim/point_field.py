@@ -68,12 +68,7 @@ PRESETS: Mapping[str, PointFieldConfig] = {
 
 
 def point_field_preset(name: str, **changes: Any) -> PointFieldConfig:
-    """A preset with some figures changed.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-    """
+    """A preset with some figures changed."""
     if name not in PRESETS:
         raise UnknownNameError("point-field preset", name, PRESETS)
     known = {f.name for f in dataclasses.fields(PointFieldConfig)}
@@ -85,11 +80,6 @@ def point_field_preset(name: str, **changes: Any) -> PointFieldConfig:
 
 def simulate_point_field(config: PointFieldConfig, seed: int) -> SensorLog:
     """A log with its truth; route, points and noise are drawn.
-
-    Parameters
-    ----------
-    config : PointFieldConfig
-    seed : int
 
     Returns
     -------

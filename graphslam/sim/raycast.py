@@ -28,11 +28,6 @@ class RayCaster:
     triangles : (t, 3)
         Rows of ``vertices``; either side of a triangle stops a ray.
 
-    Raises
-    ------
-    DataError, GeometryError
-        No triangle, a vertex that is not finite, or a triangle that names none.
-
     Examples
     --------
     >>> wall = RayCaster([[2, -1, -1], [2, 1, -1], [2, 0, 2]], [[0, 1, 2]])
@@ -67,11 +62,6 @@ class RayCaster:
         ----------
         rays : (n, 6)
             Origin [m] and unit direction.
-
-        Raises
-        ------
-        DataError
-            A ray that is not finite.
         """
         r = np.asarray(rays, dtype=np.float64)
         if r.ndim != 2 or r.shape[1] != 6:

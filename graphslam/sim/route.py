@@ -89,11 +89,6 @@ def plan_route(waypoints: ArrayLike, corner_radius: float, *, where: str = "way"
         In the plan [m].
     where : str
         For error messages.
-
-    Raises
-    ------
-    GeometryError
-        If two waypoints coincide in the plan, the way turns back on itself, or a corner does not fit its legs.
     """
     p = np.asarray(waypoints, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 3 or len(p) < 2 or not np.all(np.isfinite(p)):

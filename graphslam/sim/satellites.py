@@ -53,11 +53,6 @@ class SatelliteConfig:
 def simulate_satellites(seed: int, config: SatelliteConfig | None = None) -> SensorLog:
     """A log with the streams of smartLoc: ``pseudoranges``, ``odometry``, ``reference``.
 
-    Parameters
-    ----------
-    seed : int
-    config : SatelliteConfig, optional
-
     Returns
     -------
     SensorLog

@@ -84,13 +84,10 @@ def measure_gps(
 
     Parameters
     ----------
-    motion : Motion
     caster : RayCaster
         Of what stands still.
-    config : CampusConfig
     drawn : dict of str to float
         Figures of the noise, see :meth:`CampusConfig.draw`.
-    tree : SeedTree
     """
     c, scale = config, config.noise_scale
     times = np.arange(0.0, motion.duration, 1.0 / c.gps_rate)

@@ -255,8 +255,6 @@ def draw_street(target: str, seed: int, *, teaching: bool = False) -> Street:
 
     Parameters
     ----------
-    target : str
-    seed : int
     teaching : bool
         Another street, to learn tables on: all sizes of the target, the place of the curb and the car, and the waves
         of the ground are drawn from other and wider ranges.
@@ -396,10 +394,8 @@ def drive_street(
 
     Parameters
     ----------
-    street : Street
     seed : int
         Of every error.
-    robot : StreetRobot
     aside : float, optional
         The laser does not pan but looks to the left, and the robot drives across the street at this distance before
         the target [m], its left towards it.
@@ -467,8 +463,6 @@ def simulate_street(target: str, seed: int, robot: StreetRobot = StreetRobot()) 
     ----------
     target : str
         Of :data:`TARGETS`.
-    seed : int
-    robot : StreetRobot
 
     Returns
     -------

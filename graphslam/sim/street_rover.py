@@ -51,10 +51,8 @@ class StreetRover:
 
     Parameters
     ----------
-    street : Street
     seed : int
         Of every error.
-    robot : StreetRobot, optional
     acceleration : float
         Of speeding up and of braking [m/s²].
     longest : float
@@ -97,10 +95,8 @@ class StreetRover:
 
         Returns
         -------
-        state : RoverState
         scans : RangeScans
             What it measured on the way.
-        believed : Trajectory
         true_places : (n, 2)
             Where it was [m], every 0.01 s.
         """

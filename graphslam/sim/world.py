@@ -35,7 +35,6 @@ class World:
 
     Parameters
     ----------
-    name : str
     vertices : (v, 3)
     triangles : (t, 3) int32
         Rows of ``vertices``. Not watertight and without a meaning of their winding, but without slits between
@@ -51,11 +50,6 @@ class World:
         lengths at the same place; ``revisits``, the stretches they stand for (see :func:`find_revisits`);
         ``parallel``, pairs of stretches ``[[s1a, s1b], [s2a, s2b]]`` that are different places and must never be
         taken for one; and what else describes the world.
-
-    Raises
-    ------
-    GeometryError
-        If anything is not finite, a triangle names no vertex, or the way cannot be driven with that radius.
     """
 
     name: str
@@ -99,7 +93,6 @@ def find_revisits(
 
     Parameters
     ----------
-    route : Route
     radius : float
         Two points nearer than this are the same place [m], in three dimensions.
     gap : float

@@ -196,14 +196,12 @@ class RelaxedChain:
 
     Parameters
     ----------
-    poses : Poses
     objective : float
         Σ rᵀ Ω r; residuals are the rotation vector and the way in the frame of the first pose of each link.
     history : list of float
         The objective before the first step and after each.
     predicted, largest_move : float
         What the last step was predicted to gain, and how far it moved a pose [m].
-    converged : bool
     """
 
     poses: Poses
@@ -226,21 +224,12 @@ def relax_chain(
 
     Parameters
     ----------
-    graph : ChainGraph
     poses : Poses, optional
         Default: dead reckoning.
-    iterations : int
     gain : float
         It ends when a step is predicted to gain less than this share of the objective (and 1e-9 at least).
     progress : callable, optional
         Called with the objective after every step.
-
-    Raises
-    ------
-    IndeterminateError
-        Nothing holds a pose.
-    SolverError
-        The objective is not finite.
     """
     network = KeptNetwork(graph)
     K = len(network.kept)

@@ -73,11 +73,6 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
         Made if it is not there. Files that it holds already are kept.
     pieces : iterable of ChainPiece
         One tile each.
-
-    Raises
-    ------
-    DataError
-        A loop ends beyond the piece it stands in, or what :class:`~graphslam.skeleton.chain_graph.ChainGraph` refuses.
     """
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
@@ -135,13 +130,8 @@ class RelaxedTiles:
 
     Parameters
     ----------
-    folder : path
     names : list of str
         Files of the poses, tile by tile.
-    objective : float
-    history : list of float
-    predicted, largest_move : float
-    converged : bool
     separator : int
         Poses of the separator.
     tasks : list of float
@@ -188,13 +178,6 @@ def relax_tiles(
     task_seconds : float
         A task takes as many tiles, one after the other, as make so much CPU time [s]: a shorter one is not worth being
         handed out. Nothing else depends on it.
-
-    Raises
-    ------
-    FormatError
-        A file is missing or was changed.
-    SolverError
-        The objective is not finite.
     """
     where = Path(folder).resolve()
     index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
@@ -280,7 +263,6 @@ def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
     ----------
     seconds : sequence of float
         Of each tile.
-    least : float
     """
     out, begin, taken = [], 0, 0.0
     for k, s in enumerate(seconds):

@@ -38,7 +38,6 @@ def relative_links(problem: SkeletonProblem, *, shared: int = 4, gap: int = 20) 
 
     Parameters
     ----------
-    problem : SkeletonProblem
     shared : int
         Fewest landmarks of a link.
     gap : int

@@ -71,7 +71,6 @@ class KeyframeNetwork:
 
     Parameters
     ----------
-    network : Network
     k : int
         Poses from keyframe to keyframe.
     pattern : KeyframePattern, optional
@@ -153,8 +152,6 @@ class Preconditioner:
 
     Parameters
     ----------
-    network : Network
-    levels : Levels
     pattern : KeyframePattern, optional
         Of an earlier one.
     """

@@ -126,8 +126,6 @@ class Relaxed:
 
     Parameters
     ----------
-    method : str
-    poses : Poses
     landmarks : (L, 3)
     landmark : (M,) int32
         Landmark of each measurement: other than the problem's where unions were split.
@@ -136,7 +134,6 @@ class Relaxed:
     gradient : float
         Length of half the gradient.
     converged : {"poses", "objective", ""}
-    history : list of Iteration
     soft : list of SoftMode
         Approximate.
     split, refused : int
@@ -470,7 +467,6 @@ def conjugate_gradients(
     x : (N, 6)
     predicted : float
         ``xᵀ b``: by how much the objective falls if it is as the linear model has it.
-    products : int
     """
     x = np.zeros_like(b)
     r = b.copy()

@@ -222,13 +222,7 @@ def moved(poses: Poses, step: Array, scale: float = 1.0) -> Poses:
 
 
 def inverse_of(blocks: Array, over: Callable[..., list[Any]], what: str) -> Array:
-    """Replace blocks ``(n, 6, 6)`` by their inverses; ``over(work)`` calls ``work(begin, end)`` for ranges of them.
-
-    Raises
-    ------
-    IndeterminateError
-        One is not positive definite.
-    """
+    """Replace blocks ``(n, 6, 6)`` by their inverses; ``over(work)`` calls ``work(begin, end)`` for ranges of them."""
     bad = [k for k in over(lambda a, b: chains.invert_blocks(blocks, a, b)) if k >= 0]
     if bad:
         raise IndeterminateError(f"{what} {min(bad)} of the skeleton network is not constrained", (f"x{min(bad)}",))

@@ -37,8 +37,6 @@ def softest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork |
 
     Parameters
     ----------
-    network : Network
-    count : int
     keyframes : KeyframeNetwork, optional
         Default: one of the size of the preconditioner's is made.
     """

@@ -61,7 +61,6 @@ class Walk:
 
     Parameters
     ----------
-    poses : Poses
     tied : int
         Poses that were tied to landmarks of an earlier pass.
     refused : int
@@ -91,9 +90,6 @@ def forward_pass(
 
     Parameters
     ----------
-    problem : SkeletonProblem
-    chain : Poses
-    ago : int
     turn_sigma, way_sigma : float
         How far a pose may move from its prediction [rad, m].
     gate : float

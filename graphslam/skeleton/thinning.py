@@ -36,14 +36,8 @@ class ThinnedNetwork:
 
     Parameters
     ----------
-    network : Network
     limit : float
         Memory that the blocks may take [bytes].
-
-    Raises
-    ------
-    SolverError
-        They would take more; says how much.
     """
 
     def __init__(self, network: Network, limit: float) -> None:

@@ -43,7 +43,6 @@ class Tiles:
 
     Parameters
     ----------
-    folder : path
     verify : bool
         Read every tile once and compare its digest with its name.
 
@@ -53,13 +52,6 @@ class Tiles:
         Where the measurements of each pose begin.
     landmarks, measurements, size : int
         How many landmarks and measurements there are, and poses of the largest tile.
-
-    Raises
-    ------
-    MissingDataError
-        There is no index.
-    FormatError
-        The folder is of another format, or a tile is missing, truncated or (``verify``) changed.
     """
 
     def __init__(self, folder: str | Path, verify: bool = False) -> None:
@@ -153,11 +145,6 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
         Made if it is not there. Tiles that it holds already are kept.
     blocks : iterable of (counts (n,), points (m, 3), landmarks (m,))
         Measurements of each pose, in pose order; landmarks numbered by first sighting over all blocks.
-
-    Raises
-    ------
-    DataError
-        A block contradicts itself, is not finite, or its landmarks are not numbered by first sighting.
     """
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
@@ -199,13 +186,7 @@ def put_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
 
 
 def take_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of such a file.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        There is none, or its digest is not its name.
-    """
+    """The arrays of such a file."""
     path = folder / name
     if path.name != name or path.suffix != ".arrays":
         raise FormatError("name of a file of arrays", where=str(folder), got=name, wanted="<digest>.arrays")

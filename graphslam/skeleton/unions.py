@@ -44,7 +44,6 @@ def split_wrong_unions(network: Network, false_alarm: float = 1e-10, gap: int = 
 
     Parameters
     ----------
-    network : Network
     false_alarm : float
         Chance for a right landmark to be taken for a wrong one.
     gap : int

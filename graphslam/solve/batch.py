@@ -41,7 +41,6 @@ class BatchSolver:
     ----------
     graph : PoseGraph
         Read at every call; its values are written back.
-    config : LevenbergConfig, optional
     """
 
     name = "batch"
@@ -143,15 +142,7 @@ class PcgSolver(BatchSolver):
 
 
 def optimise(problem: SparseProblem, values: Values, config: LevenbergConfig | None = None) -> Optimum:
-    """Minimise a problem from ``values``: Gauss–Newton steps while they help, damped ones when they do not.
-
-    Raises
-    ------
-    IndeterminateError
-        It does not determine its variables (:meth:`PoseGraph.diagnose` names them).
-    SolverError
-        The objective is not finite at the start.
-    """
+    """Minimise a problem from ``values``: Gauss–Newton steps while they help, damped ones when they do not."""
     cfg = config or LevenbergConfig()
     initial = problem.objective(values)
     if not np.isfinite(initial):
@@ -174,11 +165,6 @@ def optimise_graph(
     ----------
     problem : SparseProblem, optional
         How its steps are made; by direct solves if not given.
-
-    Raises
-    ------
-    IndeterminateError
-        Names the unconstrained variables and what would fix them.
     """
     try:
         return optimise(problem or SparseProblem(graph.flat()), graph.values, config)

@@ -44,7 +44,6 @@ class GncConfig:
         A right measurement stays within its limit with this probability.
     growth : float
         By how much the surrogate is made less convex from round to round.
-    max_rounds : int
     """
 
     confidence: float = 0.999
@@ -62,12 +61,6 @@ class GncSolver(BatchSolver):
     :meth:`update` solves by least squares. :meth:`solve_to_optimum` runs graduated non-convexity from there, takes
     the outliers out of the graph (events ``outlier``: factor, class, χ² and its limit), and ends at the optimum of what
     is left.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-    config : LevenbergConfig, optional
-    gnc : GncConfig, optional
     """
 
     name = "gnc"

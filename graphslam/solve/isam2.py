@@ -43,13 +43,7 @@ _FAILURES = (RuntimeError, IndexError, ValueError, SolverError)
 
 
 class FactorRejectedError(SolverError):
-    """A factor broke an update and was taken out of the graph; everything else stands as before.
-
-    Parameters
-    ----------
-    message : str
-    factor_id : int
-    """
+    """A factor broke an update and was taken out of the graph; everything else stands as before."""
 
     def __init__(self, message: str, factor_id: int) -> None:
         super().__init__(message)
@@ -106,17 +100,7 @@ class Isam2Solver:
     # ---------------------------------------------------------------- verbs
 
     def update(self) -> None:
-        """Feed what changed in the graph since the last update, and write the new estimate back.
-
-        Raises
-        ------
-        IndeterminateError
-            The graph does not determine some variables: names them and what would fix them. Nothing is changed; the
-            next update tries again.
-        FactorRejectedError
-            One factor could not be solved with. It is removed from the graph; the solver is as it was before the
-            update, and the other new factors enter at the next one.
-        """
+        """Feed what changed in the graph since the last update, and write the new estimate back."""
         t0 = time.perf_counter()
         try:
             self._update()

@@ -49,12 +49,7 @@ SOLVERS: dict[str, type] = {
 
 
 def make_solver(name: str, graph: PoseGraph, **options: Any) -> Solver:
-    """A registered solver over ``graph``.
-
-    Raises
-    ------
-    UnknownNameError
-    """
+    """A registered solver over ``graph``."""
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
     solver: Solver = SOLVERS[name](graph, **options)

@@ -37,8 +37,6 @@ class Solution:
 
     Parameters
     ----------
-    solver : str
-    values : Values
     score : Score
         χ² and dof per class of factor.
     iterations : int
@@ -156,11 +154,6 @@ class Solution:
         ----------
         name : str or int
             Such as ``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``; a number k is the pose ``"xk"``.
-
-        Raises
-        ------
-        SolverError
-            There is no such variable.
         """
         return self.covariance.marginal(name if isinstance(name, str) else f"x{operator.index(name)}")
 
@@ -177,13 +170,7 @@ class Solution:
         return self.covariance.landmarks()
 
     def joint_covariance(self) -> Array:
-        """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base.
-
-        Raises
-        ------
-        GeometryError
-            In space, where poses are no vectors; ask :meth:`joint_marginal` for tangents.
-        """
+        """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base."""
         lay = self._flat.layout
         if lay.dim != 2:
             raise GeometryError("poses in space have no covariance as vectors", wanted="joint_marginal")
@@ -217,14 +204,8 @@ class Solution:
 
         Parameters
         ----------
-        covariances : bool
         keys : collection of int, optional
             Only of these submaps: those of one robot, where several share the graph.
-
-        Raises
-        ------
-        MissingDataError
-            No submap has a trajectory.
         """
         P_nodes = self.node_covariances() if covariances else None
         P_lasting = self._lasting_covariances() if covariances else {}

@@ -37,13 +37,7 @@ SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
 def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
-    """Sparse symmetric factorisation; ``ordered``: rows and columns are in a good order of elimination already.
-
-    Raises
-    ------
-    RuntimeError
-        Singular.
-    """
+    """Sparse symmetric factorisation; ``ordered``: rows and columns are in a good order of elimination already."""
     return spla.splu(
         sp.csc_matrix(H),
         permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
@@ -88,13 +82,7 @@ class BlockElimination:
         return B.indptr.astype(np.int64), B.indices.astype(np.int64), B.data.ravel()
 
     def factor(self, H: sp.csc_matrix) -> BlockFactor:
-        """Factorisation of a matrix of the pattern.
-
-        Raises
-        ------
-        RuntimeError
-            Not positive definite.
-        """
+        """Factorisation of a matrix of the pattern."""
         _, nodes, data = self._parts(H)
         try:
             return self._symbolic.factor(np.arange(len(nodes)) * self.width**2, data)
@@ -107,7 +95,6 @@ class SparseProblem:
 
     Parameters
     ----------
-    flat : FlatGraph
     weights : (f,), optional
         Factor on the information of every factor.
     """
@@ -143,13 +130,7 @@ class SparseProblem:
         return system.A, -system.g
 
     def solve_linear(self, values: Values, H: sp.csc_matrix, b: Array) -> Array:
-        """``H⁻¹ b`` at ``values``, with one step of iterative refinement.
-
-        Raises
-        ------
-        IndeterminateError
-            Singular, or refinement corrects more than a hundredth of the energy: too few digits are left.
-        """
+        """``H⁻¹ b`` at ``values``, with one step of iterative refinement."""
         if self._dense:
             return _dense_solve(H, b)
         try:
@@ -169,13 +150,7 @@ class SparseProblem:
         return self._elimination.factor(H)
 
     def newton_step(self, values: Values) -> tuple[Values, float, float]:
-        """One Gauss-Newton step, the fall of the objective that it predicts, and the objective after it.
-
-        Raises
-        ------
-        IndeterminateError
-            Singular linear system.
-        """
+        """One Gauss-Newton step, the fall of the objective that it predicts, and the objective after it."""
         H, b = self._system(values)
         step = self.solve_linear(values, H, b)
         moved = self.flat.layout.retract(values, step)
@@ -253,7 +228,6 @@ class PcgProblem(SparseProblem):
 
     Parameters
     ----------
-    flat : FlatGraph
     tolerance : float
         Relative error of a linear solution in the energy norm. Its square is the share of the fall of the objective
         that a step misses.
@@ -357,8 +331,6 @@ def pcg(
     Returns
     -------
     x : (n,)
-    iterations : int
-    converged : bool
     """
     x = np.zeros_like(b)
     r = b.copy()

@@ -158,11 +158,6 @@ def find_trunks(scans: LaserScans, config: TreeDetectorConfig | None = None) -> 
     """Trunks in all scans, in one kernel call.
 
     NaN ranges count as no return.
-
-    Raises
-    ------
-    DataError
-        If the beams are not evenly spaced.
     """
     c = config or TreeDetectorConfig()
     m = len(scans.bearings)

@@ -113,7 +113,6 @@ class Tally:
     ----------
     seconds : mapping of part to float
         Wall time.
-    resamplings : int
     without_beams, without_returns : int
         Steps updated without a beam, and with beams none of which met anything.
     rays, dropped_rays : int
@@ -133,8 +132,6 @@ class GridFilter:
 
     Parameters
     ----------
-    steps : Steps
-    config : GridFilterConfig
     seed : SeedTree
         Of this filter alone.
     first : int

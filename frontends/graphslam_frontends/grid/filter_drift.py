@@ -141,7 +141,6 @@ class FilterDrift:
         ----------
         path : (n, 7) or (n, 3)
             Poses from the start to the end, in any frame whose z axis is up.
-        particles : int
         gravity : bool
             The frame at the end stands level, as that of a submap does.
         reckoned : (d, d), optional
@@ -149,11 +148,6 @@ class FilterDrift:
             heading walks by ``alone_walk``, and nothing comes on top of what the filter itself leaves.
         told_tilt : float, optional
             σ of roll and pitch where gravity tells them [rad].
-
-        Raises
-        ------
-        DataError
-            No pose, or no particle.
         """
         poses = np.asarray(path, dtype=np.float64)
         if poses.ndim != 2 or len(poses) == 0 or particles < 1:

@@ -22,7 +22,6 @@ def motion_covariance(increment: Array, covariance: Array, config: GridFilterCon
         ``T_before_after``.
     covariance : (d, d)
         Of the odometry, right tangent.
-    config : GridFilterConfig
 
     Returns
     -------
@@ -83,7 +82,6 @@ def walk_tilt_errors(errors: Array, seconds: float, sigma: float, time: float, n
     Parameters
     ----------
     errors : (n, 2)
-    seconds : float
     sigma : float
         σ in the long run [rad].
     time : float

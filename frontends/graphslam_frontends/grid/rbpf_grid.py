@@ -50,7 +50,6 @@ class RbpfResult:
 
     Parameters
     ----------
-    name : str
     times : (n,)
         Of the steps [s].
     path_length : (n,)
@@ -58,7 +57,6 @@ class RbpfResult:
     effective : (n,)
         N_eff after each step's scan, before resampling.
     resampled : (n,) bool
-    ancestry : Ancestry
     particles : GridParticles
         At the end, with the grids of the survivors.
     best : int
@@ -151,8 +149,6 @@ def run_rbpf(
 
     Parameters
     ----------
-    steps : Steps
-    config : GridFilterConfig
     seed : SeedTree
         The same seed gives the same bytes, with any number of threads.
     prune_every : int
@@ -203,10 +199,8 @@ def rbpf_submap(
 
     Parameters
     ----------
-    result : RbpfResult
     drift : callable
         Path length [m] → covariance ``(d, d)`` of dead reckoning, right tangent.
-    key : int
     drift_scale : float
         Factor on the drift model's covariance.
     steps : Steps, optional
@@ -214,13 +208,6 @@ def rbpf_submap(
         (:mod:`graphslam_frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
     passed : Passed, optional
         That share; default none.
-
-    Raises
-    ------
-    DataError
-        A single step: there is no interval.
-    CovarianceError
-        The drift model gives none.
     """
     times = result.times
     if len(times) < 2:

@@ -44,7 +44,6 @@ class EkfMap:
 
     Parameters
     ----------
-    config : EkfFilterConfig
     sensor : (3,)
         ``T_base_sensor``.
     field_of_view : (2,)
@@ -110,11 +109,6 @@ class EkfMap:
             Range, bearing and their variances; an infinite bearing variance = range only.
         known : (q,)
             A number ≥ 0 of each observation's landmark in known-association mode, else -1.
-
-        Raises
-        ------
-        CovarianceError
-            If the innovation covariance is not positive definite (a non-finite increment or covariance).
         """
         q = len(observations)
         by_identity = self.config.association == "known"

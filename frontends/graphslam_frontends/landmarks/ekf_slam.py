@@ -236,10 +236,6 @@ class Ekf(FrontEnd):
 
     Needs a stream of motion and one of landmark observations or, with the tree detector, of laser scans. Draws no
     random numbers.
-
-    Parameters
-    ----------
-    config : EkfConfig
     """
 
     config: EkfConfig = field(default_factory=EkfConfig)
@@ -301,7 +297,6 @@ class EkfSlam(FrontEnd):
 
     Parameters
     ----------
-    config : EkfSlamConfig
     on_scan : callable, optional
         Called with the number of scans taken in, after each: to watch progress or to take the time. It has no part in
         the result.
@@ -346,7 +341,6 @@ def ekf_snapshots(
 
     Parameters
     ----------
-    log : SensorLog
     config : EkfSlamConfig or EkfConfig
         Of the latter, what concerns local maps alone is not read.
     seed : SeedTree, optional
@@ -360,13 +354,6 @@ def ekf_snapshots(
         Where records that are not used are counted.
     on_scan : callable, optional
         As in :class:`EkfSlam`.
-
-    Raises
-    ------
-    ConfigError
-        If ``cuts`` are not as above, or ``joint`` is another word.
-    MissingDataError
-        If a stream is missing, or no observation has a bearing.
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")

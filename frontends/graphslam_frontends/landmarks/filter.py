@@ -27,7 +27,6 @@ class ParticleSet:
 
     Parameters
     ----------
-    config : FilterConfig
     sensor : (3,)
         ``T_base_sensor``.
     field_of_view : (2,)

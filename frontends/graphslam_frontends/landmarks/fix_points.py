@@ -97,8 +97,6 @@ def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -
 
     Parameters
     ----------
-    feed : Feed
-    smoothed : Smoothed
     t_start : float
         Of the submap [s].
     times : (T,)

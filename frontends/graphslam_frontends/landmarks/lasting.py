@@ -28,8 +28,6 @@ def lasting_errors(
 
     Parameters
     ----------
-    config : LastingConfig
-    smoothed : Smoothed
     seconds : (T,)
         Of each increment of the odometry.
     way : Way or None

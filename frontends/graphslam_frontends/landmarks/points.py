@@ -60,12 +60,7 @@ class PointsConfig:
 
 
 class Points(FrontEnd):
-    """Submaps of identified points in space.
-
-    Parameters
-    ----------
-    config : PointsConfig
-    """
+    """Submaps of identified points in space."""
 
     name: ClassVar[str] = "points"
     config: PointsConfig
@@ -82,13 +77,7 @@ class Points(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :meth:`FrontEnd.submaps`; nothing is drawn.
-
-        Raises
-        ------
-        MissingDataError
-            The log has no odometry in space, or no points.
-        """
+        """See :meth:`FrontEnd.submaps`; nothing is drawn."""
         motion, seen = log.of_type(Odometry), log.of_type(PointObservations)
         if motion is None or log[motion].increments.shape[1] != 7:
             raise MissingDataError("no odometry in space", where=log.name, wanted="Odometry with increments (n, 7)")

@@ -139,13 +139,7 @@ class Prepared:
 
 
 def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, LandmarkObservations]:
-    """Name of the stream to work on, and the landmark observations in it (detected, where it holds raw scans).
-
-    Raises
-    ------
-    MissingDataError
-        If the log has neither landmark observations nor laser scans.
-    """
+    """Name of the stream to work on, and the landmark observations in it (detected, where it holds raw scans)."""
     stream = log.of_type(LandmarkObservations)
     if stream is not None:
         return stream, log[stream]
@@ -162,15 +156,8 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     ----------
     log : SensorLog
         With a stream of controls or odometry, and one of landmark observations or laser scans.
-    config : PrepareConfig
     drops : DropCounter
         Where scans and observations that are not used are counted.
-
-    Raises
-    ------
-    MissingDataError
-        If a stream is missing, identities are asked for and not there, or no scan is left; also where ranges without
-        bearings are to be associated by likelihood alone, since a range cannot found a landmark without an identity.
     """
     made = Preparing(Feed(log), config, drops)
     made.advance()
@@ -184,7 +171,6 @@ class Preparing:
 
     Parameters
     ----------
-    feed : Feed
     config, drops
         As in :func:`prepare`.
     """
@@ -211,13 +197,7 @@ class Preparing:
         return scan < len(self.prepared)
 
     def advance(self) -> bool:
-        """Make ready what has come; False: that was nothing.
-
-        Raises
-        ------
-        MissingDataError
-            See :func:`prepare`.
-        """
+        """Make ready what has come; False: that was nothing."""
         if self.done or not (self._named() or self.feed.ended):
             return False
         ended = self.feed.ended

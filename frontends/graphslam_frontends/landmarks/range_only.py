@@ -45,7 +45,6 @@ class Start:
 
     Parameters
     ----------
-    slot : int
     observations : (k,) int64
         The ranges spent on it, as they were numbered when they came.
     used : (n, k) bool
@@ -73,8 +72,6 @@ class WaitingRanges:
 
     Parameters
     ----------
-    particles : int
-    config : DelayedStart
     limit : float
         χ² gate (1 dof) beyond which a range is an outlier of the fit; inf = none is.
     """

@@ -77,12 +77,7 @@ class RbpfEkf(FrontEnd):
             key, t_start = key + 1, submap.interval[1]
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
-        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans).
-
-        Raises
-        ------
-        MissingDataError
-        """
+        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans)."""
         return landmark_stream(log, self.config.detector)
 
     def _build(

@@ -33,14 +33,7 @@ Joint = Literal["never", "last", "all"]
 
 
 class WholeMapFilter:
-    """The filter of one log, scan by scan.
-
-    Parameters
-    ----------
-    data : Prepared
-    config : RbpfSlamConfig
-    rng : numpy Generator
-    """
+    """The filter of one log, scan by scan."""
 
     def __init__(self, data: Prepared, config: RbpfSlamConfig, rng: np.random.Generator) -> None:
         obs = data.observations
@@ -98,26 +91,15 @@ def rbpf_snapshots(
 
     Parameters
     ----------
-    log : SensorLog
-    config : RbpfSlamConfig
-    seed : SeedTree
     cuts : sequence of int
         Numbers of scans after which a snapshot is taken, increasing; the filter stops at the last one.
     joint : {"last", "all", "never"}
         Which snapshots carry the joint Gaussian; the others hold the marginals of pose and landmarks.
-    drops : DropCounter, optional
 
     Yields
     ------
     Snapshot
         Moment-matched (B3) in the frame of the first base.
-
-    Raises
-    ------
-    ConfigError
-        If the cuts do not increase or lie outside the log.
-    MissingDataError
-        See :func:`graphslam_frontends.landmarks.prepare.prepare`.
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")
@@ -157,12 +139,7 @@ class RbpfSlam(FrontEnd):
             yield self._build(data, seed.child(0))
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
-        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans).
-
-        Raises
-        ------
-        MissingDataError
-        """
+        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans)."""
         return landmark_stream(log, self.config.detector)
 
     def _build(self, data: Prepared, seed: SeedTree) -> Submap:

@@ -36,8 +36,6 @@ class SubmapProblem:
     ob_pose, ob_landmark : (q,)
     observations : (q, 4)
     sensor : (3,)
-    trim : float
-    min_hits : int
     """
 
     increments: Array
@@ -105,7 +103,6 @@ def settle_rivals(problem: SubmapProblem, first: Smoothed, config: DelayedStart)
 
     Parameters
     ----------
-    problem : SubmapProblem
     first : Smoothed
         Its smoothing from the filter's start.
     config : DelayedStart

@@ -34,13 +34,6 @@ class Snapshot:
         Marginal of each landmark [m²].
     gaussian : Gaussian or None
         The joint over ``[pose, landmark_1, …]`` in the order above, where it was asked for.
-
-    Raises
-    ------
-    GeometryError
-        If shapes do not fit or a number is not finite.
-    CovarianceError
-        If the covariance of the pose is not symmetric positive definite, or one of a landmark is not positive definite.
     """
 
     scan: int

@@ -34,12 +34,7 @@ class GrowingMap(Protocol):
 
 
 class Stopping:
-    """Watches one submap grow.
-
-    Parameters
-    ----------
-    config : StoppingConfig
-    """
+    """Watches one submap grow."""
 
     def __init__(self, config: StoppingConfig) -> None:
         self.config = config

@@ -92,7 +92,6 @@ def majority_slots(table: Ints, landmark: Ints, count: int) -> tuple[Ints, Ints]
         Slot of each observation in each particle; negative where it has none.
     landmark : (q,)
         Common feature of each observation, 0 … count-1.
-    count : int
 
     Returns
     -------
@@ -136,13 +135,7 @@ class Moments:
 
     @classmethod
     def of(cls, particles: ParticleSet, kept: Ints, slots: Ints) -> Moments:
-        """Of the particles ``kept`` with the common features in ``slots`` ``(k, L)``.
-
-        Raises
-        ------
-        CovarianceError
-            If none of them has weight.
-        """
+        """Of the particles ``kept`` with the common features in ``slots`` ``(k, L)``."""
         w = particles.weights[kept]
         if not w.sum() > 0.0:
             raise CovarianceError("no particle holds the common features, nothing to moment-match")
@@ -209,7 +202,6 @@ class Smoothed:
         Objective at the optimum and its degrees of freedom.
     parts : (3,)
         Shares of the objective: odometry, range, bearing.
-    converged : bool
     landmarks : (L, 2)
         Those that were kept.
     evidence : Evidence
@@ -278,11 +270,6 @@ def smooth(
         channel) are dropped, then plain least squares.
     min_hits : int
         A landmark left with fewer observations after the trimming goes, with them.
-
-    Raises
-    ------
-    CovarianceError
-        If the smoothed system is singular.
     """
     p, l = poses.copy(), landmarks.copy()
     W = np.linalg.inv(covariances)

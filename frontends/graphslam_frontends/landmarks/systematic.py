@@ -61,7 +61,6 @@ def systematic(
 
     Parameters
     ----------
-    data : Prepared
     first, last : int
         Scans of the submap: ``first … last - 1``.
     rows, landmark : (q,)

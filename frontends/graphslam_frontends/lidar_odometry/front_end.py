@@ -118,7 +118,6 @@ class Follow:
 
     Parameters
     ----------
-    time : float
     pose : (7,)
         ``T_first_base``.
     joint : (12, 12)
@@ -127,7 +126,6 @@ class Follow:
         Covariance of what the motion from the last scan was expected to be, right tangent.
     points : (m, 3)
         In the base at ``time``.
-    seen : Seen
     """
 
     time: float
@@ -312,7 +310,6 @@ class _Heard(ABC):
 
     Parameters
     ----------
-    feed : Feed
     name : str or None
         None: there is none, and nothing is waited for.
     """
@@ -345,14 +342,7 @@ class _Heard(ABC):
 
 
 class _Unit(_Heard):
-    """The IMU of a feed, if there is one, and what of it is known.
-
-    Parameters
-    ----------
-    feed : Feed
-    name : str or None
-    config : LidarOdometryConfig
-    """
+    """The IMU of a feed, if there is one, and what of it is known."""
 
     def __init__(self, feed: Feed, name: str | None, config: LidarOdometryConfig) -> None:
         super().__init__(feed, name)
@@ -411,13 +401,7 @@ class _Unit(_Heard):
 
 
 class _Wheels(_Heard):
-    """The odometry of a feed, if there is one that is taken.
-
-    Parameters
-    ----------
-    feed : Feed
-    name : str or None
-    """
+    """The odometry of a feed, if there is one that is taken."""
 
     def __init__(self, feed: Feed, name: str | None) -> None:
         super().__init__(feed, name)

@@ -75,12 +75,7 @@ class Way:
 
 
 class Readings:
-    """Readings of an IMU as the base would make them.
-
-    Parameters
-    ----------
-    imu : Imu
-    """
+    """Readings of an IMU as the base would make them."""
 
     def __init__(self, imu: Imu) -> None:
         self.noise = imu.noise
@@ -190,7 +185,6 @@ class Inertial:
 
     Parameters
     ----------
-    imu : Imu
     trusted : bool
         It is believed whatever scans say, until this is taken back.
 

@@ -107,7 +107,6 @@ class Seen:
         Number of directions, of six, that no surface holds: the prediction stands there.
     state : str
         "first", "matched", "new space", "found again" (far and wide), "lost" (predicted, not in the map), "empty".
-    searched : bool
     aided : bool
         An IMU told where the match began, or unbent the points.
     watched : bool
@@ -175,7 +174,6 @@ class LidarOdometry:
 
     Parameters
     ----------
-    config : LidarOdometryConfig
     inertial : Inertial, optional
         Tells where a match begins and how a scan is bent, as long as it is believed; an even motion does otherwise.
     reckoned : Reckoned, optional
@@ -442,7 +440,6 @@ class LidarOdometry:
 
         Parameters
         ----------
-        raw : Raw
         chosen : (k,) int
         predicted : (7,)
             Where the match begins.

@@ -60,13 +60,6 @@ def yaw_per_metre(steps: Steps, *, apart: float = 0.5, pairs: int = 400) -> YawC
         Way between the scans of a pair [m].
     pairs : int
         Tried, spread over the path.
-
-    Raises
-    ------
-    ConfigError
-        Steps in space.
-    DataError
-        Too few pairs match.
     """
     if steps.dim != 2:
         raise ConfigError(f"{steps.name}: the yaw of odometry in space is not calibrated here")
@@ -108,13 +101,7 @@ def yaw_per_metre(steps: Steps, *, apart: float = 0.5, pairs: int = 400) -> YawC
 
 
 def without_yaw_per_metre(odometry: Odometry, rate: float, *, where: str = "odometry") -> Odometry:
-    """The odometry without a turn of ``rate`` [rad/m] for each metre driven.
-
-    Raises
-    ------
-    ConfigError
-        Odometry in space.
-    """
+    """The odometry without a turn of ``rate`` [rad/m] for each metre driven."""
     if odometry.increments.shape[1] != 3:
         raise ConfigError(f"{where}: yaw_per_metre is for odometry in the plane")
     xi = se2_log(odometry.increments)

@@ -108,7 +108,6 @@ def reckon(
         Only the speed is used.
     times : (n,)
         Strictly increasing, inside the IMU's records; none before the first speed. The last speed is held.
-    noise : DeadReckoningNoise, optional
     since : float, optional
         Start of the path, and its frame; ``times[0]`` by default, else not after it [s].
     longest : float
@@ -119,17 +118,6 @@ def reckon(
         Name of the log, for messages.
     drops : DropCounter, optional
         Counts bridged gaps.
-
-    Returns
-    -------
-    Reckoned
-
-    Raises
-    ------
-    MissingDataError
-        A stream without records.
-    DataError
-        Times outside the records, a gap longer than may be bridged, a base that stands on a wall.
     """
     noise = noise or DeadReckoningNoise()
     t = check_times(times, where=where)

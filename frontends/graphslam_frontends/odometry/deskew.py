@@ -125,7 +125,6 @@ def repeated_scans(ranges: npt.NDArray[np.floating[Any]], max_range: float) -> n
     ----------
     ranges : (n, m)
         NaN: no reading; ≥ ``max_range``: nothing met.
-    max_range : float
     """
     out = np.zeros(len(ranges), dtype=np.bool_)
     if len(ranges) > 1:

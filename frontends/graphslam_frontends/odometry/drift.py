@@ -79,10 +79,6 @@ class DriftModel:
         ----------
         length : float
             [m], ≥ 0.
-
-        Raises
-        ------
-        DataError
         """
         L = float(length)
         if not (np.isfinite(L) and L >= 0):
@@ -133,10 +129,6 @@ def fit_drift(lengths: npt.ArrayLike, moments: npt.ArrayLike) -> DriftModel:
         [m], of three different lengths at least.
     moments : (m, 6, 6) or (m, 3, 3)
         Right tangent at the end of each path.
-
-    Raises
-    ------
-    DataError
     """
     L, M = np.asarray(lengths, dtype=np.float64), np.asarray(moments, dtype=np.float64)
     if L.ndim != 1 or M.shape not in ((len(L), 3, 3), (len(L), 6, 6)) or not np.all(np.isfinite(M)):
@@ -196,11 +188,6 @@ def calibrate(
         Intervals of each length, spread evenly over the path.
     level : bool
         Frames at both ends stand level, as those of submaps do where gravity is seen.
-
-    Raises
-    ------
-    DataError
-        A path too short for three of the lengths.
     """
     s = np.asarray(path_length, dtype=np.float64)
     if intervals < 1:

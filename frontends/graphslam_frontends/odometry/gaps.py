@@ -42,11 +42,6 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
         Name of the stream.
     drops : DropCounter or None
         Counts each gap.
-
-    Raises
-    ------
-    DataError
-        A gap longer than ``limit``: names it.
     """
     known = np.append(stamps, end) if len(stamps) and end > stamps[-1] else stamps
     spacing = np.diff(known)
@@ -59,13 +54,7 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
 
 
 def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION) -> None:
-    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets.
-
-    Raises
-    ------
-    DataError
-        Names the longest.
-    """
+    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets."""
     spacing = np.diff(stamps)
     if len(gaps) and spacing[gaps].max() > limit:
         worst = int(gaps[np.argmax(spacing[gaps])])

@@ -95,13 +95,7 @@ class MotionNoise:
 
 
 def motion_stream(log: SensorLog) -> tuple[str, Motion]:
-    """Name and stream to dead-reckon from: steering before velocities before recorded odometry.
-
-    Raises
-    ------
-    MissingDataError
-        If the log has none of them.
-    """
+    """Name and stream to dead-reckon from: steering before velocities before recorded odometry."""
     name = motion_stream_name(log)
     if name is None:
         raise MissingDataError(
@@ -123,7 +117,6 @@ def dead_reckoning(
 
     Parameters
     ----------
-    log : SensorLog
     times : (n,)
         Stamps of the poses [s], strictly increasing.
     noise : MotionNoise
@@ -131,13 +124,6 @@ def dead_reckoning(
     hold : float
         Stamps up to this long before the first control are served with that control held backwards [s]; recorded
         odometry is continued at its first and last velocity by as much. The last *control* is held to the end.
-
-    Raises
-    ------
-    MissingDataError
-        If the log has no motion stream, or an empty one.
-    DataError
-        If a stamp lies outside what the stream covers.
     """
     name, stream = motion_stream(log)
     where = f"{log.name}/{name}"
@@ -209,11 +195,6 @@ def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoi
     -------
     Odometry
         As :func:`steering_odometry`.
-
-    Raises
-    ------
-    DataError
-        If a stamp lies before the first control.
     """
     t, dt, active, first = _fine_steps(controls.times, times)
     increments, covs = _start(len(t), noise)
@@ -239,12 +220,6 @@ def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, h
     hold : float
         Reach beyond the first and the last record, continued at constant velocity [s]. Both the motion and its σ then
         grow with time: what goes on is a guess.
-
-    Raises
-    ------
-    DataError
-        If the odometry is not planar, has fewer than two records, states covariances that leave its heading unknown, or
-        a stamp lies beyond its reach.
     """
     t = check_times(times)
     stamps = odometry.times
@@ -292,17 +267,11 @@ def steering_odometry(controls: SteeringControls, times: Array, noise: MotionNoi
         Held constant from each stamp to the next; the last one is held to the end.
     times : (n,)
         Stamps of the poses, strictly increasing, none before the first control.
-    noise : MotionNoise
 
     Returns
     -------
     Odometry
         Record 0 is the identity with the floor covariance; record k takes ``times[k - 1]`` to ``times[k]``.
-
-    Raises
-    ------
-    DataError
-        If a stamp lies before the first control.
     """
     t, dt, active, first = _fine_steps(controls.times, times)
     increments, covs = _start(len(t), noise)

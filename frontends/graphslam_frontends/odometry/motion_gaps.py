@@ -78,12 +78,6 @@ def bridged_reckoning(
         At ``times``.
     name : str
         Of the motion stream.
-    gaps : list of MotionGap
-
-    Raises
-    ------
-    MissingDataError, DataError
-        As there; and a gap longer than ``limit``: names it and the option.
     """
     name, motion = motion_stream(log)
     gaps = find_motion_gaps(motion, float(times[0]), float(times[-1]), limit, where=f"{log.name}/{name}")
@@ -100,11 +94,6 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
     """Gaps of the motion between two times.
 
     What is said of a gap rests on the records up to :data:`AROUND` after its end: later ones change nothing of it.
-
-    Raises
-    ------
-    DataError
-        One longer than ``limit`` seconds: names it and the option.
     """
     stamps = motion.times
     if len(stamps) < 2:

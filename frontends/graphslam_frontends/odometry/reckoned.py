@@ -79,7 +79,6 @@ class Reckoned:
         Poses at every record of the sensors, same frame.
     tilt : (n, 2)
         Roll and pitch [rad].
-    lasting : LastingErrors
     transitions, noises : (n, 12, 12)
         Of the error state from pose k - 1 to k; record 0 is identity and zero.
     floor : (6,)
@@ -116,10 +115,6 @@ class Reckoned:
         pose : (7,)
         covariance : (6, 6)
             Right tangent.
-
-        Raises
-        ------
-        DataError
         """
         n = len(self.poses)
         if not 0 <= start <= end < n:

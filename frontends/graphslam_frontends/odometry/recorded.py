@@ -55,10 +55,6 @@ class RecordedErrors:
         pose : (7,) or (3,)
         covariance : (d, d)
             Right tangent.
-
-        Raises
-        ------
-        DataError
         """
         o = self.odometry
         n, g = len(o.times), group_of(o.increments)
@@ -116,11 +112,6 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
     counted, and those of which the motion is cut get σ = 20 % of their motion on every axis besides their own. Where
     the body moved before and after, and the record tells less than half of that speed, records may have been lost, and
     with them motion: σ is then what the body drives (and, root of the mean square, turns) in that time.
-
-    Raises
-    ------
-    DataError
-        A record longer than ``limit`` seconds: names it.
     """
     if len(odometry.times) < 2:
         return odometry, Gaps()
@@ -156,15 +147,10 @@ def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise) -> Odomet
 
     Parameters
     ----------
-    odometry : Odometry
     times : (n,)
         Inside the records.
     noise : MotionNoise
         Only its floors.
-
-    Raises
-    ------
-    DataError
     """
     if odometry.increments.shape[1] == 3:
         return recorded_odometry(odometry, times, noise)

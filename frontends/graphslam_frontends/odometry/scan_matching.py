@@ -42,11 +42,6 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
         In the plane.
     drops : DropCounter, optional
         Counts scans without an accepted match, whose odometry stays.
-
-    Raises
-    ------
-    ConfigError
-        Steps in space.
     """
     if steps.dim != 2:
         raise ConfigError(f"{steps.name}: scans in space are not matched with their neighbours")

@@ -31,19 +31,7 @@ LONG = 2.0
 
 
 def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
-    """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion.
-
-    Parameters
-    ----------
-    log : SensorLog
-    config : StepConfig
-    drops : DropCounter, optional
-
-    Raises
-    ------
-    GraphSlamError
-        As :func:`graphslam_frontends.odometry.steps.make_steps`; a DataError if no beam of any scan met anything.
-    """
+    """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion."""
     count = DropCounter()
     steps = make_steps(log, replace(config, match_scans=False), drops=count)
     if drops is not None:
@@ -57,13 +45,7 @@ def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None 
 
 
 def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
-    """Raise if no beam of any scan met anything: a map of nothing helps nobody.
-
-    Raises
-    ------
-    DataError
-        Says what became of the beams.
-    """
+    """Raise if no beam of any scan met anything: a map of nothing helps nobody."""
     if np.any(steps.returns):
         return
     counts = {} if drops is None else drops.counts
@@ -103,7 +85,6 @@ def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path:
 
     Parameters
     ----------
-    steps : Steps
     stretches : list of (first, last)
         Of :func:`uncorrected`.
     path : (last - first + 1, 7) or (…, 3)
@@ -130,8 +111,6 @@ def reckoned_covariance(steps: Steps, start: int, end: int, *, level_end: bool =
 
     Parameters
     ----------
-    steps : Steps
-    start, end : int
     level_end : bool
         The frame at the end stands level where gravity is told, as that at the start does.
     """

@@ -30,13 +30,10 @@ class StepMotion:
 
     Parameters
     ----------
-    odometry : Odometry
     poses : (n, 7) or (n, 3)
     path : Trajectory
         In the frame of ``poses``; covers ``span``.
-    errors : PathErrors
     tilt : (n, 2) or None
-    tilt_sigma, tilt_time : float
     gaps : Gaps
         In which the motion is a guess.
     """
@@ -59,7 +56,6 @@ class MotionSource:
     ----------
     names : tuple of str
         Streams.
-    dim : int
     begin, end : float
         What they cover [s].
     solve : callable
@@ -78,17 +74,8 @@ def motion_source(log: SensorLog, config: StepConfig, dim: int) -> MotionSource:
 
     Parameters
     ----------
-    log : SensorLog
-    config : StepConfig
     dim : int
         Of the beams: motion of other dimensions is only taken where there is no better, or where it is named.
-
-    Raises
-    ------
-    MissingDataError
-        The log has none, or an empty one.
-    ConfigError
-        Named streams that cannot be used together.
     """
     names = config.motion or _best(log, dim)
     streams = [log[n] for n in names]

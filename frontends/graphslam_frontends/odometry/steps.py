@@ -63,8 +63,6 @@ class Steps:
         σ of its error [rad], and the time over which errors stay alike [s].
     uses : frozenset of str
         Streams of the log that are inside.
-    name : str
-    truth : Trajectory or None
     errors : PathErrors or None
         Honest covariance of dead reckoning over any interval, where the source of the motion lets it be known.
     gaps : Gaps
@@ -73,10 +71,6 @@ class Steps:
         What was noticed when scans and motion were put beside each other.
     recorded : Odometry or None
         The motion without what scans say of it, where ``odometry`` holds that too.
-
-    Raises
-    ------
-    DataError, GeometryError
     """
 
     times: Array
@@ -164,15 +158,9 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
 
     Parameters
     ----------
-    log : SensorLog
-    config : StepConfig, optional
     drops : DropCounter, optional
         Counts beams and scans that say nothing, beams outside the motion, beams left out by thinning, steps without a
         beam, gaps that were bridged.
-
-    Returns
-    -------
-    Steps
 
     Raises
     ------

@@ -37,7 +37,6 @@ class EncoderOffset:
 
     Parameters
     ----------
-    stream : str
     offset, sigma : float
         About the x axis of the mount [rad].
     """
@@ -73,16 +72,8 @@ def encoder_offset(
         With the head's scans, and motion that says which way the robot goes: wheels that do not slip to the side.
     steps : StepConfig, optional
         As the front end has it.
-    window : ScanWindowConfig, optional
     stream : str, optional
         Of the head; by default the only one.
-
-    Raises
-    ------
-    MissingDataError
-        No head that turns about an upright axis, or several and none named.
-    DataError
-        The scans do not say: too few of them could be put on each other.
     """
     heads = turning_heads(log)
     if stream is None and len(heads) == 1:

@@ -27,7 +27,6 @@ class FollowedErrors:
     ----------
     steps : Steps
         As they were before.
-    config : ScanWindowConfig
     """
 
     steps: Steps
@@ -43,13 +42,7 @@ class FollowedErrors:
     def between(
         self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
     ) -> tuple[Array, Array]:
-        """Motion from step ``start`` to step ``end`` and its covariance ``(d, d)``, right tangent.
-
-        Raises
-        ------
-        DataError
-            No such interval.
-        """
+        """Motion from step ``start`` to step ``end`` and its covariance ``(d, d)``, right tangent."""
         if not 0 <= start <= end < len(self.steps):
             raise DataError(
                 "no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {len(self.steps)}"
@@ -96,12 +89,7 @@ def followed(steps: Steps, config: ScanWindowConfig) -> Steps:
 
 
 def once(config: StepConfig) -> None:
-    """Refuse steps whose motion was fused with the same scans already.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse steps whose motion was fused with the same scans already."""
     if config.match_scans:
         raise ConfigError(
             "frontend.steps.match_scans = true fuses the motion with the scans, which scan-to-window odometry would "

@@ -126,16 +126,8 @@ def window_submaps(
 
     Parameters
     ----------
-    steps : Steps
-    window : ScanWindowConfig
-    config : WindowSubmapConfig
     first_key : int
         Submaps before it are not made.
-
-    Raises
-    ------
-    DataError
-        Fewer than two steps: there is no interval.
     """
     n = len(steps)
     if n < 2:

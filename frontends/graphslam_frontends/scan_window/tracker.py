@@ -75,13 +75,7 @@ class Found:
 
 
 class Tracker:
-    """Follows the steps of a log one by one.
-
-    Parameters
-    ----------
-    steps : Steps
-    config : ScanWindowConfig
-    """
+    """Follows the steps of a log one by one."""
 
     def __init__(self, steps: Steps, config: ScanWindowConfig) -> None:
         self.steps, self.config = steps, config
@@ -486,7 +480,6 @@ class Track:
         where one submap ends and the next begins belongs to the one that ends.
     lasting : (n, m)
         Yaw bias [rad/s], scale, direction … after each step.
-    found : tuple of Found
     """
 
     poses: Array

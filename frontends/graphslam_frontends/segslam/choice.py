@@ -151,8 +151,6 @@ def judge(
 
     Parameters
     ----------
-    proposals : sequence of Proposal
-    config : ChoiceConfig
     registration : RegistrationConfig, optional
         Whose gates are asked; default the standard ones.
     """

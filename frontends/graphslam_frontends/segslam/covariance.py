@@ -77,12 +77,6 @@ def exit_covariance(
         Factor on the drift model's covariance.
     floor_position, floor_angle : float
         Standard deviations [m], [rad] added to the moment-matched covariance.
-
-    Raises
-    ------
-    CovarianceError
-        The drift model's answer is no covariance; then nothing may enter a graph.
-    GeometryError
     """
     group = group_of(about)
     D = np.array(drift(float(length)), dtype=np.float64)
@@ -117,7 +111,6 @@ class Nees:
     ----------
     values : (n,)
         ``eᵀ P⁻¹ e``; its expectation is ``dof`` if the covariances are honest.
-    dof : int
     errors : (n, dof)
         Right tangents at the estimates, of the components that were asked for.
     """

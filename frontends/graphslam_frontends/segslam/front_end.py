@@ -89,10 +89,8 @@ def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) ->
 
     Parameters
     ----------
-    result : SegSlamResult
     drift : FilterDrift
         Errors that all particles share.
-    config : SegSlamConfig
     """
     segmap, steps = result.segmap, result.steps
     chain = settled_chain(segmap, int(result.closed[result.best]))

@@ -71,18 +71,10 @@ def localise(
         The map; not written to.
     T_start : (7,) or (3,)
         ``T_map_body``. Roll and pitch stay as they are there.
-    window : Window
     max_range : float
         [m]
-    rng : numpy Generator
-    config : LocalisationConfig
     threads : int
         The result is the same for any number.
-
-    Raises
-    ------
-    DataError
-        The window has no beam.
     """
     if not len(window):
         raise DataError("nothing to localise by", got="a window without beams that met something", wanted="some")

@@ -79,7 +79,6 @@ class Attempt:
 
     Parameters
     ----------
-    step : int
     entries : tuple of N (Entry or None)
         How each particle enters an older map; None: not at all.
     candidates : tuple of int
@@ -127,11 +126,8 @@ class Matcher:
 
     Parameters
     ----------
-    segmap : SegMap
-    config : SegSlamConfig
     max_range : float
         Of the beams [m].
-    threads : int
     """
 
     def __init__(self, segmap: SegMap, config: SegSlamConfig, max_range: float, *, threads: int = 1) -> None:
@@ -150,7 +146,6 @@ class Matcher:
 
         Parameters
         ----------
-        step : int
         poses : (N, 7) or (N, 3)
             ``T_segment_body``.
         ahead : Ahead

@@ -47,16 +47,9 @@ def concatenate(segmap: SegMap, sample: MapSample, open_path: Array | None = Non
 
     Parameters
     ----------
-    segmap : SegMap
-    sample : MapSample
     open_path : (n, 7) or (n, 3), optional
         ``T_segment_body`` of an open root, from its start to the step of now; without it the path ends where that
         begins.
-
-    Raises
-    ------
-    DataError
-        Nothing but an open root whose path is not given.
     """
     g = segmap.group
     steps: list[Ints] = []

@@ -21,7 +21,6 @@ class Progress:
         Steps done, of how many.
     length : float
         Driven so far, by the odometry [m].
-    segmap : SegMap
     last : int
         The segment that the best particle closed last; -1 before the first.
     """

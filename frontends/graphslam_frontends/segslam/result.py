@@ -49,7 +49,6 @@ class SegSlamResult:
 
     Parameters
     ----------
-    steps : Steps
     segmap : SegMap
         All its segments are closed.
     closed : (N,) int64
@@ -63,15 +62,12 @@ class SegSlamResult:
         Poses in the frames of the segments; tags number these.
     scores, attempts, boundaries : tuples
         In the order of time; attempts are those that had candidates.
-    winnowed : Winnowed
-    tally : Tally
     seconds : mapping of str to float
         Wall time by part.
     step_seconds : (n,)
         Wall time of each step, of all parts together.
     used_bytes : int
         Memory of all maps at the end.
-    seed : SeedTree
     """
 
     steps: Steps
@@ -104,7 +100,6 @@ class SegSlamResult:
         ----------
         number : int
             Samples with different numbers are drawn independently; the same number is the same sample.
-        particle : int, optional
         """
         at = int(self.closed[self.best if particle is None else particle])
         rng = self.seed.child("map-sample", number).generator()

@@ -83,13 +83,7 @@ class Root:
 
 
 def root_of_particle(segmap: SegMap, particle: int, step: int) -> Root:
-    """The segment a particle is in, at the step of now.
-
-    Raises
-    ------
-    DataError
-        It is in none.
-    """
+    """The segment a particle is in, at the step of now."""
     if not 0 <= particle < segmap.particles or segmap.entries[particle] is None:
         raise DataError(f"particle {particle} is in no segment", wanted="one that entered a segment and did not leave")
     e = cast(Entry, segmap.entries[particle])
@@ -130,9 +124,6 @@ def grow(
 
     Parameters
     ----------
-    segmap : SegMap
-    root : Root
-    rng : numpy Generator
     weights : (len(segmap),), optional
         Of the segments, for the draw among those that fit; default equal. Where all that fit weigh nothing, equal.
     local_length : float

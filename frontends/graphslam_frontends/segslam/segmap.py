@@ -41,16 +41,11 @@ class SegMap:
         Of the steps [s].
     path_length : (n,)
         Way by odometry up to each step [m].
-    particles : int
     dim : {3, 2}
     gravity : bool
         Frames are aligned with gravity: only headings lie between them.
     lift : float
         Height of the body over the frame of a new segment at its entry [m].
-
-    Raises
-    ------
-    DataError, GeometryError
     """
 
     def __init__(
@@ -117,7 +112,6 @@ class SegMap:
 
         Parameters
         ----------
-        step : int
         entries : sequence of Entry
             One for each particle, in its order.
         which : iterable of int, optional
@@ -128,12 +122,6 @@ class SegMap:
         list of EvidenceGrid or None
             The map to go on with: a copy of the one that is entered, locked if that is; None of a new segment, whose
             map the filter makes.
-
-        Raises
-        ------
-        DataError
-            A particle has not left its last segment, or enters one that is not there.
-        GeometryError
         """
         chosen = self._which(which, len(entries), "entries")
         if not 0 <= step < len(self.times):
@@ -183,7 +171,6 @@ class SegMap:
 
         Parameters
         ----------
-        step : int
         grids : sequence of EvidenceGrid
             Their maps, in the frames they work in. Only handles are kept: the filter may go on writing to its own.
         paths : sequence of (step - start + 1, 7 or 3)
@@ -191,19 +178,11 @@ class SegMap:
             segment**: the first pose is that of the entry.
         weights : (particles,), optional
             Of all particles; default equal.
-        which : iterable of int, optional
 
         Returns
         -------
         (n,) int64
             Indices of the segments. Particles that are copies of each other share one.
-
-        Raises
-        ------
-        DataError
-            Nothing is open, or the interval is empty.
-        GeometryError
-            A path of the wrong shape, not finite, or in another frame.
         """
         chosen = self._which(which, len(grids), "grids")
         self._which(which, len(paths), "paths")
@@ -311,15 +290,8 @@ class SegMap:
 
         Parameters
         ----------
-        keep, other : int
         T_keep_other : (7,) or (3,), optional
             Between the frames of the segments; default the identity.
-
-        Raises
-        ------
-        DataError
-            The maps share some scans and neither holds all of the other's: these would count twice.
-        GridLockedError, GridError, GeometryError
         """
         i, j = self._alive(keep), self._alive(other)
         T = self.group.identity if T_keep_other is None else np.asarray(T_keep_other, dtype=np.float64)

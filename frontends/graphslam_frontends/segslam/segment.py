@@ -46,7 +46,6 @@ class Segment:
 
     Parameters
     ----------
-    index : int
     interval : (start, end)
         Steps of its two boundaries.
     t_start, t_end : float
@@ -64,7 +63,6 @@ class Segment:
     weight : float
         Share of the particles' weight when it was closed.
     match_covariance : (d, d) or None
-    fitness : float
     locked : bool
         Its map is localised in, not updated.
     """
@@ -94,18 +92,10 @@ def check_path(path: Any, entry: Entry | None, particle: int, interval: tuple[in
     path : (n, 7) or (n, 3)
     entry : Entry or None
         How the particle entered.
-    particle : int
     interval : (start, end)
         Steps.
     last : int
         The last step there is.
-
-    Raises
-    ------
-    DataError
-        A segment that was never entered, is empty, or ends outside the path.
-    GeometryError
-        A path of the wrong shape, not finite, or in another frame.
     """
     start, step = interval
     if entry is None:

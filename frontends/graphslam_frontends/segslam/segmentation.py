@@ -63,11 +63,6 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
     scans : sequence of w scans
     max_range : float
         Beams longer than this are left out [m].
-
-    Raises
-    ------
-    DataError
-        Scans and increments differ in number.
     """
     u = np.asarray(increments, dtype=np.float64)
     g = group_of(u)
@@ -97,7 +92,6 @@ class Score:
         Mean log-likelihood a beam, 0 = perfect (eq. 15–17, clipped); NaN likewise.
     share, log_likelihood : float
         Weighted means over the particles.
-    beams : int
     """
 
     shares: Array
@@ -126,7 +120,6 @@ def predictive_score(
     grids : sequence of P EvidenceGrid
     poses : (P, 7) or (P, 3)
         ``T_map_body`` before the window.
-    window : Window
     max_range : float
         [m]
     weights : (P,), optional
@@ -194,7 +187,6 @@ class Decision:
 
     Parameters
     ----------
-    ends : bool
     why : str
         "score", "relative-score", "motion-error", "period", "max-length", "max-seconds"; else what keeps it: "young",
         "short", "" if nothing asks for an end.
@@ -224,7 +216,6 @@ class Segmenter:
 
     Parameters
     ----------
-    config : SegmentationConfig
     time : float
         When the segment began [s].
     length : float
@@ -283,11 +274,6 @@ class Segmenter:
             Predictive score of the window ahead; NaN: there is none.
         again : bool
             The body is where the path of its map passed before; only then may the ground be known.
-
-        Raises
-        ------
-        GeometryError
-            Time or way run backwards, or are not finite.
         """
         c = self.config
         seconds, way = time - self.time, length - self.length

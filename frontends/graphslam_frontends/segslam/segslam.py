@@ -50,10 +50,8 @@ def run_segslam(
 
     Parameters
     ----------
-    steps : Steps
     filter : GridFilterConfig
         Of the particle filter inside the segments.
-    config : SegSlamConfig
     seed : SeedTree
         The same seed gives the same SegMap, with any number of threads.
     progress : bool

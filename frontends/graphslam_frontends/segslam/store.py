@@ -124,12 +124,7 @@ def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
 
 
 class Maps:
-    """Evidence grids that segments use, each until its last user is gone.
-
-    Parameters
-    ----------
-    group : Group
-    """
+    """Evidence grids that segments use, each until its last user is gone."""
 
     def __init__(self, group: Group) -> None:
         self.group = group

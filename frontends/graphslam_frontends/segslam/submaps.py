@@ -89,11 +89,6 @@ def settled_chain(segmap: SegMap, last: int) -> Ints:
     """Segments from the first to ``last``, each beginning where the one before ends.
 
     The particle's own history as far as it is there, else the heaviest segment that fits (A6).
-
-    Parameters
-    ----------
-    segmap : SegMap
-    last : int
     """
     t = segmap.table
     chain = [segmap[last].index]
@@ -109,13 +104,7 @@ def settled_chain(segmap: SegMap, last: int) -> Ints:
 
 
 def sampled_chain(segmap: SegMap, sample: MapSample) -> Ints:
-    """Segments of a full map sample as they follow each other, of whichever particles.
-
-    Raises
-    ------
-    DataError
-        The sample is not full: it has an open segment.
-    """
+    """Segments of a full map sample as they follow each other, of whichever particles."""
     if (sample.segments < 0).any():
         raise DataError(
             "a map sample with an open segment is no chain", wanted="a sample from a segment that is closed"
@@ -138,11 +127,8 @@ def settle(
 
     Parameters
     ----------
-    segmap : SegMap
     chain : sequence of int
         Each begins where the one before ends.
-    drift : Drift
-    config : HandoverConfig, optional
     uses : frozenset of str
         Streams of the log that are inside.
     reasons : mapping of step to str, optional
@@ -151,13 +137,6 @@ def settle(
         Key of the first submap; the others follow.
     with_grids : bool
         Hand over the maps, in the frames of the submaps' bases.
-
-    Raises
-    ------
-    DataError
-        Segments that do not follow each other, or are not there.
-    CovarianceError
-        The drift model gives no covariance.
     """
     config = HandoverConfig() if config is None else config
     segments = [segmap[int(i)] for i in chain]

@@ -31,7 +31,6 @@ class Ahead:
     full : bool
         The log reaches to the end of the window. A match of less is not to be believed: with half of its surroundings
         a place looks like others.
-    window : Window
     """
 
     step: int
@@ -51,8 +50,6 @@ def look_ahead(steps: Steps, step: int, seconds: float) -> Ahead:
 
     Parameters
     ----------
-    steps : Steps
-    step : int
     seconds : float
         W.
     """

@@ -129,14 +129,12 @@ def winnow(
 
     Parameters
     ----------
-    segmap : SegMap
     sample : MapSample
         Its root is the segment the particles are in.
     T_root_body : (n, 7) or (n, 3)
         Their poses.
     step : int
         The step of now.
-    config : WinnowConfig
     exclude : set of int
         Segments that are not asked for, such as the one whose map the particles work in already.
     tally : Winnowed, optional

@@ -100,13 +100,7 @@ class Generation(OutputFiles):
 
 
 def outputs(folder: str | os.PathLike[str]) -> Path:
-    """Where the files of the present state of a folder are: its generation, or itself where it has none.
-
-    Raises
-    ------
-    FormatError
-        ``current`` names a generation that is not there.
-    """
+    """Where the files of the present state of a folder are: its generation, or itself where it has none."""
     home = Path(folder)
     target = _current(home)
     if target is None:
@@ -134,11 +128,6 @@ def consistent(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
 def check_links(folder: str | os.PathLike[str]) -> None:
     """Refuse a folder in which a name of ours is a link that leads out of it: a folder that somebody else made chooses
     neither which other files are read, nor where is written. Links of other names are left alone.
-
-    Raises
-    ------
-    FormatError
-        Names the link.
     """
     home = Path(folder)
     real = os.path.realpath(home)
@@ -163,13 +152,7 @@ def _links(home: Path) -> Iterator[Path]:
 
 
 def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
-    """Hold ids of generations inside files against each other; files of older versions have none (None).
-
-    Raises
-    ------
-    FormatError
-        Names two files that differ.
-    """
+    """Hold ids of generations inside files against each other; files of older versions have none (None)."""
     file, known = first
     for other, found in others:
         if found is not None and known is not None and str(found) != str(known):
@@ -189,13 +172,6 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
     ----------
     folder : path
         The caller has looked whether it is one of ours.
-
-    Raises
-    ------
-    RunFolderError
-        Another process is writing into it.
-    FormatError
-        A link in it leads out of it.
     """
     home = Path(folder)
     with locked(home):

@@ -27,13 +27,7 @@ _held: dict[str, int] = {}
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make a folder and those above it, unless it is there.
-
-    Raises
-    ------
-    RunFolderError
-        It cannot be made.
-    """
+    """Make a folder and those above it, unless it is there."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -47,11 +41,6 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold a folder against other processes that would write into it; made if missing.
 
     The system gives the lock back when a process ends, however it ends. A thread may lock a folder again that it holds.
-
-    Raises
-    ------
-    RunFolderError
-        Another process, or another thread of this one, is writing into it; or it cannot be made.
     """
     home = make_folder(folder)
     real = os.path.realpath(home)

@@ -15,12 +15,7 @@ from graphslam.core.json_file import finite
 
 
 class OutputFiles:
-    """Writes files of a folder, each whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-    """
+    """Writes files of a folder, each whole or not at all."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)

@@ -114,13 +114,7 @@ class ReportFolder:
 
 
 def read_folder(path: str | Path, root: Path) -> ReportFolder:
-    """Read what there is, of one state of the folder, whose files are in ``root``.
-
-    Raises
-    ------
-    RunFolderError
-        Neither a run folder nor a merged one.
-    """
+    """Read what there is, of one state of the folder, whose files are in ``root``."""
     home = Path(path)
     if (root / "merge.json").is_file():
         kind: Kind = "merged"

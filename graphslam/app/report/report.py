@@ -58,7 +58,6 @@ class Report:
 
     Parameters
     ----------
-    html : str
     kind : {"run", "interrupted", "merged"}
         Of the folder.
     problems : dict of str to str
@@ -78,11 +77,6 @@ def make_report(folder: str | Path) -> Report:
     """The page of a run folder or a merged folder, finished or not.
 
     The same folder gives the same page. Two runs of the same configuration differ in its part ``times`` alone.
-
-    Raises
-    ------
-    RunFolderError
-        Neither a run folder nor a merged one. What is missing inside one, or damaged, is said in the page.
     """
     return consistent(folder, lambda root: _page(Path(folder), root))
 
@@ -106,14 +100,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
 
     Parameters
     ----------
-    folder : path
     out : path, optional
         Default: ``report.html`` in the folder.
-
-    Raises
-    ------
-    RunFolderError
-        No run folder, or the page cannot be written.
     """
     return report_and_file(folder, out)[1]
 

@@ -50,14 +50,10 @@ def prepared(
 
     Parameters
     ----------
-    log : SensorLog
-    front : FrontEnd
-    config : CalibrateConfig
     options : mapping
         What the user asked for: noise that is set by hand stays.
     own : bool
         Is there a preset for this very set?
-    seed : int
     """
     if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "Noise and lasting errors are those given in calibrate.given.")]
@@ -155,13 +151,7 @@ def front_kind(front: FrontEnd) -> str | None:
 
 
 def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 0) -> Calibration:
-    """What the log says of its noise, of the streams that the front end reads.
-
-    Raises
-    ------
-    DataError, MissingDataError
-        The log says nothing.
-    """
+    """What the log says of its noise, of the streams that the front end reads."""
     kind = front_kind(front)
     if kind is None:
         raise DataError(f"front end {front.name} reads nothing that can be calibrated", where=log.name)
@@ -214,8 +204,6 @@ def named_causes(
 
     Parameters
     ----------
-    log : SensorLog
-    config : CalibrateConfig
     chi2_per_dof, dof : float
         Of the join of the submaps.
     ranges_corrected : bool

@@ -35,7 +35,6 @@ class Choice:
 
     Parameters
     ----------
-    frontend : str
     why : str
         What of the log it is for.
     """
@@ -45,13 +44,7 @@ class Choice:
 
 
 def choose_front_end(log: SensorLog) -> Choice:
-    """The front end for what a log holds.
-
-    Raises
-    ------
-    MissingDataError
-        There is none: says what the log holds, what is missing, and what works.
-    """
+    """The front end for what a log holds."""
 
     def has(*kinds: type) -> bool:
         return any(isinstance(s, kinds) and len(s.times) for s in log.streams.values())

@@ -173,32 +173,17 @@ LEDGER: dict[str, type] = {
 
 
 def read_report(root: Path) -> dict[str, Any]:
-    """``run.json`` of a finished run.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """``run.json`` of a finished run."""
     return read_json(root / "run.json", fmt=RUN_FORMAT, shape=RUN)
 
 
 def read_merge_report(root: Path) -> dict[str, Any]:
-    """``merge.json`` of a merged map.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """``merge.json`` of a merged map."""
     return read_json(root / "merge.json", fmt=MERGE_FORMAT, shape=MERGE)
 
 
 def read_options(root: Path) -> dict[str, Any]:
-    """``config.toml`` of a run: tables of options by name; nothing where there is none.
-
-    Raises
-    ------
-    ConfigError, FormatError
-    """
+    """``config.toml`` of a run: tables of options by name; nothing where there is none."""
     file = root / "config.toml"
     if not file.exists():
         return {}
@@ -210,12 +195,7 @@ def read_options(root: Path) -> dict[str, Any]:
 
 
 def read_map(root: Path) -> GlobalMap:
-    """``map.npz``.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """``map.npz``."""
     file = root / "map.npz"
     where = str(file)
     a = read_npz(file, fmt=MAP_FORMAT, fields=MAP)
@@ -256,12 +236,7 @@ def _check_covariances(covariances: Array, what: str, where: str) -> None:
 
 
 def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
-    """Landmark identities that a run's back end gave, by submap key.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """Landmark identities that a run's back end gave, by submap key."""
     file = root / "association.npz"
     a = read_npz(file, fmt=ASSOCIATION_FORMAT, fields=ASSOCIATION)
     o = a["offsets"]
@@ -273,10 +248,6 @@ def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
 def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
     """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a value that was
     not a number is NaN.
-
-    Raises
-    ------
-    MissingDataError, FormatError
     """
     file = root / name
     rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
@@ -288,15 +259,7 @@ def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
 
 
 def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dict[str, Any]]:
-    """``events.jsonl`` of the files of a run; ``home`` is the folder that errors name.
-
-    Raises
-    ------
-    RunFolderError
-        It has none.
-    FormatError
-        A line is no event; names it.
-    """
+    """``events.jsonl`` of the files of a run; ``home`` is the folder that errors name."""
     file = Path(root) / "events.jsonl"
     if not file.is_file():
         raise RunFolderError(f"{home or root}: has no events.jsonl; give a folder of a finished run")
@@ -311,13 +274,7 @@ def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dic
 
 
 def check_state(root: Path) -> None:
-    """Hold the ids of generations in plain files of a run against each other; files of older versions have none.
-
-    Raises
-    ------
-    FormatError
-        Names two files that are not of one state.
-    """
+    """Hold the ids of generations in plain files of a run against each other; files of older versions have none."""
     known = read_report(root).get("generation")
     for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "taken.npz")):
         if file.is_file():
@@ -347,13 +304,7 @@ def _check_decision(event: Mapping[str, Any], where: str) -> None:
 
 
 def read_ledger(root: Path) -> pd.DataFrame:
-    """``ledger.csv`` as a table: which factor spent which stream when.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        Names file and line.
-    """
+    """``ledger.csv`` as a table: which factor spent which stream when."""
     file = root / "ledger.csv"
     try:
         lines = list(csv.reader(io.StringIO(read_text(file)), strict=True))
@@ -386,34 +337,19 @@ def _cell(text: str, kind: type, where: str) -> Any:
 
 
 def read_merged_dense(root: Path) -> dict[str, npt.NDArray[Any]]:
-    """``merged.npz`` of merged dense submaps.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """``merged.npz`` of merged dense submaps."""
     return read_npz(root / "merged.npz", fmt=MERGED_DENSE_FORMAT, fields=MERGED_DENSE)
 
 
 def read_gps_residuals(file: Path) -> GpsResiduals:
-    """``gps_NAME.npz``.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """``gps_NAME.npz``."""
     a: Any = read_npz(file, fmt=GPS_FORMAT, fields=GPS)
     a |= {name: int(a[name]) for name in ("fitted", "outside", "in_gap")}
     return GpsResiduals(**a)
 
 
 def read_fixes(root: Path) -> Gps | None:
-    """``fixes.npz``; None where there is none.
-
-    Raises
-    ------
-    FormatError
-    """
+    """``fixes.npz``; None where there is none."""
     file = root / "fixes.npz"
     if not file.is_file():
         return None
@@ -425,24 +361,13 @@ def read_fixes(root: Path) -> Gps | None:
 
 
 def loops_of_run(folder: str | Path) -> LoopLedger:
-    """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not.
-
-    Raises
-    ------
-    RunFolderError, DataError, FormatError
-    """
+    """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not."""
     events = consistent(folder, lambda root: read_events(root, home=folder))
     return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
 
 
 def undone_of_run(folder: str | Path) -> list[Decision]:
-    """Loops that were taken out of a finished run by hand; none where a run was not finished.
-
-    Raises
-    ------
-    DataError, FormatError
-        The folder's events are damaged.
-    """
+    """Loops that were taken out of a finished run by hand; none where a run was not finished."""
     if not (outputs(folder) / "events.jsonl").is_file():
         return []
     return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]

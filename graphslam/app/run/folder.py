@@ -49,12 +49,7 @@ class Settled:
 
 
 class RunFolder:
-    """Creates and reopens a run folder.
-
-    Parameters
-    ----------
-    path : path
-    """
+    """Creates and reopens a run folder."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -66,14 +61,6 @@ class RunFolder:
         until the block ends.
 
         A folder in which a run left no finished submap is begun anew.
-
-        Raises
-        ------
-        RunFolderError
-            The folder holds something else, another configuration, or a run of another log; it is being written by
-            another process, or cannot be written.
-        FormatError
-            A link in it leads out of it.
         """
         folder = cls(path)
         make_folder(folder.path)
@@ -132,12 +119,7 @@ class RunFolder:
         return SubmapStore(self.path / (SUBMAPS if draw is None else f"{SUBMAPS}-{draw}"), load_grid=load_grid)
 
     def settled(self) -> Settled | None:
-        """Which draw the submaps are, where several were made and one was chosen.
-
-        Raises
-        ------
-        FormatError
-        """
+        """Which draw the submaps are, where several were made and one was chosen."""
         file = inside(self.path, DRAWS, str(self.path))
         if not file.exists():
             return None

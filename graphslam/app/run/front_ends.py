@@ -24,24 +24,13 @@ def front_end_names() -> list[str]:
 
 
 def check_name(name: str) -> None:
-    """See that a front end of that name is installed.
-
-    Raises
-    ------
-    UnknownNameError
-    """
+    """See that a front end of that name is installed."""
     if name not in front_end_names():
         raise UnknownNameError("front end", name, front_end_names())
 
 
 def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
-    """Name of a front end that is given by its name, as a class or as an object.
-
-    Raises
-    ------
-    ConfigError
-        Something else was given.
-    """
+    """Name of a front end that is given by its name, as a class or as an object."""
     if isinstance(front, str):
         return front
     kind = front if isinstance(front, type) else type(front)
@@ -74,11 +63,6 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
     ----------
     front : str, class or object
         An object has its configuration and is taken as it is.
-    options : mapping
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
     """
     name = name_of(front)
     if not isinstance(front, (str, type)):
@@ -104,15 +88,8 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
 
     Parameters
     ----------
-    log : SensorLog
-    frontend : str
     preset : str, optional
         Name of a preset instead; ``none``: defaults.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such preset for the front end.
     """
     if preset is not None:
         return named_preset(frontend, preset)
@@ -128,13 +105,7 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
 
 
 def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
-    """Settings of a preset for a front end; of ``none``, and of None, nothing.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such preset for the front end.
-    """
+    """Settings of a preset for a front end; of ``none``, and of None, nothing."""
     if preset is None or preset == "none":
         return {}
     known = cfg.preset_names(frontend)

@@ -51,7 +51,6 @@ class FrontEndWork:
 
     Parameters
     ----------
-    seconds : float
     resumed : int
         Submaps that were there already.
     per_scan : (k,)
@@ -68,10 +67,6 @@ class FrontToBack:
 
     Parameters
     ----------
-    feed : Feed
-    front : FrontEnd
-    back : BackEnd
-    seed : SeedTree
     folder : RunFolder or None
         Where submaps are stored; those that are there already are not made again.
     with_grids : bool

@@ -23,17 +23,8 @@ def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
 
     Parameters
     ----------
-    folder : path
     loop : int
         Number in the ledger.
-    progress : bool
-
-    Raises
-    ------
-    RunFolderError, DataError
-        No run, or no loop of that number in its graph; or another process is writing into the folder.
-    MissingDataError
-        An older version wrote the folder, which does not hold what the graph was made of.
     """
 
     def without(before: LoopLedger, undone: list[Decision]) -> list[Decision]:

@@ -35,7 +35,6 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
 
     Parameters
     ----------
-    run_map : RunMap
     path : Trajectory
         Solved.
     figures : Path

@@ -107,11 +107,6 @@ SAME_FRAME = 1e-6
 def write_outputs(folder: Path, run: Run) -> Run:
     """Write a new state of a run folder: everything but ``config.toml`` and ``submaps/``, which are there already.
 
-    Parameters
-    ----------
-    folder : Path
-    run : Run
-
     Returns
     -------
     Run
@@ -272,17 +267,6 @@ def _identified(home: Path, root: Path) -> list[Submap]:
 def open_run(path: str | Path) -> Run:
     """Read a finished run folder, all of it of one state.
 
-    Parameters
-    ----------
-    path : path
-
-    Raises
-    ------
-    RunFolderError
-        Not a finished run.
-    FormatError
-        A file is damaged, or not of one state with the others.
-
     Examples
     --------
     >>> run = gs.open_run("runs/vp")
@@ -329,13 +313,7 @@ def _open(home: Path, root: Path) -> Run:
 
 
 def refined_submaps_of(run: Run) -> list[Submap]:
-    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the result.
-
-    Raises
-    ------
-    FormatError, DataError
-        The store is damaged, or not of the state that the run was read in.
-    """
+    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the result."""
     if run.refined is not None:
         return run.refined.submaps
     if run.folder is None:
@@ -394,7 +372,6 @@ def graph_facts(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> di
 
     Parameters
     ----------
-    graph : PoseGraph
     classes : mapping of str to ClassConsistency
         Of this graph (:func:`graphslam.evaluate.without_truth.class_consistency`).
     """

@@ -311,20 +311,10 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
 
     Parameters
     ----------
-    folder : path
     undo : sequence of Decision
         Loops that are taken out.
     progress : bool
         Show a progress bar on stderr.
-
-    Raises
-    ------
-    RunFolderError
-        No finished run, or another process is writing into it.
-    MissingDataError
-        An older version wrote the folder, which does not hold enough.
-    FormatError
-        What it holds is damaged.
     """
     root = Path(folder)
     begin = time.perf_counter()
@@ -343,14 +333,7 @@ def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True
 
 
 def solve_again(folder: str | Path) -> tuple[PoseGraph, Solution]:
-    """Graph and solution of a finished run, from what its folder holds, without the loops that were undone.
-
-    Raises
-    ------
-    MissingDataError
-        An older version wrote the folder, which does not hold enough.
-    RunFolderError, FormatError
-    """
+    """Graph and solution of a finished run, from what its folder holds, without the loops that were undone."""
     root = Path(folder)
     with one_blas_thread():
         taken, _ = consistent(root, read_taken)
@@ -395,7 +378,6 @@ class _Attempt:
 
     Parameters
     ----------
-    run : Run
     draw : int
         Of the random numbers its submaps were made of.
     loops : bool

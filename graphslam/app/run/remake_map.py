@@ -32,7 +32,6 @@ class RemadeMap:
 
     Parameters
     ----------
-    map : RunMap
     clearest : Clearest or None
         Choices of matches and loops, where they were asked for.
     files, figures : list of Path
@@ -60,7 +59,6 @@ def remake_map(
 
     Parameters
     ----------
-    folder : path
     grid : bool
         Write the evidence grid itself too.
     minimum_entropy : bool
@@ -71,17 +69,6 @@ def remake_map(
         Where the run's log is by now; default where it was.
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
-    progress : bool
-
-    Raises
-    ------
-    RunFolderError
-        Not a finished run, or another process is writing into it.
-    MissingDataError
-        A run without dense maps; no log to find hypotheses in.
-    ConfigError
-        Both kinds of alternatives at once, or hypotheses of another front end.
-    FormatError, DataError
     """
     if minimum_entropy and hypotheses:
         raise ConfigError(
@@ -131,10 +118,6 @@ def remake_terrain(
     Returns
     -------
     RunTerrain, files, figures
-
-    Raises
-    ------
-    RunFolderError, MissingDataError, FormatError, DataError
     """
     home = Path(folder)
     if not (outputs(home) / "run.json").is_file():
@@ -173,10 +156,6 @@ def remake_surface(
     Returns
     -------
     RunSurface, files, figures
-
-    Raises
-    ------
-    RunFolderError, MissingDataError, FormatError, DataError, UnknownNameError
     """
     home = Path(folder)
     if colour not in COLOURS:
@@ -201,17 +180,8 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
 
     Parameters
     ----------
-    path : path
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
-
-    Raises
-    ------
-    RunFolderError
-        Not a finished run.
-    MissingDataError
-        A run of a front end without dense maps, or one that left them out.
-    FormatError, DataError
     """
     run = open_run(path)
     root = Path(path)

@@ -183,13 +183,7 @@ class Run:
 
 
 def metric_value(metrics: pd.DataFrame, key: str) -> float:
-    """Value of one row of a table of metrics (``key, value, …``).
-
-    Raises
-    ------
-    KeyError
-        There is no such metric.
-    """
+    """Value of one row of a table of metrics (``key, value, …``)."""
     row = metrics[metrics["key"] == key]
     if row.empty:
         raise KeyError(key)

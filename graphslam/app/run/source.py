@@ -34,13 +34,6 @@ def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = Non
         What the run's ``config.toml`` says of it: ``source``, as it was given, and the digest ``log``.
     log : str, path or SensorLog, optional
         Where the log is now. Default: where it was; a relative path begins where the command is started.
-
-    Raises
-    ------
-    MissingDataError
-        It is not there any more.
-    DataError
-        Another log than that of the run.
     """
     try:
         source = load_log_source(said["source"] if log is None else log)

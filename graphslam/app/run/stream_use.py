@@ -24,7 +24,6 @@ class StreamUse:
 
     Parameters
     ----------
-    name : str
     role : {"input", "gps", "imu", "compass", "beacons", "unused"}
         What it was there for: ``input`` of the front end; something that the graph was given; or nothing in this run.
     offered : int
@@ -60,10 +59,8 @@ def stream_use(
 
     Parameters
     ----------
-    log : SensorLog
     graph : PoseGraph
         Finished; its ledger says what was spent.
-    settings : RunConfig
     dropped : mapping of str to int
         Records dropped by the front end and the graph, per ``"stream: reason"``.
     streams_used : frozenset of str

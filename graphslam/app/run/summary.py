@@ -172,7 +172,6 @@ def headline(
 
     Parameters
     ----------
-    findings : iterable of Finding
     facts : sequence of str
         What was made, in a few words each.
     judged : sequence of Judged

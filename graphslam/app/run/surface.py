@@ -40,14 +40,12 @@ class ScannedPath:
 
     Parameters
     ----------
-    scans : PointClouds or RangeScans
     path : Trajectory
         ``T_world_base`` in space.
     node_times, node_poses : (k,), (k, 7)
         In time order; a scan goes with the last node before it.
     node_covariances : (k, 6, 6), optional
         In the right tangent of each node.
-    stream : str
     """
 
     scans: PointClouds | RangeScans
@@ -58,13 +56,7 @@ class ScannedPath:
     stream: str = "scans"
 
     def inside(self) -> npt.NDArray[np.int64]:
-        """Numbers of the scans that lie within the path in time.
-
-        Raises
-        ------
-        DataError
-            None does.
-        """
+        """Numbers of the scans that lie within the path in time."""
         times = self.scans.times
         inside = (times >= self.path.times[0]) & (times <= self.path.times[-1])
         if isinstance(self.scans, RangeScans):
@@ -88,15 +80,12 @@ class RunSurface:
     ----------
     layer : SurfaceLayer
         A piece for each node of the graph.
-    mesh : Mesh
     owner : (v,)
         Node that each vertex hangs on, those of all sessions counted on; −1 none.
     session : (v,)
         Session of that node, in the order of the paths; −1 none.
     sigma : (v,)
         σ of its place that comes of the pose of that node [m]; NaN where it is not known.
-    scans : int
-    stream : str
     read_s, seconds : float
         CPU time to read the scans into pieces, and to make the surface of the pieces.
     """
@@ -183,13 +172,6 @@ def read_surface(
     ----------
     paths : sequence of ScannedPath
         One for each session.
-    config : SurfaceConfig, optional
-    progress : bool
-
-    Raises
-    ------
-    DataError
-        No scan within a path, or no surface in the scans.
     """
     layer = SurfaceLayer(config)
     covariances: dict[PieceId, Array] = {}

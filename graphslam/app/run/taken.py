@@ -97,13 +97,7 @@ def take(
 
 
 def write_taken(folder: Path, taken: Taken, generation: str) -> None:
-    """Write it into the folder of a run's files.
-
-    Raises
-    ------
-    FormatError
-        The name of a stream is no file name, or ``meta`` is not JSON.
-    """
+    """Write it into the folder of a run's files."""
     log = taken.log
     save_log(replace(log, streams={n: s for n, s in log.streams.items() if isinstance(s, KEPT)}), folder / INPUTS)
     arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
@@ -120,14 +114,7 @@ def write_taken(folder: Path, taken: Taken, generation: str) -> None:
 
 
 def read_taken(folder: Path) -> tuple[Taken, str | None]:
-    """Read it, and the generation that it is of.
-
-    Raises
-    ------
-    MissingDataError
-        It is not there: an older version wrote the folder.
-    FormatError
-    """
+    """Read it, and the generation that it is of."""
     if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
         raise MissingDataError(
             "the run does not hold what its graph was made of (taken.npz, inputs/)",

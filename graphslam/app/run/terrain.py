@@ -55,7 +55,6 @@ class RunTerrain:
     ----------
     layer : TerrainLayer
         A piece for each node of the graph, in the level frame.
-    map : TerrainMap
     rotation : (3, 3)
         From the frame of the run to the level one.
     path : (n, 3)
@@ -66,8 +65,6 @@ class RunTerrain:
         Points of the scans that were left out, because something that moved was there.
     read_s, seconds : float
         CPU time to read the lines into pieces, and to make the map of the pieces.
-    scans, lines : int
-    stream : str
     """
 
     layer: TerrainLayer
@@ -128,20 +125,11 @@ def terrain_of_run(
         Where the run's log is by now; default where it was.
     stream : str, optional
         Of point clouds or of an upright line laser; default the first of point clouds, else of lines.
-    vehicle : Vehicle, optional
     sensor_height : float, optional
         Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
         is taken to drive on the ground.
     tables : Tables, optional
         Default those of the package.
-    progress : bool
-
-    Raises
-    ------
-    RunFolderError, MissingDataError
-        No folder, no such log or stream.
-    DataError
-        Another log, a run in the plane, or no ground in the scans.
     """
     name, scans = scans_of_run(run, log, stream, what="terrain")
     return read_terrain(
@@ -188,7 +176,6 @@ def read_terrain(
 
     Parameters
     ----------
-    scans : PointClouds or RangeScans
     path : Trajectory
         ``T_world_base`` in space; the z axis of the world points upwards within 20°.
     node_times, node_poses : (k,), (k, 7)
@@ -198,11 +185,6 @@ def read_terrain(
         time are read without what stands where they are.
     stream, vehicle, sensor_height, tables, progress
         See :func:`terrain_of_run`.
-
-    Raises
-    ------
-    DataError
-        No scan within the path, no ground in the scans, or lines that are not upright.
     """
     chosen = vehicle or Vehicle()
     inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
@@ -300,7 +282,6 @@ class _Turns:
 
     Parameters
     ----------
-    scans : PointClouds
     at : (k,)
         Scans that are asked for, in this order.
     level : Trajectory
@@ -375,15 +356,7 @@ def _lines(scans: RangeScans, at: Ints, level: Trajectory, height: float) -> Sca
 
 
 def read_terrain_file(folder: Path) -> ClassGrid:
-    """The terrain of a run folder.
-
-    Raises
-    ------
-    MissingDataError
-        It was not made yet.
-    FormatError
-        Files that do not fit.
-    """
+    """The terrain of a run folder."""
     facts = read_json(folder / "terrain.json", fmt=FORMAT, shape={"rotation_level_run": [(float,) * 3]})
     a = read_npz(
         folder / "terrain.npz", fmt=FORMAT, fields={"origin": floats(2), "cell": floats(), "classes": ints("ny", "nx")}

@@ -65,7 +65,6 @@ class Figures:
     report : mapping
         ``run.json`` or ``merge.json``.
     metrics : mapping of str to float
-    events : sequence of mapping
     sessions : sequence of mapping
         Of a merge.
     """
@@ -134,7 +133,6 @@ def observed(
 
     Parameters
     ----------
-    streams : sequence of StreamUse
     noticed : sequence of Noticed
         Of the raw streams; what is bad in one that was not used is only worth a look.
     submaps : sequence of Submap
@@ -248,7 +246,6 @@ class Judged:
     code : {"chi2", "nees"}
     name : str
         ``χ²/dof``.
-    ratio, dof : float
     about : str
         Of what.
     """

@@ -73,7 +73,6 @@ class WithoutTruth:
 
         Parameters
         ----------
-        submaps : sequence of Submap
         refined : bool
             The result is a path refined by its scans. The factors of the graph were its start only, and its own noise
             was estimated from its own residuals, so that of all tests only those of fixes say anything of it.

@@ -36,13 +36,7 @@ def is_dense(run: Run) -> bool:
 
 
 def with_maps(run: Run) -> list[Submap]:
-    """The submaps of a run with their dense maps, along its refined path where it has one.
-
-    Raises
-    ------
-    DataError
-        A submap whose map is nowhere.
-    """
+    """The submaps of a run with their dense maps, along its refined path where it has one."""
     submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
         submaps = read_submaps(run.folder, load_grid=load_shelved)
@@ -74,11 +68,6 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
 
     Of a refined run the chain is that of its refined submaps, and nothing else: its re-entries and loops were made of
     the scans that the refinement spent, and enter no sum a second time.
-
-    Raises
-    ------
-    DataError
-        Submaps that cannot be placed, or a run that does not say how its submaps hang together.
     """
     config = back_end_config(run)
     begin = run.submaps[0].interval[0]

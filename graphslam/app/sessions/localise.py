@@ -146,13 +146,6 @@ def source_of(
         Of a run folder, only these submaps, which must follow one another.
     begin, end : float, optional
         Of a log [s].
-    reader : str, optional
-    reader_options : mapping, optional
-
-    Raises
-    ------
-    DataError
-        Keys that are not there, or not in a row; a stretch without records.
     """
     path = Path(source)
     if (outputs(path) / "run.json").is_file():
@@ -174,13 +167,7 @@ def source_of(
 
 
 def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
-    """Submaps that the front end of a run makes of a log, with the options of the run.
-
-    Raises
-    ------
-    MissingDataError
-        The log gives none.
-    """
+    """Submaps that the front end of a run makes of a log, with the options of the run."""
     folder = None if run.folder is None else Path(run.folder) / "config.toml"
     if folder is None or not folder.is_file():
         raise DataError("a run without a folder does not say its front end's options", where=run.name)

@@ -35,7 +35,6 @@ def align_runs(
 
     Parameters
     ----------
-    runs : list of Run
     names : list of str
         Of the runs, for messages.
     by : {"identity", "constellation"}
@@ -50,11 +49,6 @@ def align_runs(
         Start of every run in the first one's frame; None for the first.
     renamed : dict of int to dict of int to int
         Of every run, its landmarks' ids and those in the common graph.
-
-    Raises
-    ------
-    DataError
-        A run that shares fewer than two landmarks, or whose landmarks do not say how it lies; names it.
     """
     fresh = 1 + max((int(s.landmarks.ids.max(initial=-1)) for r in runs for s in r.submaps if s.landmarks), default=0)
     renamed: dict[int, dict[int, int]] = {}

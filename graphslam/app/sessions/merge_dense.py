@@ -37,11 +37,8 @@ class PlacedSession:
 
     Parameters
     ----------
-    name : str
-    run : Run
     session : DenseSession
         Its submaps with the keys and the clock of the common graph.
-    first_node : int
     attached : Attached or None
         How it hangs on another session; None for the one whose first base is fixed.
     trajectory : Trajectory
@@ -66,12 +63,8 @@ class MergedSubmaps:
 
     Parameters
     ----------
-    sessions : list of PlacedSession
     solution : Solution
         One least-squares problem over all chains.
-    graph : PoseGraph
-    metrics : DataFrame
-    report : dict
     """
 
     sessions: list[PlacedSession]
@@ -114,23 +107,14 @@ def merge_dense(
 
     Parameters
     ----------
-    runs : sequence of Run
     names : sequence of str
         Of the sessions, each once.
     by : {"auto", "places", "gps"}
         ``auto``: GPS where both have it, and then places that it brings together; else places.
-    solver : str
     config : TieConfig, optional
         When ties by places are believed.
     progress : bool
         Show progress bars on stderr.
-
-    Raises
-    ------
-    DataError
-        A run that nothing ties to the others; names it, and says what was tried. Nothing is guessed.
-    ConfigError
-        An unknown option.
     """
     if by not in ("auto", "places", "gps"):
         raise ConfigError(f"by = {by!r}; known for dense submaps: auto, places, gps")

@@ -39,14 +39,8 @@ def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
 
     Parameters
     ----------
-    path : path
     anew : bool
         One that holds a merge already is taken too.
-
-    Raises
-    ------
-    RunFolderError
-        The folder holds something already, cannot be made, or is being written by another process.
     """
     folder = make_folder(path)
 

@@ -30,15 +30,6 @@ def surface_of_sessions(
         Of runs in space.
     logs : sequence of card name, folder, or SensorLog; optional
         Where the logs of the runs are by now, in the order of the sessions; default where they were.
-    config : SurfaceConfig, optional
-    progress : bool
-
-    Raises
-    ------
-    ConfigError
-        Runs that were merged by landmarks: they have no scans of surfaces; or not one log of each session.
-    RunFolderError, MissingDataError, DataError
-        See :func:`graphslam.app.run.terrain.terrain_of_run`.
     """
     if not isinstance(merged, MergedSubmaps):
         raise ConfigError("a surface of runs that are merged by landmarks; wanted runs of dense submaps in space")

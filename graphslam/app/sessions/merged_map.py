@@ -27,7 +27,6 @@ class Session:
     ----------
     name : str
         Unique among the sessions.
-    run : Run
     keys : tuple of int
         Keys of its submaps in the common graph.
     first_node : int
@@ -52,15 +51,11 @@ class MergedMap:
 
     Parameters
     ----------
-    sessions : list of Session
     landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
     landmark_sessions : (n,) int64
         How many sessions saw it.
     solution : Solution
         One least-squares problem over all chains.
-    graph : PoseGraph
-    metrics : DataFrame
-    report : dict
     """
 
     sessions: list[Session]

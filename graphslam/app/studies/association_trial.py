@@ -89,13 +89,7 @@ def run_trial(config: TrialConfig, seed: int) -> list[Measurement]:
 
 @dataclass
 class Trial:
-    """The log of one run, and every algorithm on it.
-
-    Parameters
-    ----------
-    config : TrialConfig
-    seed : int
-    """
+    """The log of one run, and every algorithm on it."""
 
     config: TrialConfig
     seed: int

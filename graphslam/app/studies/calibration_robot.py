@@ -73,9 +73,6 @@ def drive(robot: DrawnRobot, seed: int, seconds: float = 120.0, *, rate: float =
 
     Parameters
     ----------
-    robot : DrawnRobot
-    seed : int
-    seconds : float
     rate : float
         Records of odometry a second.
     scans : float

@@ -103,7 +103,6 @@ def scanned(
 
     Parameters
     ----------
-    source, presets, frontend : str
     added : Added or None
         None: drawn by the seed.
     first : float or None
@@ -111,7 +110,6 @@ def scanned(
     ways : sequence of str
         Maps that are made: of the log as recorded by its ``preset``, and as if it were unknown (``recorded``); with the
         errors as if it were unknown (``calibrated``), and by the preset (``stated``).
-    seed : int
     """
     recorded = load_log_source(source)
     begin = float(recorded["reference"].times[0])

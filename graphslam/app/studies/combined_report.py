@@ -128,7 +128,6 @@ def online_consistency(table: pd.DataFrame, quantity: str = "pose_nees") -> pd.D
 
     Parameters
     ----------
-    table : DataFrame
     quantity : str
         ``pose_nees``, or ``pose_nees_tangent``: the same covariance, the error taken as a right perturbation.
     """

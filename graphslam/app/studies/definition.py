@@ -21,12 +21,7 @@ from graphslam.evaluate.montecarlo import Measurement
 
 @runtime_checkable
 class StudyDefinition(Protocol):
-    """A study: its worlds, one trial of each as a function of a seed, and what is made of the table.
-
-    Attributes
-    ----------
-    name, description : str
-    """
+    """A study: its worlds, one trial of each as a function of a seed, and what is made of the table."""
 
     name: str
     description: str

@@ -53,8 +53,6 @@ class TrialRecord:
 
     Parameters
     ----------
-    world : str
-    run, seed : int
     error : str or None
         Why it failed; then it has no figures.
     details : str or None
@@ -96,12 +94,7 @@ class Collected:
 
 
 class StudyFolder:
-    """Starts, reopens, fills and reads the folder of one study.
-
-    Parameters
-    ----------
-    path : path
-    """
+    """Starts, reopens, fills and reads the folder of one study."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -113,16 +106,8 @@ class StudyFolder:
 
         Parameters
         ----------
-        path : path
         identity : mapping
             What must be the same for trials to belong together (JSON values): name, seed, configuration, versions.
-
-        Raises
-        ------
-        RunFolderError
-            The folder holds something else or another study, cannot be made, or is being written by another process.
-        FormatError
-            Its ``study.json`` is damaged.
         """
         folder = cls(path)
         make_folder(folder.path)
@@ -141,12 +126,7 @@ class StudyFolder:
             yield folder
 
     def identity(self) -> dict[str, Any]:
-        """What the folder's ``study.json`` says.
-
-        Raises
-        ------
-        MissingDataError, FormatError
-        """
+        """What the folder's ``study.json`` says."""
         check_links(self.path)
         value = read_json(self.path / "study.json", fmt=STUDY_FORMAT, shape=_IDENTITY)
         value.pop("format")
@@ -204,13 +184,7 @@ class StudyFolder:
         write_npz(path, arrays)
 
     def read_trial(self, path: Path) -> TrialRecord:
-        """Read one trial.
-
-        Raises
-        ------
-        FormatError
-            Damaged, or the trial of another place.
-        """
+        """Read one trial."""
         a = read_npz(path, fmt=TRIAL_FORMAT, fields=_TRIAL)
         world, run = str(a["world"]), int(a["run"])
         for name, names in (("algorithm", "algorithms"), ("quantity", "quantities")):

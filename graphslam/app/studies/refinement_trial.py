@@ -88,12 +88,7 @@ def drawn_garage(config: GridTrialConfig, seed: int) -> GridTrialConfig:
 
 @dataclass
 class RefinementTrial(GraphTrial):
-    """SegSLAM of a run, its graph, and refinements of that.
-
-    Parameters
-    ----------
-    study : RefinementTrialConfig
-    """
+    """SegSLAM of a run, its graph, and refinements of that."""
 
     study: RefinementTrialConfig = field(kw_only=True)
 

@@ -34,7 +34,6 @@ class ScaleTrialConfig:
     Parameters
     ----------
     what : {"methods", "approximations", "stability"}
-    world : LapsConfig
     wrong : tuple of float
         Shares of the landmarks of several passes that are merged with another one.
     kept : tuple of float

@@ -49,7 +49,6 @@ class Judge:
 
     Parameters
     ----------
-    truth : Truth
     times : (m,)
         Stamps at which the submaps end.
     distance : float

@@ -94,12 +94,7 @@ class BuiltGraph:
 
 @dataclass
 class GraphTrial(GridTrial):
-    """The filters of a run, and the graph of what the last SegSLAM settled.
-
-    Parameters
-    ----------
-    graph : GraphTrialConfig
-    """
+    """The filters of a run, and the graph of what the last SegSLAM settled."""
 
     graph: GraphTrialConfig = field(kw_only=True)
 

@@ -67,12 +67,7 @@ class SegSlamGarage(GridStudy):
     """See the module."""
 
     def settings(self, world: str) -> GridTrialConfig:
-        """World, robot and filters of a trial.
-
-        Raises
-        ------
-        UnknownNameError
-        """
+        """World, robot and filters of a trial."""
         known = {**WORLDS, **QUICK_WORLDS}
         if world not in known:
             raise UnknownNameError("world", world, known)

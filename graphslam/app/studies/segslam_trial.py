@@ -53,13 +53,7 @@ PATH_POINTS = 100
 
 
 def family_of(algorithm: str) -> tuple[str, int]:
-    """``rbpf`` or ``segslam``, and the number of particles; ``dead-reckoning`` and 0.
-
-    Raises
-    ------
-    ConfigError
-        Another name.
-    """
+    """``rbpf`` or ``segslam``, and the number of particles; ``dead-reckoning`` and 0."""
     if algorithm == DEAD_RECKONING:
         return algorithm, 0
     found = re.fullmatch(r"(rbpf|segslam)-([1-9]\d*)", algorithm)
@@ -141,13 +135,7 @@ class Outcome:
 
 @dataclass
 class GridTrial:
-    """The steps of one run, and every algorithm on them.
-
-    Parameters
-    ----------
-    config : GridTrialConfig
-    seed : int
-    """
+    """The steps of one run, and every algorithm on them."""
 
     config: GridTrialConfig
     seed: int

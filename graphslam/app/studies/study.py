@@ -35,8 +35,6 @@ class Study:
 
     Parameters
     ----------
-    definition : StudyDefinition
-    folder : StudyFolder
     identity : dict
         Name, seed, quick, fingerprints of the worlds' configurations, versions.
     table : DataFrame
@@ -77,13 +75,7 @@ class Study:
         return tuple(w for w in self.definition.worlds(bool(self.identity["quick"])) if w in present)
 
     def report(self) -> dict[str, pd.DataFrame]:
-        """The study's named summary tables.
-
-        Raises
-        ------
-        DataError
-            Too little is done to say anything.
-        """
+        """The study's named summary tables."""
         return self.definition.report(self.table, self.timings)
 
     def plot_consistency(

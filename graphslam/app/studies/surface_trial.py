@@ -198,13 +198,7 @@ def _follow(name: str, layer: SurfaceLayer, c: SurfaceTrialConfig, rebuild_s: fl
 
 
 class Judge:
-    """Compares surfaces with the truth, both ways.
-
-    Parameters
-    ----------
-    seen : Seen
-    r : Generator
-    """
+    """Compares surfaces with the truth, both ways."""
 
     def __init__(self, seen: Seen, r: np.random.Generator) -> None:
         self.seen, self.r = seen, r

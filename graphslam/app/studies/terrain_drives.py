@@ -167,7 +167,6 @@ class Navigator:
     ----------
     name : str
         Of the map, see the module.
-    config : DriveTrialConfig
     start : (2,)
         There the robot stands: what is under it is free.
     """

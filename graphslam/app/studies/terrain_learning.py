@@ -86,18 +86,10 @@ def learn_tables(
     ----------
     seeds : sequence of int
         Of the teaching streets; each is driven through once for every target.
-    targets : sequence of str
     config : TerrainTrialConfig, optional
         Robot and vehicle.
     progress : bool
         Show a progress bar on stderr.
-
-    Raises
-    ------
-    ConfigError
-        No drives.
-    DataError
-        Too few cells to learn from.
     """
     c = config or TerrainTrialConfig()
     if not seeds or not targets:

@@ -28,7 +28,6 @@ class TrustWorld:
     ----------
     robot : ChartConfig
         With the noise as it is stated.
-    front_end : str
     understated : float
         True over stated σ of odometry and sightings.
     scale : float

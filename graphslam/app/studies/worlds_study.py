@@ -22,7 +22,6 @@ class WorldsStudy(Generic[C]):
 
     Parameters
     ----------
-    name, description : str
     full, quick : mapping of world to its configuration
     trials : int
         Of each world where none are asked for; two in quick mode.

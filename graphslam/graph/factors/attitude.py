@@ -87,7 +87,6 @@ class AttitudeRecord:
 
     Parameters
     ----------
-    node : int
     direction : (3,)
         Unit vector of gravity (down) in the node's frame.
     whitener : (2, 2)

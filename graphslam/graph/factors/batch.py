@@ -89,7 +89,6 @@ class FactorBatch(ABC):
     ----------
     records : sequence of records
         Of :attr:`record`, possibly none.
-    layout : Layout
 
     Attributes
     ----------
@@ -290,13 +289,7 @@ def register_factor(batch: type[FactorBatch]) -> type[FactorBatch]:
 
 
 def batch_of(record_type: type) -> type[FactorBatch]:
-    """The batch of a type of record.
-
-    Raises
-    ------
-    ConfigError
-        Nobody registered that kind of factor.
-    """
+    """The batch of a type of record."""
     if record_type not in _BATCHES:
         known = ", ".join(t.__name__ for t in _BATCHES)
         raise ConfigError(f"no kind of factor is registered for {record_type.__name__}; known: {known}")

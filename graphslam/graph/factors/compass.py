@@ -41,8 +41,6 @@ class CompassRecord:
 
     Parameters
     ----------
-    node : int
-    time : float
     axis : (dim,)
         The body's x axis in the node's frame, a unit vector.
     heading : float
@@ -129,7 +127,6 @@ class DeclinationRecord:
 
     Parameters
     ----------
-    compass : int
     declination, sigma : float
         [rad]
     """

@@ -104,7 +104,6 @@ class BiasPriorRecord:
 
     Parameters
     ----------
-    bias : int
     sigma : float
         [m]
     before : int or None

@@ -39,7 +39,6 @@ class SubmapRecord:
 
     Parameters
     ----------
-    factor_id, submap_key, start : int
     landmark_ids : (n,) int64
         Graph landmark of every entry; an id may stand twice.
     z : (3 + 2n,)

@@ -34,12 +34,10 @@ class OdometerRecord:
 
     Parameters
     ----------
-    i, j : int
     odometer : int
         Row of its bias of the turn rate [rad/s] and scale error.
     twist : (6,)
         Rotation [rad] and translation [m] from i to j, as measured.
-    seconds : float
     whitener : (6, 6)
         In the right tangent at j.
     """
@@ -106,7 +104,6 @@ class OdometerPriorRecord:
 
     Parameters
     ----------
-    odometer : int
     sigmas : (2,)
         [rad/s], and of the scale.
     """

@@ -45,8 +45,6 @@ class PseudorangeRecord:
 
     Parameters
     ----------
-    node : int
-    time : float
     arm : (3,)
         Antenna in the node's frame [m].
     satellite : (3,)
@@ -142,7 +140,6 @@ class ClockRecord:
     ----------
     before, after : int
         Rows of ``clock``.
-    seconds : float
     offset_walk : float
         Of the offset [m/√s].
     drift_walk : float
@@ -210,7 +207,6 @@ class SatelliteBiasRecord:
     ----------
     before : int or None
         Row of ``satbias``; None: the first one.
-    bias : int
     keep : float
         ``exp(-Δt/τ)``.
     sigma : float

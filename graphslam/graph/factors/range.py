@@ -36,7 +36,6 @@ class RangeRecord:
 
     Parameters
     ----------
-    i, j : int
     arm_i, arm_j : (dim,)
         Antennas in the frames of the nodes.
     distance, sigma : float
@@ -75,7 +74,6 @@ class BeaconRangeRecord:
     ----------
     node, beacon : int
         Number of the node; row of the beacon.
-    time : float
     arm : (dim,)
     distance, sigma : float
         [m]

@@ -114,13 +114,7 @@ class SightingBatch(UniformBatch):
 
     @cached_property
     def natives(self) -> list[gtsam.NonlinearFactor]:
-        """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular.
-
-        Raises
-        ------
-        SolverError
-            GTSAM has none for sightings by x and y.
-        """
+        """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular."""
         if not self._polar.all():
             raise SolverError("GTSAM has no native factor for Cartesian landmark observations")
         nodes, rows = self._rows.T

@@ -29,12 +29,7 @@ _BIAS = 1 << 20
 
 
 class SurfaceLayer:
-    """Pieces at poses, and the signed distance that they make.
-
-    Parameters
-    ----------
-    config : SurfaceConfig, optional
-    """
+    """Pieces at poses, and the signed distance that they make."""
 
     def __init__(self, config: SurfaceConfig | None = None) -> None:
         self.config = config or SurfaceConfig()

@@ -49,13 +49,7 @@ class Mesh:
         return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
     def samples(self, number: int, rng: np.random.Generator) -> Array:
-        """Points ``(number, 3)``, evenly over the area.
-
-        Raises
-        ------
-        DataError
-            A mesh without area.
-        """
+        """Points ``(number, 3)``, evenly over the area."""
         areas = self._areas()
         if not areas.sum() > 0.0:
             raise DataError("a mesh without area has no points", got=f"{len(self.triangles)} triangles")
@@ -236,17 +230,7 @@ def position_sigma(mesh: Mesh, layer: SurfaceLayer, covariances: Mapping[PieceId
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike[str], colours: npt.NDArray[np.uint8] | None = None) -> Path:
-    """Write PLY (binary), GLB or OBJ by the ending of the path; ``colours (v, 3)`` or ``(v, 4)`` of the vertices.
-
-    Raises
-    ------
-    FormatError
-        Another ending.
-    DataError
-        No triangle.
-    MissingExtraError
-        The extra ``surface`` is not installed.
-    """
+    """Write PLY (binary), GLB or OBJ by the ending of the path; ``colours (v, 3)`` or ``(v, 4)`` of the vertices."""
     trimesh = import_extra("trimesh", "a file of a surface")
     target = Path(path)
     if target.suffix not in FORMATS:

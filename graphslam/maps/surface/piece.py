@@ -157,13 +157,7 @@ def normals_of(points: Array, towards: Array, config: SurfaceConfig) -> Array:
 
 
 def piece_of_scans(scans: Iterable[Scan], pose: Array, config: SurfaceConfig) -> SurfacePiece:
-    """The piece of a node at ``pose`` ``(7,)`` of scans whose points and scanner are in the world frame.
-
-    Raises
-    ------
-    DataError
-        Points that are not finite, or of another shape.
-    """
+    """The piece of a node at ``pose`` ``(7,)`` of scans whose points and scanner are in the world frame."""
     parts, origins = [], []
     to_node = se3.se3_inverse(np.asarray(pose, dtype=np.float64))
     for points, origin in scans:

@@ -91,13 +91,7 @@ def level_rotation(up: Array) -> npt.NDArray[np.float64]:
 
 
 def common_up(planes: list[GroundPlane | None]) -> Array:
-    """Where up is for a whole path: the mean of its planes' normals, those that differ by more than 10° left out.
-
-    Raises
-    ------
-    DataError
-        Ground in fewer than three scans.
-    """
+    """Where up is for a whole path: the mean of its planes' normals, those that differ by more than 10° left out."""
     normals = np.array([p.up for p in planes if p is not None])
     if len(normals) < 3:
         raise DataError(

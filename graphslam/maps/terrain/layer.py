@@ -80,9 +80,6 @@ class TerrainLayer:
 
     Parameters
     ----------
-    tables : Tables
-    vehicle : Vehicle
-    sensor : LineSensor
     cells : tuple of float, optional
         Widths of the cells of the bands [m].
     """
@@ -96,13 +93,7 @@ class TerrainLayer:
     def read(
         self, name: PieceId, lines: Iterable[ScanLines], pose: Array, config: DetectorConfig | None = None
     ) -> TerrainPiece:
-        """Make the piece of a node of lines in the world frame, the node at ``pose`` ``(7,)``.
-
-        Raises
-        ------
-        DataError
-            The piece is there already.
-        """
+        """Make the piece of a node of lines in the world frame, the node at ``pose`` ``(7,)``."""
         if name in self.pieces:
             raise DataError(f"the terrain of node {name!r} is there already")
         edges = self.sensor.band_edges(self.cells)
@@ -118,11 +109,6 @@ class TerrainLayer:
         """Put pieces at other poses ``(7,)``; number of those that moved.
 
         Only what the moved ones say is taken out of the map and put in at its new place.
-
-        Raises
-        ------
-        DataError
-            A node without a piece.
         """
         strange = [name for name in poses if name not in self.pieces]
         if strange:
@@ -151,13 +137,7 @@ class TerrainLayer:
         return max(tilts, default=0.0)
 
     def pyramid(self) -> Pyramid:
-        """All pieces at their poses.
-
-        Raises
-        ------
-        GridError
-            No piece says anything, or they lie too far apart.
-        """
+        """All pieces at their poses."""
         if self._made is None:
             box = self._box({})
             if box is None:

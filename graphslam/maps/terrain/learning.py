@@ -30,7 +30,6 @@ def count_values(rows: Rows, labels: npt.NDArray[np.int8], bands: int) -> Ints:
     labels : (2, k)
         For steps and for support, of the cell of each statement: 0 free, 1 free on a slope that may be driven, 2 a
         hazard, −1 neither.
-    bands : int
     """
     out = np.zeros((2, 3, bands, BINS), np.int64)
     for channel in (0, 1):
@@ -76,11 +75,6 @@ def fit_weights(
         The truth.
     slope : (k,) bool, optional
         Free cells on a slope that may be driven.
-
-    Raises
-    ------
-    DataError
-        Fewer than 20 cells of either kind.
     """
     if min(int(hazard.sum()), int((~hazard).sum())) < _LEAST:
         raise DataError(

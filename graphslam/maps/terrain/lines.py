@@ -66,10 +66,6 @@ class ScanLines:
         Of the sensor [m].
     feet : (n,)
         Height of the ground under the sensor [m].
-
-    Raises
-    ------
-    GeometryError, DataError
     """
 
     points: Array
@@ -194,13 +190,11 @@ def observe(
 
     Parameters
     ----------
-    lines : ScanLines
     edges, cells : (b,)
         Ranges at which the bands end, and widths of their cells [m].
     vehicle : Vehicle
         Its clearance and height tell steps, obstacles and what is above reach apart; its slope is no step. A fall
         begins on ground that it can be on, not on what it does not climb and is narrower than it.
-    config : DetectorConfig, optional
 
     Yields
     ------

@@ -72,13 +72,7 @@ class CostMap:
     known: npt.NDArray[np.bool_]
 
     def index(self, point: Array) -> tuple[int, int]:
-        """Row and column of the cell of a point ``(2,)``.
-
-        Raises
-        ------
-        DataError
-            Outside the map.
-        """
+        """Row and column of the cell of a point ``(2,)``."""
         ix, iy = (math.floor(v) for v in (np.asarray(point, dtype=np.float64) - self.origin) / self.cell)
         ny, nx = self.cost.shape
         if not (0 <= ix < nx and 0 <= iy < ny):
@@ -119,7 +113,6 @@ def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
 
     Parameters
     ----------
-    costs : CostMap
     start : (2,)
         [m]. It may lie in closed cells, because a vehicle stands where it stands: then the way begins with a straight
         line to the nearest open cell, if that is within 0.5 m and no hazard lies on it.
@@ -176,21 +169,11 @@ def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "
 
     Parameters
     ----------
-    costs : CostMap
     path : path
         Ending in ``.yaml``.
     mode : {"raw", "scale"}
         ``raw``: a PGM, whose bytes are the values, 0 to 100, and 255, unknown. ``scale``: a PNG, a grey a cost, where
         what is unknown is transparent; a PGM cannot say that in this mode.
-
-    Returns
-    -------
-    (yaml, image) : paths
-
-    Raises
-    ------
-    FormatError
-        Another ending or mode.
     """
     target = Path(path)
     if target.suffix != ".yaml":

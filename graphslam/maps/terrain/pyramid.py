@@ -126,9 +126,6 @@ class Pyramid:
     ----------
     box : (x0, y0, x1, y1)
         What it covers [m]; grown to whole cells of the coarsest band.
-    tables : Tables
-    vehicle : Vehicle
-    sensor : LineSensor
     cells : tuple of float, optional
         Widths of the cells of the bands [m]; the same width for all is a map of a single resolution, in which all
         bands are *added*.

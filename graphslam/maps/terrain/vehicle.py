@@ -101,7 +101,6 @@ class LineSensor:
 
         Parameters
         ----------
-        vehicle : Vehicle
         depth : float
             [m]; without end by default, which is the limit for any fall.
         """
@@ -124,7 +123,6 @@ class LineSensor:
 
         Parameters
         ----------
-        vehicle : Vehicle
         depth : float, optional
             Of the fall [m]; default the vehicle's clearance, over which it would hang.
         """

@@ -32,7 +32,6 @@ class BatchProblem:
 
     Parameters
     ----------
-    network : PoseNetwork
     used : (m + k,) bool, optional
         Which edges and observations enter; all of them if not given.
     """
@@ -57,13 +56,7 @@ class BatchProblem:
         return float(2.0 * self.graph.error(values))
 
     def newton_step(self, values: gtsam.Values) -> tuple[gtsam.Values, float, float]:
-        """One full Gauss-Newton step, the fall of the objective that it predicts, and the objective after it.
-
-        Raises
-        ------
-        RuntimeError
-            GTSAM's, if the linear system is singular to working precision.
-        """
+        """One full Gauss-Newton step, the fall of the objective that it predicts, and the objective after it."""
         params = gtsam.GaussNewtonParams()
         params.setLinearSolverType(f"MULTIFRONTAL_{self.factorization}")
         params.setOrdering(self._ordering)
@@ -92,7 +85,6 @@ class BatchProblem:
 
         Returns
         -------
-        values : gtsam.Values
         objectives : list of float
             After every step taken.
         steps : int

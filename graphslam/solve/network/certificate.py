@@ -130,11 +130,6 @@ def isotropic(network: PoseNetwork) -> tuple[Array, Array]:
     """κ and τ of every edge ``(m,)`` each: the isotropic noise with the same total variance.
 
     ``‖R_j - R_i Z‖² = 2 θ²`` to second order, so ``κ = 1/(2 σ²)``.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Singular information.
     """
     w = np.linalg.eigvalsh(network.information)
     if (w[:, 0] <= 1e-12 * w[:, -1]).any():

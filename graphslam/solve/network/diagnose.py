@@ -19,13 +19,7 @@ from graphslam.graph.variables import Values, split_name
 
 
 def check_determined(network: PoseNetwork, flat: FlatGraph) -> None:
-    """Raise if some vertex or landmark is not connected to an anchor by measurements.
-
-    Raises
-    ------
-    IndeterminateError
-        ``variables`` names every one of them; the message says what would fix it.
-    """
+    """Raise if some vertex or landmark is not connected to an anchor by measurements."""
     lost, islands = unreached(flat)
     if lost:
         names = _in_words(network, lost)
@@ -41,11 +35,6 @@ def check_full_rank(network: PoseNetwork, flat: FlatGraph, values: Values) -> No
     """Raise if measurements with rank-deficient information leave a direction free.
 
     Costs nothing where every information matrix has full rank.
-
-    Raises
-    ------
-    IndeterminateError
-        Naming the vertices that move most in the free direction.
     """
     pivots = (np.diagonal(f.whiteners, axis1=1, axis2=2) for f in flat.batches if isinstance(f, UniformBatch))
     if all((np.abs(p) > 1e-12 * np.abs(p).max(axis=1, keepdims=True)).all() for p in pivots):

@@ -21,13 +21,7 @@ from graphslam.graph.variables import gtsam_key
 
 
 def measured_factors(flat: FlatGraph) -> list[list[gtsam.NonlinearFactor]]:
-    """Native factors of the edges, and of the observations.
-
-    Raises
-    ------
-    SolverError
-        Cartesian observations: GTSAM has no native factor for them.
-    """
+    """Native factors of the edges, and of the observations."""
     found = [cast("BetweenBatch | SightingBatch", f).natives for f in flat.batches]
     return [found[0], found[1] if len(found) > 1 else []]
 

@@ -44,9 +44,6 @@ class FullBatch:
         Measured minus free scalars.
     covariance : JointCovariance
         The poses are those of the *sensor* where it is not at the base.
-    iterations : int
-    converged : bool
-    seconds : float
     """
 
     poses: Array
@@ -98,18 +95,6 @@ def full_batch(
         Bases at the scans in the frame of the first base. Dead reckoning over kilometres is too poor a start: give the
         path of a solved submap graph.
     initial_landmarks : mapping of id to (2,)
-    max_iterations : int
-
-    Returns
-    -------
-    FullBatch
-
-    Raises
-    ------
-    DataError
-        Lengths differ, no identities, or a landmark without a start.
-    SolverError
-        Gauss-Newton finds no minimum.
     """
     start = time.perf_counter()
     u, Q = np.asarray(increments, dtype=np.float64), np.asarray(covariances, dtype=np.float64)

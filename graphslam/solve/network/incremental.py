@@ -88,13 +88,7 @@ def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
 
 
 def run_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, progress: bool = False) -> gtsam.Values:
-    """:func:`feed_isam2`, with QR where Cholesky fails on the way (large or badly scaled information).
-
-    Raises
-    ------
-    IndeterminateError
-        With QR too.
-    """
+    """:func:`feed_isam2`, with QR where Cholesky fails on the way (large or badly scaled information)."""
     options = options or Isam2Options()
     try:
         return feed_isam2(network, options, progress=progress)
@@ -110,12 +104,6 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
 
     A new pose starts from the current estimate of the neighbour with the nearest id, composed with the measurement;
     a new landmark from the pose that first sees it.
-
-    Raises
-    ------
-    IndeterminateError
-        iSAM2 met a system that does not determine a variable. (Its object is then dead and dropped here:
-        ``ISAM2.update`` is not exception-safe.)
     """
     options = options or Isam2Options()
     isam = gtsam.ISAM2(options.params())

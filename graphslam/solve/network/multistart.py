@@ -39,10 +39,8 @@ class StartReport:
 
     Parameters
     ----------
-    name : str
     objective_initial, objective : float
         Before and after descent.
-    iterations : int
     status : str
         "converged", "rejected" (could not get below another start), "stalled", "out of iterations",
         "same as …" (not tried) or "failed".
@@ -144,11 +142,8 @@ class Starts:
 
     Parameters
     ----------
-    problem : Problem
-    best : Optimum
     start : str
         Which won.
-    reports : tuple of StartReport
     doubt : str
         What spoke against the first start's answer, so that it was certified or the others were tried; empty if
         nothing did, or if starts were named.
@@ -215,13 +210,6 @@ def best_of_starts(
         How it is solved; :func:`make_problem` if not given.
     certified : callable, optional
         Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
-
-    Raises
-    ------
-    UnknownNameError
-        For a start that does not exist.
-    IndeterminateError
-        If every start ends in a singular system.
     """
     chosen = tuple(names) if names is not None else default_starts(network)
     for name in chosen:

@@ -90,13 +90,6 @@ def truncated_least_squares(
     noise_scale : float, optional
         s², true over stated variance of the edges. Estimated from the network if not given. Observations of landmarks
         are always taken at their word.
-
-    Raises
-    ------
-    ConfigError
-        Probability outside (0, 1), or a scale that is not positive.
-    IndeterminateError
-        No start could be made.
     """
     if not 0.0 < probability < 1.0:
         raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")

@@ -54,7 +54,6 @@ class NetworkSolution:
     ----------
     network : PoseNetwork
         What was solved.
-    solver : str
     poses : (n, 3) or (n, 7)
     landmarks : (l, 2)
     objective : float
@@ -63,7 +62,6 @@ class NetworkSolution:
         The same at what the file says: its values, or its odometry chain if it has edges only.
     iterations : int
         Steps of the descent that won (all solvers count linear solves of the whole network).
-    seconds : float
     converged : bool
         At a stationary point (the decrement is negligible) *and* not above the best objective that any start
         reached. For gnc: at a stationary point of the inliers' objective, and not where most loops contradict each
@@ -181,7 +179,6 @@ def solve_network(
 
     Parameters
     ----------
-    network : PoseNetwork
     solver : {"lm", "isam2", "gnc", "pcg"}
         Key of :data:`SOLVERS`.
     starts : sequence of str or "all", optional
@@ -197,13 +194,6 @@ def solve_network(
         isam2: ``relinearise`` (True: close the gap), ``batch``, ``relinearize_threshold``, ``relinearize_skip``;
         gnc: ``inlier_probability`` (0.9999), ``trust_odometry`` (True), ``noise_scale`` (true over stated variance;
         None: estimated); pcg: ``tolerance``, ``max_iterations``.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-        Unknown solver, start or option.
-    IndeterminateError
-        Variables that the measurements do not determine, by name.
     """
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)

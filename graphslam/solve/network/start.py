@@ -130,10 +130,6 @@ def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
     one cycle. In 2-D the residual angles around it must add up to less than half a turn; in 3-D the product of the
     residual rotations, each lifted to the nearer of its two quaternions, must have the sign of what was measured (two
     turns are none there). A cycle whose measurements miss by more than a third of a turn decides nothing.
-
-    Returns
-    -------
-    wound, undecided, cycles : int
     """
     tree, (i, j) = spanning_tree(network), network.edges.T
     branch = tree.edge >= 0

@@ -53,7 +53,6 @@ class AxesCheck:
         By how much the residuals of the stated mounting are larger, in units of the noise that the best leaves (χ²).
     alike : int
         Ways that explain the readings as well as the best one.
-    windows : int
     sensor : {"both", "accelerometer", "gyro"}
         Whose readings A explains.
     turns : (float, float) or None
@@ -82,12 +81,7 @@ class AxesCheck:
         return ", ".join(said)
 
     def raise_if_wrong(self, where: str = "imu") -> None:
-        """Raise if the stated mounting is contradicted.
-
-        Raises
-        ------
-        DataError
-        """
+        """Raise if the stated mounting is contradicted."""
         if self.wrong:
             several = "" if self.alike == 1 else f" (or one of {self.alike - 1} others that fit as well)"
             whose = "" if self.sensor == "both" else f" of the {self.sensor}"
@@ -106,7 +100,6 @@ def check_imu_axes(
 
     Parameters
     ----------
-    imu : Imu
     path : Trajectory
         ``T_world_base``, z up.
     window : float
@@ -115,11 +108,6 @@ def check_imu_axes(
         The stated mounting is contradicted if its χ² exceeds that of the best explanation by this.
     force_sigma : float
         What accelerations leave in the mean specific force of a window at least [m/s²].
-
-    Raises
-    ------
-    DataError
-        Path and readings share fewer than ten windows.
     """
     begin, end = max(imu.times[0], path.times[0]), min(imu.times[-1], path.times[-1])
     n = int((end - begin) // window)

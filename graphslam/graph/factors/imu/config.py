@@ -74,7 +74,6 @@ class Place:
 
     Parameters
     ----------
-    time : float
     T_node_body : (7,)
     covariance : (6, 6)
         Right tangent at the body.
@@ -125,13 +124,7 @@ def places_of(submaps: Sequence[SubmapNode], window: float) -> dict[int, Place]:
 
 
 def path_of(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
-    """Path of the body in the level frame at the first base, by rigid submaps at their nodes.
-
-    Raises
-    ------
-    DataError
-        No submap has a path.
-    """
+    """Path of the body in the level frame at the first base, by rigid submaps at their nodes."""
     times, poses = [np.zeros(0)], [np.zeros((0, 7))]
     level = SE3.identity.copy()
     if values.tilt is not None:

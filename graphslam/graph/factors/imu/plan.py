@@ -94,13 +94,7 @@ def window_of(t: float, cfg: ImuConfig) -> tuple[float, float]:
 
 
 def joined(old: Imu, new: Imu, stream: str) -> Imu:
-    """One IMU's readings in two portions.
-
-    Raises
-    ------
-    DataError
-        Readings that were given before, or another unit.
-    """
+    """One IMU's readings in two portions."""
     if len(new.times) == 0:
         return old
     if new.times[0] <= old.times[-1]:

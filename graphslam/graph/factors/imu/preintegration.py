@@ -78,18 +78,10 @@ def preintegrate(imu: Imu, begin: ArrayLike, end: ArrayLike, bias: ArrayLike = 0
 
     Parameters
     ----------
-    imu : Imu
     begin, end : (k,)
         ``begin < end`` [s], inside the readings.
     bias : (6,) or (k, 6)
         Of gyro and accelerometer.
-
-    Raises
-    ------
-    DataError
-        A span that ends before it begins or reaches beyond the readings.
-    ConfigError
-        Gyro or accelerometer without noise.
     """
     from graphslam.graph.factors.imu.imu_kernels import preintegrate_spans  # numba is slow to load
 
@@ -123,10 +115,8 @@ def mean_force(imu: Imu, at: Array, half: float) -> tuple[Array, npt.NDArray[np.
 
     Parameters
     ----------
-    imu : Imu
     at : (k,)
         With ``half`` seconds of readings before and after.
-    half : float
 
     Returns
     -------

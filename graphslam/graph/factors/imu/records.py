@@ -14,7 +14,6 @@ class ImuRecord:
 
     Parameters
     ----------
-    stream : str
     i, j : int
         Nodes.
     interval : (t_i, t_j)
@@ -124,8 +123,6 @@ class ForceRecord:
 
     Parameters
     ----------
-    node : int
-    time : float
     bias : int
         Row of :attr:`~graphslam.graph.variables.Values.imu_biases`.
     T_node_imu : (7,)
