@@ -3,7 +3,7 @@
 from graphslam.core.face import face
 
 _FACE = {
-    "odometry.steps": "make_steps",
+    "odometry.make_steps": "make_steps",
     "detectors.trees": "TreeDetectorConfig detect_trees",
     "grid.config": "GridFilterConfig",
     "grid.filter": "GridFilter",

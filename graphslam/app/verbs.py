@@ -39,9 +39,9 @@ from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 
 __all__ = [
     *(

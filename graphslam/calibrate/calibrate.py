@@ -13,8 +13,8 @@ from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LaserScans
 from graphslam_frontends.landmarks.prepare import landmark_stream
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import RecordedErrors
-from graphslam_frontends.odometry.steps import make_steps
 
 
 def calibrate_streams(

@@ -24,9 +24,9 @@ from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.stream_checks_clock import check_clocks
 from graphslam.evaluate.stream_checks_imu import check_turns
 from graphslam.evaluate.stream_checks_motion import check_odometry, check_sighted_motion
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import check_motion, motion_findings
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 
 MOST_SCANS = 1500
 """Scans of a planar laser that are held against the motion, from the middle of a log; …"""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.mark_kernels import (
     BRICKS,
     CUT,
@@ -29,10 +30,8 @@ from graphslam.evidence.mark_kernels import (
 )
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
+from graphslam.evidence.tree_kernels import write_bricks
 from graphslam.evidence.update_kernels import PENDING, apply_grids, drop_left, resolve_grids, settle_grids
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 BATCH = 64
 """Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
@@ -43,7 +42,7 @@ Scan = tuple[Array, Array, npt.NDArray[np.uint8], float]
 
 
 def update_grids(
-    grids: Sequence[EvidenceGrid],
+    grids: Sequence[GridTree],
     poses: Any,
     points: Any,
     *,
@@ -111,7 +110,7 @@ def report_of(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
     return UpdateReport(t[RAYS], t[CUT], t[NOT_FINITE], t[ZERO_LENGTH], t[OUTSIDE], locked, t[BRICKS])
 
 
-def insert(grids: Sequence[EvidenceGrid], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
+def insert(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
     """Write a checked scan; hold the pool's lock, and Ctrl-C back where there are several grids. ``poses (P, 12)``."""
     pool = grids[0].pool
     tally = np.zeros(TALLY, np.int64)
@@ -131,7 +130,7 @@ def insert(grids: Sequence[EvidenceGrid], poses: Array, scan: Scan, threads: int
     return tally
 
 
-def own_grids(grids: Sequence[EvidenceGrid], pool: GridPool) -> npt.NDArray[np.int64]:
+def own_grids(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int64]:
     """Make every grid the only owner of its root; roots ``(P,)``. Hold the pool's lock."""
     pool.collect()
     boxes = [g._box for g in grids]
@@ -144,8 +143,19 @@ def own_grids(grids: Sequence[EvidenceGrid], pool: GridPool) -> npt.NDArray[np.i
     return np.array([box.root for box in owned], np.int64)
 
 
+def write_packed(grid: GridTree, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
+    """Replace bricks by packed offset coordinates ``(n,)`` and values ``(n, 512)``, unchecked."""
+    pool = grid.pool
+    with pool.lock, deferred_interrupts():
+        own_grids((grid,), pool)  # first: it may take a node itself
+        pool.reserve(len(keys) * (pool.levels - 1), len(keys))
+        write_bricks(
+            grid.root, keys, values, grid.model.threshold_step, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
+        )
+
+
 def _insert_serial(
-    grid: EvidenceGrid,
+    grid: GridTree,
     roots: npt.NDArray[np.int64],
     poses: Array,
     scan: Scan,
@@ -202,7 +212,7 @@ def _insert_serial(
 
 
 def _insert_threads(
-    grid: EvidenceGrid,
+    grid: GridTree,
     roots: npt.NDArray[np.int64],
     poses: Array,
     scan: Scan,

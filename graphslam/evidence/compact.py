@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,17 +16,17 @@ from graphslam.core.errors import GridError
 from graphslam.core.interrupt import deferred_interrupts
 from graphslam.evidence.batch import own_grids
 from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES, GridPool
 from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 Ints = npt.NDArray[np.int64]
 
 VALUES = 1 << 16
 """Distinct values of a voxel, UNKNOWN among them; a value v has the row v + 32768 of tables."""
+
+G = TypeVar("G", bound=GridTree)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class States:
 
 
 def find_all_states(
-    grids: Sequence[EvidenceGrid], *, classes: bool = False, threshold: int = 0, maxima: bool = False
+    grids: Sequence[GridTree], *, classes: bool = False, threshold: int = 0, maxima: bool = False
 ) -> States:
     """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
     pool = grids[0].pool
@@ -79,7 +79,7 @@ def find_all_states(
     return states
 
 
-def compact(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> CompactReport:
+def compact(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     """Let all cubes of one value in some grids share one brick or node for each size and value, without loss.
 
     Bricks and nodes that are of one value are kept once for each value, those entirely unknown not at all. What the
@@ -141,7 +141,7 @@ class Pieces:
     cube_values: Ints
 
 
-def pieces_of(grid: EvidenceGrid) -> Pieces:
+def pieces_of(grid: GridTree) -> Pieces:
     """What a grid holds; equal maps give equal pieces, whatever happened to them before."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
@@ -153,7 +153,7 @@ def pieces_of(grid: EvidenceGrid) -> Pieces:
     return Pieces(_unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, 3 + 2 * cubes[:, 1], cubes[:, 2])
 
 
-def list_grid(grid: EvidenceGrid) -> tuple[Ints, Ints]:
+def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
     """Mixed bricks ``(n, 2)`` and cubes ``(m, 3)`` as `cube_kernels.list_pieces` gives them; hold the pool's lock."""
     pool = grid.pool
     states = find_all_states([grid])
@@ -166,7 +166,7 @@ def list_grid(grid: EvidenceGrid) -> tuple[Ints, Ints]:
     return mixed, cubes
 
 
-def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
+def grid_of(grid: G, pieces: Pieces) -> G:
     """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`overlap`)."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
@@ -189,7 +189,7 @@ def grid_of(grid: EvidenceGrid, pieces: Pieces) -> EvidenceGrid:
     return grid
 
 
-def move(grids: Sequence[EvidenceGrid]) -> None:
+def move(grids: Sequence[GridTree]) -> None:
     """Move grids into a pool of their own, the same for all, as large as they need it.
 
     A pool keeps the memory of maps that died. After a particle filter that is many times what is left alive; its memory

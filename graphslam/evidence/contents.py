@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,12 +12,10 @@ import numpy.typing as npt
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
 from graphslam.evidence.dense_kernels import known_box
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import STEP
 from graphslam.evidence.query_kernels import count_boxes, count_values, list_occupied, walk_once
 from graphslam.evidence.scan import point_rows
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 Ints = npt.NDArray[np.int64]
 
@@ -68,7 +66,7 @@ class BinnedCloud:
     counts: Ints
 
 
-def box_query(grid: EvidenceGrid, lower: Any, upper: Any) -> BoxCounts:
+def box_query(grid: GridTree, lower: Any, upper: Any) -> BoxCounts:
     """Occupied, known and all voxels that boxes overlap.
 
     Parameters
@@ -99,7 +97,7 @@ def box_query(grid: EvidenceGrid, lower: Any, upper: Any) -> BoxCounts:
     return BoxCounts(counts[:, 0], counts[:, 1], np.prod(high - low, axis=1))
 
 
-def bounding_box(grid: EvidenceGrid) -> tuple[Array, Array] | None:
+def bounding_box(grid: GridTree) -> tuple[Array, Array] | None:
     """Corners ``(dim,)``, ``(dim,)`` of the smallest box that holds all known voxels [m]; None of an empty map."""
     pool = grid.pool
     bounds = np.empty(6, np.int64)
@@ -112,7 +110,7 @@ def bounding_box(grid: EvidenceGrid) -> tuple[Array, Array] | None:
     return lower, upper
 
 
-def occupied_voxels(grid: EvidenceGrid) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int16]]:
+def occupied_voxels(grid: GridTree) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int16]]:
     """Signed coordinates ``(n, 3)`` and values ``(n,)`` [`layout.STEP`] of the occupied voxels.
 
     They come brick by brick, ascending in (z, y, x) of the bricks, and so inside each brick.
@@ -128,7 +126,7 @@ def occupied_voxels(grid: EvidenceGrid) -> tuple[npt.NDArray[np.int32], npt.NDAr
     return voxels, values
 
 
-def occupied_cloud(grid: EvidenceGrid, *, with_log_odds: bool = False) -> Any:
+def occupied_cloud(grid: GridTree, *, with_log_odds: bool = False) -> Any:
     """Centres of the occupied voxels.
 
     Parameters
@@ -146,7 +144,7 @@ def occupied_cloud(grid: EvidenceGrid, *, with_log_odds: bool = False) -> Any:
     return (points, (values * STEP).astype(np.float32)) if with_log_odds else points
 
 
-def binned_cloud(grid: EvidenceGrid, level: int, *, minimum: int = 1) -> BinnedCloud:
+def binned_cloud(grid: GridTree, level: int, *, minimum: int = 1) -> BinnedCloud:
     """Occupied voxels gathered in cells of ``2**level`` voxels a side: the thinned cloud that submaps are matched with.
 
     Parameters
@@ -172,7 +170,7 @@ def binned_cloud(grid: EvidenceGrid, level: int, *, minimum: int = 1) -> BinnedC
     return BinnedCloud(points[keep], counts[keep].astype(np.int64))
 
 
-def value_counts(grid: EvidenceGrid) -> Ints:
+def value_counts(grid: GridTree) -> Ints:
     """Number of voxels of each value, ``(65536,)``, row v + 32768; row 0, of the unknown, is set to 0.
 
     A brick that stands in many places of a compacted map is looked at once.
@@ -194,19 +192,19 @@ def value_counts(grid: EvidenceGrid) -> Ints:
     return counts
 
 
-def voxel_counts(grid: EvidenceGrid) -> VoxelCounts:
+def voxel_counts(grid: GridTree) -> VoxelCounts:
     """Numbers of occupied and free voxels."""
     counts = value_counts(grid)
     row = grid.model.threshold_step + 32768
     return VoxelCounts(int(counts[row:].sum()), int(counts[:row].sum()))
 
 
-def known_volume(grid: EvidenceGrid) -> float:
+def known_volume(grid: GridTree) -> float:
     """Volume of the voxels that were observed [m³], in 2-D their area [m²]."""
     return float(value_counts(grid).sum()) * grid.voxel_size**grid.dim
 
 
-def entropy(grid: EvidenceGrid) -> float:
+def entropy(grid: GridTree) -> float:
     """Entropy of the map (SegSLAM eq. 20–22): observed voxels only, times the volume of a voxel [nat m³; 2-D: nat m²].
 
     ``H = Σ γ (-ρ log ρ - (1 - ρ) log(1 - ρ))``. Voxels are counted by value first, so that the sum is the same whatever

@@ -7,7 +7,6 @@ particles share their history, and a submap that is entered again starts as a co
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -16,26 +15,23 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.atomic import write_npz
-from graphslam.core.errors import GridError, GridLockedError
+from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
 from graphslam.core.markup import element, join, pairs
 from graphslam.evidence import contents, queries
-from graphslam.evidence.batch import insert, own_grids, report_of
-from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.batch import insert, report_of, write_packed
 from graphslam.evidence.compact import pieces_of
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
 from graphslam.evidence.memory import Memory, memory
 from graphslam.evidence.merge import merge
-from graphslam.evidence.pool import GridPool, RootBox
-from graphslam.evidence.scan import UpdateReport, point_rows, pose_row, scan_rows
-from graphslam.evidence.tree_kernels import gather_bricks, list_bricks, read_values, write_bricks
+from graphslam.evidence.scan import UpdateReport, pose_row, scan_rows
+from graphslam.evidence.tree_kernels import gather_bricks
 
 FORMAT = "graphslam.evidence/1"
-_DEFAULT_MODEL = BeamModel()
 
 
-class EvidenceGrid:
+class EvidenceGrid(GridTree):
     """A log-odds occupancy map, 3-D or 2-D, with O(1) copies.
 
     Voxel (i, j, k) covers ``[i v, (i + 1) v) × …`` of the grid's frame, v the voxel size. A 2-D grid is the layer
@@ -64,82 +60,9 @@ class EvidenceGrid:
     True
     """
 
-    __slots__ = ("__weakref__", "_box", "dim", "locked", "model", "pool", "voxel_size")
-
-    def __init__(
-        self, voxel_size: float, *, model: BeamModel | None = None, pool: GridPool | None = None, dim: int = 3
-    ) -> None:
-        if not (isinstance(voxel_size, (int, float, np.number)) and math.isfinite(voxel_size) and voxel_size > 0):
-            raise GridError("impossible voxel size", got=voxel_size, wanted="> 0 m")
-        if dim not in (2, 3):
-            raise GridError("impossible dimension of a grid", got=dim, wanted="2 or 3")
-        self.voxel_size = float(voxel_size)
-        self.model = _DEFAULT_MODEL if model is None else model
-        self.pool = GridPool() if pool is None else pool
-        self.dim = dim
-        self.locked = False
-        self._box = RootBox(0, self.pool.dead)
-
-    # --- life ------------------------------------------------------------------------------------------------
-
-    def copy(self) -> EvidenceGrid:
-        """The same map under a second handle, in constant time; whichever is written first pays for what it changes.
-
-        The copy of a locked grid is not locked.
-        """
-        twin: EvidenceGrid = _new(EvidenceGrid)
-        twin.voxel_size = self.voxel_size
-        twin.model = self.model
-        twin.pool = self.pool
-        twin.dim = self.dim
-        twin.locked = False
-        box = self._box
-        box.shared = True
-        twin._box = box
-        return twin
-
-    __copy__ = copy
-
-    def __deepcopy__(self, memo: Any) -> EvidenceGrid:
-        return self.copy()
-
-    def empty(self, pool: GridPool | None = None) -> EvidenceGrid:
-        """An empty grid of the same kind, in the same pool or another."""
-        return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
-
-    def release(self) -> None:
-        """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""
-        self._box = RootBox(0, self.pool.dead)
-        self.pool.collect()
-
-    def lock(self) -> None:
-        """Localise only: from here on, updating raises `GridLockedError` (SegSLAM A12)."""
-        self.locked = True
-
-    def unlock(self) -> None:
-        """Allow updates again."""
-        self.locked = False
-
-    @property
-    def root(self) -> int:
-        """Root node in the pool, 0 of an empty grid; valid until the next write."""
-        return self._box.root
-
-    def take(self, other: EvidenceGrid) -> None:
-        """Become what ``other``, a grid of the same kind, is now: how a long change is made whole or not at all."""
-        other._box.shared = True
-        self.pool, self._box = other.pool, other._box
-
-    def same_as(self, other: EvidenceGrid) -> bool:
-        """Whether two handles hold the very same tree (a copy that neither side has written to)."""
-        return self._box is other._box or (self.root == 0 == other.root)
+    __slots__ = ()
 
     # --- writing ---------------------------------------------------------------------------------------------
-
-    def check_writable(self) -> None:
-        """Raise `GridLockedError` if the grid is locked."""
-        if self.locked:
-            raise GridLockedError("this evidence grid is locked: it is localised in, not updated; unlock or copy it")
 
     def insert_scan(
         self,
@@ -219,46 +142,13 @@ class EvidenceGrid:
         keys = (u[:, 2] << 40) | (u[:, 1] << 20) | u[:, 0]
         if len(np.unique(keys)) != len(keys):
             raise GridError("a brick stands twice in one write", wanted="each brick once")
-        self.write_packed(keys, v)
-
-    def write_packed(self, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
-        """:meth:`write_bricks` by packed offset coordinates ``(n,)``, unchecked."""
-        pool = self.pool
-        with pool.lock, deferred_interrupts():
-            own_grids((self,), pool)  # first: it may take a node itself
-            pool.reserve(len(keys) * (pool.levels - 1), len(keys))
-            write_bricks(
-                self.root,
-                keys,
-                values,
-                self.model.threshold_step,
-                pool.levels,
-                *pool.tree_arrays(),
-                *pool.store_arrays(),
-            )
+        write_packed(self, keys, v)
 
     def merge(self, other: EvidenceGrid, pose: Any = None) -> int:
         """Add the log-odds of another map under ``T_self_other``; see `merge.merge`."""
         return merge(self, other, pose)
 
     # --- reading ---------------------------------------------------------------------------------------------
-
-    def packed_bricks(self) -> npt.NDArray[np.int64]:
-        """Packed coordinates and ids of the bricks, ``(n, 2)``, ascending; hold the pool's lock."""
-        pool = self.pool
-        if self.root == 0:
-            return np.zeros((0, 2), np.int64)
-        n = list_bricks(self.root, pool.levels, pool.children, np.zeros((0, 2), np.int64))
-        out = np.empty((n, 2), np.int64)
-        list_bricks(self.root, pool.levels, pool.children, out)
-        return out[np.argsort(out[:, 0])]
-
-    def brick_coordinates(self) -> npt.NDArray[np.int64]:
-        """Signed coordinates of the bricks ``(n, 3)``, ascending in (z, y, x); brick b holds voxels 8b … 8b + 7."""
-        with self.pool.lock:
-            keys = self.packed_bricks()[:, 0]
-        half = self.pool.half // BRICK_EDGE
-        return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1) - half
 
     def brick_values(self) -> npt.NDArray[np.int16]:
         """Values of the bricks ``(n, 512)``, in the order of :meth:`brick_coordinates`, in units of `layout.STEP`."""
@@ -276,18 +166,6 @@ class EvidenceGrid:
             ids = self.packed_bricks()[:, 1]
             for k in range(0, len(ids), size):
                 yield coordinates[k : k + size], pool.bricks[ids[k : k + size]]
-
-    def values_at(self, points: Any) -> npt.NDArray[np.int16]:
-        """Values of the voxels points lie in ``(n,)``, in units of `layout.STEP`; `layout.UNKNOWN` where nothing is
-        known, outside the addressable cube, and for points that are not finite."""
-        p = point_rows(points, self.dim, self.voxel_size)
-        out = np.empty(len(p), np.int16)
-        with self.pool.lock:
-            read_values(
-                self.root, p, 1.0 / self.voxel_size, self.pool.half, self.pool.levels, self.pool.children,
-                self.pool.bricks, out,
-            )  # fmt: skip
-        return out
 
     # --- queries ---------------------------------------------------------------------------------------------
 
@@ -389,6 +267,3 @@ class EvidenceGrid:
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""
         return f"EvidenceGrid({self.voxel_size:g} m, {self.dim}-D, {len(self.brick_coordinates())} bricks{state})"
-
-
-_new = object.__new__  # a name of the module: copying is counted in tenths of microseconds

@@ -6,17 +6,14 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
 from graphslam.evidence.query_kernels import count_private, walk_once
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +49,7 @@ class Memory:
         return self.total - self.private
 
 
-def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
+def memory(grids: GridTree | Sequence[GridTree]) -> Memory:
     """Memory of a grid or of a set of grids of one pool, by one walk over what they reach.
 
     Parameters
@@ -88,7 +85,7 @@ def memory(grids: EvidenceGrid | Sequence[EvidenceGrid]) -> Memory:
     return Memory(int(begins[-1]), found, int(private[0]), int(private[1]))
 
 
-def shared_bricks(grid: EvidenceGrid, others: Sequence[EvidenceGrid]) -> npt.NDArray[np.bool_]:
+def shared_bricks(grid: GridTree, others: Sequence[GridTree]) -> npt.NDArray[np.bool_]:
     """Which bricks of a grid are bricks of others too, not merely equal ``(n,)``; ordered as its `brick_coordinates`.
 
     Parameters

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
+from graphslam.evidence.batch import write_packed
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.merge_kernels import sample_bricks
 from graphslam.evidence.scan import pose_row
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 CHUNK = 2048
 """Bricks worked on at a time: bounds the memory of a merge to some megabytes."""
 
 
-def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
+def merge(grid: GridTree, other: GridTree, pose: Any = None) -> int:
     """Add the log-odds of ``other`` to ``grid``; returns how many voxels got something.
 
     A voxel takes the value of the voxel of ``other`` that its centre lies in; unknown there adds nothing. Sums are
@@ -77,7 +76,7 @@ def merge(grid: EvidenceGrid, other: EvidenceGrid, pose: Any = None) -> int:
         part, values = part[some], values[some]
         with pool.lock:
             old = pool.bricks[_ids(bricks, part)]
-        work.write_packed(part, _sum(old, values, *grid.model.clamp_steps))
+        write_packed(work, part, _sum(old, values, *grid.model.clamp_steps))
     grid.take(work)
     return found
 
@@ -97,7 +96,7 @@ def _sum(old: npt.NDArray[np.int16], add: npt.NDArray[np.int16], low: int, high:
     return np.where(known, np.clip(new, low, high), old).astype(np.int16)
 
 
-def _touched(grid: EvidenceGrid, coordinates: npt.NDArray[np.int64], R: Array, t: Array) -> npt.NDArray[np.int64]:
+def _touched(grid: GridTree, coordinates: npt.NDArray[np.int64], R: Array, t: Array) -> npt.NDArray[np.int64]:
     """Packed coordinates of the target bricks that the boxes around the moved source bricks meet, ascending."""
     edge = BRICK_EDGE * grid.voxel_size
     half = grid.pool.half // BRICK_EDGE

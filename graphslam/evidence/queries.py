@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,12 +27,10 @@ from graphslam.evidence.cast_kernels import (
     cast_rays,
     unit_directions,
 )
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import STEP
 from graphslam.evidence.query_kernels import look_up
 from graphslam.evidence.scan import check_number, point_rows, pose_row, pose_rows
-
-if TYPE_CHECKING:
-    from graphslam.evidence.grid import EvidenceGrid
 
 __all__ = [
     "HIT",
@@ -85,7 +83,7 @@ class Cast:
 
 
 def cast(
-    grid: EvidenceGrid,
+    grid: GridTree,
     origins: Any,
     directions: Any,
     max_range: float,
@@ -122,7 +120,7 @@ def cast(
 
 
 def cast_grids(
-    grids: Sequence[EvidenceGrid],
+    grids: Sequence[GridTree],
     poses: Any,
     origins: Any,
     directions: Any,
@@ -156,7 +154,7 @@ def cast_grids(
 
 
 def _cast(
-    grids: Sequence[EvidenceGrid],
+    grids: Sequence[GridTree],
     rows: Array,
     origins: Any,
     directions: Any,
@@ -197,7 +195,7 @@ def _cast(
 
 
 def endpoint_log_odds(
-    grids: Sequence[EvidenceGrid], poses: Any, points: Any, *, threads: int = 1
+    grids: Sequence[GridTree], poses: Any, points: Any, *, threads: int = 1
 ) -> npt.NDArray[np.float32]:
     """Log-odds of the voxels that points of one scan fall in, in many grids.
 
@@ -221,7 +219,7 @@ def endpoint_log_odds(
 
 
 def endpoint_probability(
-    grids: Sequence[EvidenceGrid],
+    grids: Sequence[GridTree],
     poses: Any,
     points: Any,
     *,
@@ -254,28 +252,28 @@ def endpoint_probability(
     return _look_up(grids, _rows(grids, poses), points, table, interpolation == "trilinear", threads)
 
 
-def log_odds_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.float32]:
+def log_odds_at(grid: GridTree, points: Any) -> npt.NDArray[np.float32]:
     """Log-odds ``(n,)`` of the voxels that points ``(n, dim)`` [m] of the grid's frame lie in; NaN where unknown."""
     rows = pose_row(None, grid.dim)[None]
     return _look_up([grid], rows, points, _log_odds_table(), False, 1)[0]
 
 
-def occupied_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.bool_]:
+def occupied_at(grid: GridTree, points: Any) -> npt.NDArray[np.bool_]:
     """Whether points ``(n, dim)`` [m] of the grid's frame lie in occupied voxels: known, at the threshold or above."""
     return grid.values_at(points) >= grid.model.threshold_step
 
 
-def known_at(grid: EvidenceGrid, points: Any) -> npt.NDArray[np.bool_]:
+def known_at(grid: GridTree, points: Any) -> npt.NDArray[np.bool_]:
     """Whether points ``(n, dim)`` [m] of the grid's frame lie in voxels that were observed."""
     return ~np.isnan(log_odds_at(grid, points))
 
 
-def _rows(grids: Sequence[EvidenceGrid], poses: Any) -> Array:
+def _rows(grids: Sequence[GridTree], poses: Any) -> Array:
     return pose_rows(poses, grids[0].dim) if len(grids) else np.empty((0, 12))
 
 
 def _look_up(
-    grids: Sequence[EvidenceGrid],
+    grids: Sequence[GridTree],
     rows: Array,
     points: Any,
     table: npt.NDArray[np.float32],
@@ -302,7 +300,7 @@ def _look_up(
     return out
 
 
-def check_together(grids: Sequence[EvidenceGrid], *, same_threshold: bool = False) -> EvidenceGrid:
+def check_together(grids: Sequence[GridTree], *, same_threshold: bool = False) -> GridTree:
     """Refuse grids that cannot be read in one call; returns the first."""
     first = grids[0]
     for k, g in enumerate(grids):

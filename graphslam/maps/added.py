@@ -16,6 +16,7 @@ import numpy as np
 from graphslam.core.errors import GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Submap
+from graphslam.evidence.batch import write_packed
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.shelved import shelved
@@ -84,7 +85,7 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
         subtract_bricks(keys, new, tree, slack, grid.dim == 2, difference, counts)
     some = (difference != UNKNOWN).any(axis=1)
     out = grid.empty()
-    out.write_packed(keys[some], difference[some])
+    write_packed(out, keys[some], difference[some])
     return Added(out, *counts.tolist())
 
 

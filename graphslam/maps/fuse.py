@@ -23,6 +23,7 @@ from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.geometry import Array
 from graphslam.core.interrupt import deferred_interrupts
 from graphslam.core.poses import SE2, SE3
+from graphslam.evidence.batch import write_packed
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import compact
 from graphslam.evidence.contents import entropy_of_counts
@@ -255,7 +256,7 @@ class FusedMap:
                 keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
             ):
                 if len(some):
-                    work.write_packed(some, values)
+                    write_packed(work, some, values)
                 written.append(some)
                 empty += gone_empty
             changed = np.concatenate(written)

@@ -15,7 +15,7 @@ from graphslam.core.config import merge
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.progress import Progress
 from graphslam_frontends.segslam.segslam import run_segslam
 from tests.app.cli.test_cli import graphslam, refused

@@ -46,8 +46,9 @@ from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.sim.garage import garage
 from graphslam_frontends.grid.config import GridFilterConfig
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, settled
 from graphslam_frontends.segslam.segslam import run_segslam
 

@@ -22,7 +22,8 @@ from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.garage import garage
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.steps import Steps
 
 NAMES = ("fitness", "fitness_upright", "fitness_known", "degeneracy", "tilt")
 

@@ -22,7 +22,8 @@ from graphslam.core.config import build
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import align_se3, se3_transform
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.exits import relative_covariance
 from graphslam_frontends.scan_window.front_end import ScanWindowFrontEndConfig
 from graphslam_frontends.scan_window.tracker import track

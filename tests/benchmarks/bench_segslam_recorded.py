@@ -32,8 +32,9 @@ from graphslam.io.catalog import load
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam

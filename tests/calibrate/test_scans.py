@@ -13,8 +13,8 @@ from graphslam.calibrate.estimate import Calibration, Estimate
 from graphslam.calibrate.scans import BLOCK, Pairs, calibrate_scans, predicted, regress
 from graphslam.calibrate.sighted import QUICK
 from graphslam.core.errors import DataError
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 from tests.calibrate.room import drive
 
 BIAS, SCALE, NOISE = np.deg2rad(0.6), 1.04, 0.02

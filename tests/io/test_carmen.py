@@ -13,7 +13,8 @@ from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.core.log import DropCounter
 from graphslam.io.carmen import bearings, mend_stamps, read_carmen
 from graphslam.io.catalog import load
-from graphslam_frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
 
 OFFSET = np.array([-0.04, 0.0, 0.0])
 

@@ -16,7 +16,8 @@ from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import settled
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam

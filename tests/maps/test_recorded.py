@@ -12,7 +12,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.maps.fuse import fuse
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import divide_submaps
-from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
 from tests.benchmarks.bench_maps import bodies_of, insert, scene, submaps_of
 
 

@@ -16,7 +16,9 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.base import FrontEnd
-from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,9 +15,9 @@ from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import refine
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Cloud
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 from tests.calibrate.room import drive, scan
 
 

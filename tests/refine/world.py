@@ -13,8 +13,8 @@ from graphslam.refine.scans import Scans
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.odometry.steps import make_steps
 
 
 @lru_cache(maxsize=32)

@@ -36,7 +36,8 @@ from graphslam_frontends.odometry.scan_use import (
     uncorrected_covariance,
     with_findings,
 )
-from graphslam_frontends.odometry.steps import StepConfig, Steps
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.covariance import Drift, exit_covariance
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 

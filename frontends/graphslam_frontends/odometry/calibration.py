@@ -7,7 +7,6 @@ has to undo it at every step bends its maps; but a few hundred matches of scans 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from graphslam.core.records import Odometry
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import register
 from graphslam.registration.target import Target
-
-if TYPE_CHECKING:
-    from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.steps import Steps
 
 _MATCHING = RegistrationConfig(radii=(1.0, 0.3), near=0.15)
 _LEAST = 20

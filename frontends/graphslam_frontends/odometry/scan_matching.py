@@ -8,7 +8,6 @@ there the odometry stays.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +17,7 @@ from graphslam.core.log import DropCounter
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import register
 from graphslam.registration.target import Target
-
-if TYPE_CHECKING:
-    from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.odometry.steps import Steps
 
 MATCHING = RegistrationConfig(radii=(0.6, 0.3), near=0.15, floor_sigma=0.01, floor_turn=0.003)
 FITNESS = 0.6

@@ -19,10 +19,11 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of, level
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import check_motion, motion_findings, spin_of
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import Steps, make_steps
+from graphslam_frontends.odometry.steps import Steps
 
 FEW = 10
 """Returns below which a step's scan does not hold a pose: a wall takes some beams to be a line."""

@@ -17,8 +17,8 @@ from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.se3 import quat_to_matrix
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 from graphslam_frontends.scan_window.tracker import Tracker
 

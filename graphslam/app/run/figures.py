@@ -1,73 +1,22 @@
-"""The pictures of a run."""
+"""Figures of a run, written as PNG files."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphslam.core.geometry import se2_transform
-from graphslam.core.log import Truth
+from graphslam.app.run.run import Run
 from graphslam.core.plan_view import plan_pose, plan_submap
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.map import plot_map
-from graphslam.plots.paths import GRAPH, plot_paths
 from graphslam.plots.refined import plot_before_after
 from graphslam.plots.save import save
 from graphslam.plots.submaps import plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
 from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
-
-if TYPE_CHECKING:
-    from graphslam.app.run.run import Run
-
-# A dead-reckoned path this many times larger than the map would shrink the map to a dot.
-_MAX_STRETCH = 2.5
-
-
-def draw_map(run: Run, ax: Any = None) -> Any:
-    """Map with path, landmarks and 95 % ellipses, GPS and truth.
-
-    In the GPS frame (east, north) where fixes were scored, else in the frame of the first base.
-    """
-    m = run.map
-    if m.dim == 3:
-        return _draw_paths(run, ax, "xy")
-    fixes, T = None, np.zeros(3)
-    scored = run.gps.get("all")
-    if scored is not None:
-        fixes, T = scored.points + scored.residuals, scored.T_gps_map
-    landmarks, covariances = m.landmarks_in(T)
-    truth = None
-    if run.truth is not None:
-        path = run.truth_path
-        if path is None:
-            path = Trajectory(m.base_times, np.vstack([np.zeros((1, 3)), run.truth.exit_poses]))
-        truth = Truth(path.transformed(T), run.truth.landmark_ids, se2_transform(T, run.truth.landmarks))
-    title = f"{run.name}: {len(run.submaps)} submaps, {len(m.landmarks)} landmarks"
-    if scored is not None:
-        title += f", GPS RMSE {scored.statistics.rmse:.2f} m"
-    reckoned = _fitting(run.dead_reckoning, m.trajectory)
-    axes = plot_map(
-        ax,
-        trajectory=m.trajectory.transformed(T),
-        landmarks=landmarks,
-        covariances=covariances,
-        gps=fixes,
-        truth=truth,
-        dead_reckoning=None if reckoned is None else reckoned.transformed(T),
-        before=None if run.graph_path is None else run.graph_path.transformed(T),
-        pose_ellipses=12,
-        title=title,
-    )
-    if scored is not None:
-        axes.set_xlabel("east [m]")
-        axes.set_ylabel("north [m]")
-    return axes
 
 
 def _as_solved(run: Run) -> list[Submap]:
@@ -89,32 +38,12 @@ def _as_solved(run: Run) -> list[Submap]:
     return out
 
 
-def _draw_paths(run: Run, ax: Any, plane: str) -> Any:
-    """A map in space: its path from above or from the side, with what it claims to know, truth and dead reckoning."""
-    paths = {"path": run.map.trajectory}
-    if run.graph_path is not None:
-        paths[GRAPH] = Trajectory(run.graph_path.times, run.graph_path.poses)  # its ellipses would hide the map's
-    reckoned = _fitting(run.dead_reckoning, run.map.trajectory)
-    if reckoned is not None and reckoned.dim == 3:
-        paths["dead reckoning"] = reckoned
-    title = f"{run.name}: {len(run.submaps)} submaps, {len(run.map.node_poses)} nodes"
-    return plot_paths(ax, paths, truth=run.truth_path, ellipses=12, plane=plane, title=title)
-
-
-def _fitting(path: Trajectory | None, beside: Trajectory) -> Trajectory | None:
-    """The path, if it does not dwarf the one it is drawn beside."""
-    if path is None:
-        return None
-    own, other = np.ptp(path.positions, axis=0).max(), np.ptp(beside.positions, axis=0).max()
-    return path if own <= _MAX_STRETCH * max(other, 1.0) else None
-
-
 def save_figures(run: Run, folder: Path) -> list[Path]:
     """Map, submap chain, and GPS residuals, innovations and loops where there are any, as PNG files."""
-    made = [save(draw_map(run), folder / "map.png")]
+    made = [save(run.plot(), folder / "map.png")]
     submaps, bases = _as_solved(run), run.map.base_poses
     if run.map.dim == 3:
-        made.append(save(_draw_paths(run, None, "xz"), folder / "side.png"))
+        made.append(save(run.plot(plane="xz"), folder / "side.png"))
         submaps, bases = [plan_submap(s) for s in submaps], plan_pose(bases)
     chain = plot_submap_chain(None, submaps, bases, title=f"{run.name}: submaps at their solved poses")
     made.append(save(chain, folder / "submaps.png"))

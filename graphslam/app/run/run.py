@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.core.findings import Finding, findings_of_json, headline_of_json
-from graphslam.core.log import SensorLog
+from graphslam.core.geometry import se2_transform
+from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.markup import element, frame, join
 from graphslam.core.records import Gps
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from graphslam.solve.solution import Solution
 
 Ints = npt.NDArray[np.int64]
+_MAX_STRETCH = 2.5
+"""A dead-reckoned path this many times larger than the map is not drawn: the map would be a dot."""
 
 
 class Later:
@@ -167,11 +170,69 @@ class Run:
         """The path at full rate, a row an instant, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
         return self.map.trajectory.to_pandas()
 
-    def plot(self, ax: Any = None) -> Any:
-        """Map with path, landmarks and their ellipses, GPS and truth, in the frame of the first base."""
-        from graphslam.app.run.figures import draw_map
+    def plot(self, ax: Any = None, *, plane: str = "xy") -> Any:
+        """Map with path, landmarks and 95 % ellipses, GPS fixes and ground truth.
 
-        return draw_map(self, ax)
+        In the GPS frame (east, north) where fixes were scored, else in the frame of the first base. A map in space is
+        drawn by its path in ``plane``, ``"xy"`` or ``"xz"``.
+        """
+        if self.map.dim == 3:
+            return self._plot_paths(ax, plane)
+        from graphslam.plots.map import plot_map
+
+        m = self.map
+        fixes, T = None, np.zeros(3)
+        scored = self.gps.get("all")
+        if scored is not None:
+            fixes, T = scored.points + scored.residuals, scored.T_gps_map
+        landmarks, covariances = m.landmarks_in(T)
+        truth = None
+        if self.truth is not None:
+            path = self.truth_path
+            if path is None:
+                path = Trajectory(m.base_times, np.vstack([np.zeros((1, 3)), self.truth.exit_poses]))
+            truth = Truth(path.transformed(T), self.truth.landmark_ids, se2_transform(T, self.truth.landmarks))
+        title = f"{self.name}: {len(self.submaps)} submaps, {len(m.landmarks)} landmarks"
+        if scored is not None:
+            title += f", GPS RMSE {scored.statistics.rmse:.2f} m"
+        reckoned = self._fitting_dead_reckoning()
+        axes = plot_map(
+            ax,
+            trajectory=m.trajectory.transformed(T),
+            landmarks=landmarks,
+            covariances=covariances,
+            gps=fixes,
+            truth=truth,
+            dead_reckoning=None if reckoned is None else reckoned.transformed(T),
+            before=None if self.graph_path is None else self.graph_path.transformed(T),
+            pose_ellipses=12,
+            title=title,
+        )
+        if scored is not None:
+            axes.set_xlabel("east [m]")
+            axes.set_ylabel("north [m]")
+        return axes
+
+    def _plot_paths(self, ax: Any, plane: str) -> Any:
+        """Path of a map in space with its ellipses, ground truth and dead reckoning."""
+        from graphslam.plots.paths import GRAPH, plot_paths
+
+        paths = {"path": self.map.trajectory}
+        if self.graph_path is not None:
+            paths[GRAPH] = Trajectory(self.graph_path.times, self.graph_path.poses)  # its ellipses would hide the map's
+        reckoned = self._fitting_dead_reckoning()
+        if reckoned is not None and reckoned.dim == 3:
+            paths["dead reckoning"] = reckoned
+        title = f"{self.name}: {len(self.submaps)} submaps, {len(self.map.node_poses)} nodes"
+        return plot_paths(ax, paths, truth=self.truth_path, ellipses=12, plane=plane, title=title)
+
+    def _fitting_dead_reckoning(self) -> Trajectory | None:
+        """Dead reckoning, if it does not make the map a dot in the figure."""
+        if self.dead_reckoning is None:
+            return None
+        own = np.ptp(self.dead_reckoning.positions, axis=0).max()
+        beside = np.ptp(self.map.trajectory.positions, axis=0).max()
+        return self.dead_reckoning if own <= _MAX_STRETCH * max(beside, 1.0) else None
 
     def __repr__(self) -> str:
         return f"Run({self.name!r}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks)"

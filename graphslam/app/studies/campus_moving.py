@@ -26,8 +26,8 @@ from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.moving import outvoted
 from graphslam.sim.campus import simulate_campus
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 from graphslam_frontends.scan_window.front_end import ScanWindow
 
 ALL = 1_000_000

@@ -32,7 +32,7 @@ from graphslam.refine.scans import Scans
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.solve.batch import BatchSolver
-from graphslam_frontends.odometry.steps import make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.submaps import base_of
 

@@ -35,7 +35,9 @@ from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_drift import FilterDrift
 from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
 from graphslam_frontends.odometry.drift import DriftModel
-from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.log import SensorLog
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import MotionCheck, check_motion, motion_findings
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import make_steps
 from tests.faults import inject_grid as put
 from tests.faults.grid_worlds import RANGE, ring_log
 

@@ -17,6 +17,7 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry
 from graphslam.io.catalog import load
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
 from graphslam_frontends.odometry.recorded import (
     RecordedErrors,
@@ -26,7 +27,7 @@ from graphslam_frontends.odometry.recorded import (
     cut_odometry,
     lasting_effect,
 )
-from graphslam_frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
 
 NOISE = MotionNoise(floor_position=1e-6, floor_heading=1e-6)
 

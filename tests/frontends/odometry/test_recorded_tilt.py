@@ -11,8 +11,9 @@ from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import LaserScans, Odometry
 from graphslam_frontends.grid.motion import tilts
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.odometry.test_recorded import winding
 
 

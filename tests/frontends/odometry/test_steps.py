@@ -12,8 +12,9 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
 from graphslam_frontends.odometry.deskew import assign, cut_beams, spread
+from graphslam_frontends.odometry.make_steps import level_on_the_whole, make_steps
 from graphslam_frontends.odometry.reckoned import Reckoned
-from graphslam_frontends.odometry.steps import StepConfig, level_on_the_whole, make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled
 from tests.reference.imu_drive import drive
 from tests.reference.plain_steps import deskew_all, room_scans, winding_path

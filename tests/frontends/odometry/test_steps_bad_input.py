@@ -11,7 +11,9 @@ from graphslam.core.errors import ConfigError, DataError, GeometryError, Missing
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.steps import StepConfig, Steps, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.step_logs import odometry_of, planar_log, room_log, spoiled
 
 

@@ -10,7 +10,8 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_between, se2_transform
 from graphslam.core.log import DropCounter
-from graphslam_frontends.odometry.steps import StepConfig, make_steps
+from graphslam_frontends.odometry.make_steps import make_steps
+from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.step_logs import odometry_of, planar_log
 
 

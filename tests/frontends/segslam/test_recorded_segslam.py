@@ -18,8 +18,8 @@ from graphslam.core.random import SeedTree
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.io.carmen import read_carmen
 from graphslam.io.catalog import load
+from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.odometry.steps import make_steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.segslam import run_segslam
 

@@ -1,0 +1,212 @@
+"""Steps: sensor data as grid front ends read it, whatever the robot.
+
+A step is a short stretch of time: the motion that ends at its stamp and the beams of that stretch, moved to where the
+base stands at the stamp. Front ends on grids see nothing else, so that any robot whose data become steps can be mapped.
+"""
+
+from __future__ import annotations
+
+import logging
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.geometry import Array
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LaserScans
+from graphslam_frontends.odometry.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
+from graphslam_frontends.odometry.scan_matching import match_neighbours
+from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.step_motion import MotionSource, motion_source
+from graphslam_frontends.odometry.steps import Steps
+
+_log = logging.getLogger(__name__)
+_MOST_STEPS = 1_000_000
+
+
+def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropCounter | None = None) -> Steps:
+    """Cut a log into steps.
+
+    A step takes the beams after the stamp of the one before, up to its own stamp, each moved by the motion from its own
+    time to the step's stamp. With a ``period`` steps begin with the first beam and the last may be shorter; a step
+    without any beam is kept, for the motion goes on. With none, there is one step for every record of the first
+    scanner.
+
+    Parameters
+    ----------
+    log : SensorLog
+    config : StepConfig, optional
+    drops : DropCounter, optional
+        Counts beams and scans that say nothing, beams outside the motion, beams left out by thinning, steps without a
+        beam, gaps that were bridged.
+
+    Returns
+    -------
+    Steps
+
+    Raises
+    ------
+    MissingDataError
+        No scanner or no motion.
+    DataError
+        A gap in the motion that is too long; a scanner whose clock is not that of the motion.
+    ConfigError
+        Streams that do not fit together.
+    """
+    config = config or StepConfig()
+    count = DropCounter()
+    names = config.scanners or _scanners(log)
+    source = motion_source(log, config, 2 if isinstance(log[names[0]], LaserScans) else 3)
+    sources = _beam_sources(log, names, source, config, count)
+    beam_times = np.concatenate([s.times for s in sources])
+    inside = (beam_times >= source.begin) & (beam_times <= source.end)
+    outside = len(inside) - int(inside.sum())
+    if len(inside) and outside > 0.5 * len(inside):
+        raise DataError(
+            f"{outside} of {len(inside)} beams lie outside the motion: are the clocks the same?",
+            where=f"{log.name}: {', '.join(names)}",
+            got=f"{beam_times.min():.3f} to {beam_times.max():.3f} s",
+            wanted=f"{source.begin:.3f} to {source.end:.3f} s, as {', '.join(source.names)}",
+        )
+    count.drop(", ".join(names), "beam outside the motion", outside)
+    skipped = np.concatenate([s.skipped for s in sources])
+    skipped = skipped[(skipped >= source.begin) & (skipped <= source.end)]
+    times, begin = _stamps(log[names[0]], np.append(beam_times[inside], skipped), source, config)
+    motion = source.solve(times, np.unique(np.append(beam_times[inside], begin)), count)
+
+    step = assign(beam_times, times, begin)
+    step[~inside] = -1
+    if config.silent == "unknown":
+        silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources]) & inside
+        step[silent] = -1
+        count.drop(", ".join(names), "beam without a range", int(silent.sum()))
+    chosen, offsets, thinned = _choose(step, len(times), config.most_points)
+    count.drop(", ".join(names), f"beam left out, {config.most_points} a step are kept", thinned)
+    count.drop("steps", "step without a beam (kept)", int(np.sum(np.diff(offsets) == 0)))
+    origins, ends, met = _beams(sources, chosen, config)
+    origins, ends = deskew(motion.path, motion.poses, step[chosen], beam_times[chosen], origins, ends)
+    for what, n in count.counts.items():
+        _log.info("%s: %s: %d", log.name, what, n)
+    if drops is not None:
+        drops.counts.update(count.counts)
+    steps = Steps(
+        times=times,
+        odometry=motion.odometry,
+        offsets=offsets,
+        points=ends,
+        origins=origins,
+        returns=met,
+        max_range=config.max_range or max(s.max_range for s in sources),
+        range_sigma=max(s.sigma for s in sources),
+        ages=times[step[chosen]] - beam_times[chosen],
+        tilt=level_on_the_whole(motion.tilt, motion.odometry.increments) if config.level_floors else motion.tilt,
+        tilt_sigma=motion.tilt_sigma,
+        tilt_time=motion.tilt_time,
+        uses=frozenset((*source.names, *names)),
+        name=log.name + (f" (yaw rate off by {config.yaw_bias:g} rad/s)" if config.yaw_bias else ""),
+        truth=log.truth.trajectory if log.truth is not None else None,
+        errors=motion.errors,
+        gaps=motion.gaps,
+    )
+    return match_neighbours(steps, drops=drops) if config.match_scans else steps
+
+
+def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
+    """Roll and pitch ``(n, 2)`` [rad] without their median over the steps in which the body moved.
+
+    On level floors the body stands level whatever way it heads, and ramps are less than half of the way, and lead up as
+    often as down; so the median is that part of gravity's error that lasts.
+    """
+    if tilt is None:
+        return None
+    way = np.linalg.norm(increments[:, :3], axis=1)
+    moved = way > 0.5 * float(np.median(way))
+    return tilt - np.median(tilt[moved if moved.any() else slice(None)], axis=0)
+
+
+def _scanners(log: SensorLog) -> tuple[str, ...]:
+    for kind in (RangeScans, PointClouds, LaserScans):
+        names = tuple(name for name, s in log.streams.items() if isinstance(s, kind))
+        if names:
+            return names
+    raise MissingDataError("no scanner to make steps of", where=log.name, wanted="RangeScans, PointClouds, LaserScans")
+
+
+def _beam_sources(
+    log: SensorLog, names: tuple[str, ...], motion: MotionSource, config: StepConfig, drops: DropCounter
+) -> list[BeamSource]:
+    sources = []
+    for name in names:
+        stream = log[name]
+        if not isinstance(stream, RangeScans | PointClouds | LaserScans):
+            raise ConfigError(f"steps: stream {name!r} holds no beams; got {type(stream).__name__}")
+        source = beam_source(
+            stream,
+            name,
+            min_range=config.min_range,
+            range_sigma=config.range_sigma,
+            cloud_range=config.cloud_range,
+            drops=drops,
+        )
+        if source.dim != motion.dim:
+            raise ConfigError(
+                f"steps: {name!r} has {source.dim} dimensions, the motion of {', '.join(motion.names)} {motion.dim}"
+            )
+        sources.append(source)
+    return sources
+
+
+def _stamps(
+    first: RangeScans | PointClouds | LaserScans, beams: Array, source: MotionSource, config: StepConfig
+) -> tuple[Array, float]:
+    """Stamps of the steps and where the first begins; ``beams``: times of those inside the motion."""
+    if config.period is None:
+        last = first.beam_times[-1] if isinstance(first, RangeScans) and len(first.beam_times) else 0.0
+        whole = (first.times >= source.begin) & (first.times + last <= source.end)
+        if not np.any(whole):
+            raise DataError("no record of the scanner lies inside the motion", got=len(first.times))
+        return first.times[whole] + last, float(first.times[whole][0])
+    if len(beams):
+        begin, end = float(beams.min()), float(beams.max())
+    else:  # a scanner that never saw anything: the motion is all there is
+        begin, end = source.begin, source.end
+    n = int(np.floor((end - begin) / config.period + 1e-9))
+    if n > _MOST_STEPS:
+        source.solve(np.array([begin, end]), np.zeros(0), None)  # names the gap, if that is why
+        raise DataError(
+            f"{n} steps", got=f"{end - begin:.0f} s in steps of {config.period} s", wanted=f"≤ {_MOST_STEPS}"
+        )
+    times = np.minimum(begin + config.period * np.arange(1, n + 1), end)
+    if n == 0 or end - times[-1] > 1e-6:
+        times = np.append(times, end)
+    else:
+        times[-1] = end  # not short of the last beam by rounding
+    return times, begin
+
+
+def _choose(step: Index, n: int, most: int) -> tuple[Index, Index, int]:
+    """Numbers of the beams kept, by step ``(k,)``; offsets ``(n + 1,)``; how many were left out."""
+    order = np.argsort(step, kind="stable")
+    bounds = np.searchsorted(step[order], np.arange(n + 1))
+    kept = [order[a:b][spread(int(b - a), most)] for a, b in pairwise(bounds)]
+    offsets = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.int64)
+    chosen = np.concatenate(kept) if kept else np.zeros(0, dtype=np.int64)
+    return chosen.astype(np.int64), offsets, int(bounds[-1] - bounds[0] - offsets[-1])
+
+
+def _beams(sources: list[BeamSource], chosen: Index, config: StepConfig) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    """Origins, ends and returns of the chosen beams, base at their own time, cut at the greatest range."""
+    dim = sources[0].dim
+    origins, ends, met = np.empty((len(chosen), dim)), np.empty((len(chosen), dim)), np.zeros(len(chosen), np.bool_)
+    first = 0
+    for s in sources:
+        rows = np.flatnonzero((chosen >= first) & (chosen < first + len(s.times)))
+        rows = rows[np.argsort(chosen[rows], kind="stable")]
+        origins[rows], far, hit = s.beams(chosen[rows] - first)
+        ends[rows], met[rows] = cut_beams(origins[rows], far, hit, min(config.max_range or np.inf, s.max_range))
+        first += len(s.times)
+    return origins, ends, met

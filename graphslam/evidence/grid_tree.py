@@ -1,0 +1,128 @@
+"""The handle on a tree of an evidence grid: what its maps, queries and files are built on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import GridError, GridLockedError
+from graphslam.evidence.beams import BeamModel
+from graphslam.evidence.layout import BRICK_EDGE
+from graphslam.evidence.pool import GridPool, RootBox
+from graphslam.evidence.scan import point_rows
+from graphslam.evidence.tree_kernels import list_bricks, read_values
+
+_DEFAULT_MODEL = BeamModel()
+_new = object.__new__  # a name of the module: copying is counted in tenths of microseconds
+
+
+class GridTree:
+    """A tree in a shared pool under a handle that copies in constant time (SegSLAM, section 2).
+
+    Base of :class:`~graphslam.evidence.grid.EvidenceGrid`, which has the parameters.
+    """
+
+    __slots__ = ("__weakref__", "_box", "dim", "locked", "model", "pool", "voxel_size")
+
+    def __init__(
+        self, voxel_size: float, *, model: BeamModel | None = None, pool: GridPool | None = None, dim: int = 3
+    ) -> None:
+        if not (isinstance(voxel_size, (int, float, np.number)) and math.isfinite(voxel_size) and voxel_size > 0):
+            raise GridError("impossible voxel size", got=voxel_size, wanted="> 0 m")
+        if dim not in (2, 3):
+            raise GridError("impossible dimension of a grid", got=dim, wanted="2 or 3")
+        self.voxel_size = float(voxel_size)
+        self.model = _DEFAULT_MODEL if model is None else model
+        self.pool = GridPool() if pool is None else pool
+        self.dim = dim
+        self.locked = False
+        self._box = RootBox(0, self.pool.dead)
+
+    def copy(self) -> Self:
+        """The same map under a second handle, in constant time; whichever is written first pays for what it changes.
+
+        The copy of a locked grid is not locked.
+        """
+        twin = _new(self.__class__)
+        twin.voxel_size = self.voxel_size
+        twin.model = self.model
+        twin.pool = self.pool
+        twin.dim = self.dim
+        twin.locked = False
+        box = self._box
+        box.shared = True
+        twin._box = box
+        return twin
+
+    __copy__ = copy
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self.copy()
+
+    def empty(self, pool: GridPool | None = None) -> Self:
+        """An empty grid of the same kind, in the same pool or another."""
+        return self.__class__(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
+
+    def release(self) -> None:
+        """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""
+        self._box = RootBox(0, self.pool.dead)
+        self.pool.collect()
+
+    def lock(self) -> None:
+        """Localise only: from here on, updating raises `GridLockedError` (SegSLAM A12)."""
+        self.locked = True
+
+    def unlock(self) -> None:
+        """Allow updates again."""
+        self.locked = False
+
+    @property
+    def root(self) -> int:
+        """Root node in the pool, 0 of an empty grid; valid until the next write."""
+        return self._box.root
+
+    def take(self, other: GridTree) -> None:
+        """Become what ``other``, a grid of the same kind, is now: how a long change is made whole or not at all."""
+        other._box.shared = True
+        self.pool, self._box = other.pool, other._box
+
+    def same_as(self, other: GridTree) -> bool:
+        """Whether two handles hold the very same tree (a copy that neither side has written to)."""
+        return self._box is other._box or (self.root == 0 == other.root)
+
+    def check_writable(self) -> None:
+        """Raise `GridLockedError` if the grid is locked."""
+        if self.locked:
+            raise GridLockedError("this evidence grid is locked: it is localised in, not updated; unlock or copy it")
+
+    def packed_bricks(self) -> npt.NDArray[np.int64]:
+        """Packed coordinates and ids of the bricks, ``(n, 2)``, ascending; hold the pool's lock."""
+        pool = self.pool
+        if self.root == 0:
+            return np.zeros((0, 2), np.int64)
+        n = list_bricks(self.root, pool.levels, pool.children, np.zeros((0, 2), np.int64))
+        out = np.empty((n, 2), np.int64)
+        list_bricks(self.root, pool.levels, pool.children, out)
+        return out[np.argsort(out[:, 0])]
+
+    def brick_coordinates(self) -> npt.NDArray[np.int64]:
+        """Signed coordinates of the bricks ``(n, 3)``, ascending in (z, y, x); brick b holds voxels 8b … 8b + 7."""
+        with self.pool.lock:
+            keys = self.packed_bricks()[:, 0]
+        half = self.pool.half // BRICK_EDGE
+        return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1) - half
+
+    def values_at(self, points: Any) -> npt.NDArray[np.int16]:
+        """Values of the voxels points lie in ``(n,)``, in units of `layout.STEP`; `layout.UNKNOWN` where nothing is
+        known, outside the addressable cube, and for points that are not finite."""
+        p = point_rows(points, self.dim, self.voxel_size)
+        out = np.empty(len(p), np.int16)
+        with self.pool.lock:
+            read_values(
+                self.root, p, 1.0 / self.voxel_size, self.pool.half, self.pool.levels, self.pool.children,
+                self.pool.bricks, out,
+            )  # fmt: skip
+        return out
