@@ -25,7 +25,7 @@ class GpsOptions(GpsConfig):
     """Of these at most one in so many seconds becomes a factor; the rest is withheld, too [s]."""
     robust: Robust = spelled(Robust("cauchy", 2.385), robust="kind", robust_width="k")
     """Robust kernel on every GPS factor, and its width in standard deviations; less costs accuracy where fixes are good
-    (docs/segmap-graph.md)."""
+    (docs/notes/segmap-graph.md)."""
 
     def __post_init__(self) -> None:
         GpsConfig.__post_init__(self)

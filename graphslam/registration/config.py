@@ -79,7 +79,7 @@ class RegistrationConfig:
         A result farther from its start is refused [m, rad]: it is another place than the one asked about.
     covariance_scale : float
         Of the inverse Hessian with the noise that the pairs show; calibrated in halls, whatever the noise, the bins and
-        the number of points (docs/registration.md). Three dimensions; ``covariance_scale_planar`` in two.
+        the number of points (docs/notes/registration.md). Three dimensions; ``covariance_scale_planar`` in two.
     floor_sigma, floor_turn : float
         σ added to the covariance, per axis [m, rad]: what is wrong with the map itself. The defaults are for maps whose
         scans are placed to 2 cm and 2 mrad; for 30 m of dead reckoning 5 cm and 5 mrad fit.

@@ -1,4 +1,4 @@
-"""Figures of docs/registration.md: capture, calibration, what the gates tell apart, time. About three minutes.
+"""Figures of docs/notes/registration.md: capture, calibration, what the gates tell apart, time. About three minutes.
 
 python -m tests.benchmarks.bench_registration [capture|calibration|gates|time|recorded] [--quick: time only]
 """

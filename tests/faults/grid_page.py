@@ -1,4 +1,4 @@
-"""The table of the grid front ends in ``docs/faults.md``; ``python -m tests.faults.grid_page`` writes it anew."""
+"""The table of the grid front ends in ``docs/notes/faults.md``; ``python -m tests.faults.grid_page`` writes it anew."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.faults.grid_rows import ROWS
 
 MARK = "<!-- grid rows -->\n"
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md"
 
 
 def markdown() -> str:

@@ -62,7 +62,7 @@ class Row:
         return f"{self.name}: {self.sensor}: {self.fault}"
 
     def cells(self) -> tuple[str, ...]:
-        """Of the table in ``docs/faults.md``."""
+        """Of the table in ``docs/notes/faults.md``."""
         shows = f"`{self.shows}`" if self.outcome != "refused" else f"“{self.shows}”"
         return self.sensor, self.fault, self.name, f"{self.dim}-D", self.outcome, shows if self.shows else "—"
 
@@ -295,7 +295,7 @@ ROWS: list[Row] = _rows()
 
 
 def table() -> str:
-    """The rows as ``docs/faults.md`` shows them: front ends with the same outcome share a line."""
+    """The rows as ``docs/notes/faults.md`` shows them: front ends with the same outcome share a line."""
     seen: dict[tuple[str, ...], list[str]] = {}
     for row in ROWS:
         sensor, fault, name, dim, outcome, shows = row.cells()

@@ -63,6 +63,6 @@ def test_every_fault_has_its_outcome(row: Row, dim: int, frontend: str) -> None:
 
 
 def test_the_page_holds_the_rows() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "faults.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md").read_text()
     shown = page.partition("<!-- grid rows -->\n")[2]
-    assert shown.startswith(markdown()), "write docs/faults.md anew: python -m tests.faults.grid_page"
+    assert shown.startswith(markdown()), "write docs/notes/faults.md anew: python -m tests.faults.grid_page"

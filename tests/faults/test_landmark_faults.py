@@ -20,7 +20,7 @@ from graphslam.core.records import LandmarkObservations
 from tests.faults import inject_landmarks as inject
 from tests.faults.landmark_rows import KNOWN, ROWS, Row, table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md"
 CERTAIN = 0.999
 
 

@@ -1,5 +1,7 @@
-"""Best-known objectives ``Σ rᵀ Ω r`` (GTSAM's residual, no ½) of the recorded pose networks; docs/pose-graphs.md says
-how each was established."""
+"""Best-known objectives ``Σ rᵀ Ω r`` (GTSAM's residual, no ½) of the recorded pose networks.
+
+docs/notes/pose-graphs.md describes how each was established.
+"""
 
 from __future__ import annotations
 

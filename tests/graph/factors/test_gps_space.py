@@ -156,7 +156,7 @@ def test_a_late_first_fix_moves_nothing(rng):
 def test_multipath_jumps_of_thirty_metres(rng, kind):
     """One fix in five is off by 30 m, in bursts that agree with each other; Cauchy keeps the map.
 
-    Its width is the customary one: at 1.0 the kernel costs accuracy without any jump (docs/segmap-graph.md).
+    Its width is the customary one: at 1.0 the kernel costs accuracy without any jump (docs/notes/segmap-graph.md).
     """
     error = {"clean": [], "spoilt": []}
     for _ in range(3):
