@@ -9,8 +9,8 @@ import pytest
 from graphslam.core.errors import DataError
 from graphslam.evaluate.gps_innovation import GpsInnovations
 from graphslam.evaluate.loop_consistency import Loops, loop_consistency
-from graphslam.plots.association import plot_runs
 from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
+from graphslam_studies.plots.association import plot_runs
 
 
 def loops_of(errors: np.ndarray) -> Loops:

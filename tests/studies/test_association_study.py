@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies import association_trial
-from graphslam.app.studies.association_ambiguity import PAIRS, QUICK, STUDY, WORLDS, local_nees, paired
-from graphslam.app.studies.association_trial import FIVE_SIGMA_3DOF, LOCAL, SINGLE, Trial, run_trial
-from graphslam.app.studies.definition import StudyDefinition, find_study, fingerprint
 from graphslam.core.errors import UnknownNameError
 from graphslam.evaluate.consistency import nees, vector_pose_error
+from graphslam_studies import association_trial
+from graphslam_studies.association_ambiguity import PAIRS, QUICK, STUDY, WORLDS, local_nees, paired
+from graphslam_studies.association_trial import FIVE_SIGMA_3DOF, LOCAL, SINGLE, Trial, run_trial
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study, fingerprint
 
 CONFIG = QUICK["rows-quick"]
 

@@ -9,13 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.studies.calibration import STUDY
-from graphslam.app.studies.calibration_scanned import Added, faulty
-from graphslam.app.studies.definition import find_study
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam_frontends.odometry.recorded import chain
+from graphslam_studies.calibration import STUDY
+from graphslam_studies.calibration_scanned import Added, faulty
+from graphslam_studies.montecarlo.definition import find_study
 
 
 def test_quick_study_maps_a_drawn_robot_three_ways(tmp_path) -> None:

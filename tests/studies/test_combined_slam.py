@@ -7,7 +7,10 @@ import pandas as pd
 import pytest
 
 from graphslam.app.compare import map_nees
-from graphslam.app.studies.combined_report import (
+from graphslam.core.errors import UnknownNameError
+from graphslam.evaluate.metrics import map_truth
+from graphslam.join.submap_solver import solve_submaps
+from graphslam_studies.combined_report import (
     GLOBAL,
     agreement,
     final,
@@ -20,13 +23,10 @@ from graphslam.app.studies.combined_report import (
     report,
     targets,
 )
-from graphslam.app.studies.combined_slam import STUDY
-from graphslam.app.studies.combined_trial import TrialConfig, _Trial, run_trial
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.core.errors import UnknownNameError
-from graphslam.evaluate.metrics import map_truth
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.join.submap_solver import solve_submaps
+from graphslam_studies.combined_slam import STUDY
+from graphslam_studies.combined_trial import TrialConfig, _Trial, run_trial
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
+from graphslam_studies.montecarlo.trials import Measurement
 
 CONFIG = TrialConfig("quick", 20)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.exits import FACTOR, STUDY, drawn_robot, inside_table, told
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam_studies.exits import FACTOR, STUDY, drawn_robot, inside_table, told
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
 
 COLUMNS = ["world", "run", "algorithm", "submap", "quantity", "value"]
 

@@ -11,8 +11,8 @@ from graphslam.app.worlds import simulate
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_adjoint, se2_compose, se2_inverse, se2_transform
 from graphslam.core.log import SensorLog
-from graphslam.solve.network.full_batch import FullBatch, full_batch
 from graphslam_frontends.odometry.motion import MotionNoise, steering_odometry
+from graphslam_studies.baselines.full_batch import FullBatch, full_batch
 from tests.reference.batch_slam import batch_slam
 
 

@@ -9,7 +9,12 @@ import pytest
 
 from graphslam.core.errors import DataError, UnknownNameError
 from graphslam.core.geometry import wrap_angle
-from graphslam.evaluate.gap import (
+from graphslam.join.ekf import join_ekf
+from graphslam.join.order import join_sequential, join_tree
+from graphslam.join.submap_blocks import relabel
+from graphslam.join.submap_isam2 import solve_submaps_isam2
+from graphslam.join.submap_solver import solve_submaps
+from graphslam_studies.evaluate.gap import (
     METHODS,
     gap_along,
     gap_by_tree,
@@ -17,11 +22,6 @@ from graphslam.evaluate.gap import (
     polish_history,
     pose_consistency_along,
 )
-from graphslam.join.ekf import join_ekf
-from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.submap_blocks import relabel
-from graphslam.join.submap_isam2 import solve_submaps_isam2
-from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 

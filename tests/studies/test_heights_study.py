@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.heights import PAIR, STUDY, exit_table, pair_table
-from graphslam.app.studies.refinement_trial import ROBOTS, drawn_garage
 from graphslam.core.poses import upright
-from graphslam.evaluate.segslam_judge import climbs
+from graphslam_studies.evaluate.segslam_judge import climbs
+from graphslam_studies.heights import PAIR, STUDY, exit_table, pair_table
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
+from graphslam_studies.refinement_trial import ROBOTS, drawn_garage
 
 COLUMNS = ["world", "run", "algorithm", "submap", "quantity", "value"]
 
@@ -53,7 +53,7 @@ def test_every_algorithm_runs_in_both_ways(tables: tuple[pd.DataFrame, pd.DataFr
 
 
 def test_the_first_of_a_pair_is_todays_filter(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
-    from graphslam.app.studies.segslam_trial import run_trial
+    from graphslam_studies.segslam_trial import run_trial
 
     wanted = {(m.algorithm, m.quantity, m.submap): m.value for m in run_trial(STUDY.quick["court-quick"].grid, 1)
               if not m.timing and m.algorithm == "rbpf-5"}  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.imu import Imu
-from graphslam.graph.inertial_start import inertial_start, turned_on
+from graphslam_studies.graph.inertial_start import inertial_start, turned_on
 from tests.reference.imu_ring import NOISE, true_readings, true_unit
 
 UNSURE = replace(NOISE, gyro_bias=0.1)

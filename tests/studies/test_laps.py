@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError
-from graphslam.sim.laps import Laps, LapsConfig, draw_laps
 from graphslam.skeleton.schur import Layout, Network, Workers
+from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 
 CONFIG = LapsConfig(poses=480, laps=6, gps_every=5)
 

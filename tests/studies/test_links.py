@@ -7,8 +7,8 @@ import pytest
 
 from graphslam.core.errors import DataError
 from graphslam.core.se3 import matrix_to_quat, se3_between, se3_log
-from graphslam.sim.laps import Laps, LapsConfig, draw_laps
-from graphslam.skeleton.links import relative_links
+from graphslam_studies.baselines.links import relative_links
+from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 
 
 @pytest.fixture(scope="module")

@@ -14,16 +14,7 @@ import pytest
 
 from graphslam.app.machine import hold_one_thread
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.evaluate.executors import Job, execute
-from graphslam.evaluate.montecarlo import (
-    COLUMNS,
-    Measurement,
-    TrialError,
-    check_measurements,
-    run_trials,
-    trial_seed,
-)
-from graphslam.evaluate.tables import (
+from graphslam_studies.evaluate.tables import (
     consistency_of,
     consistency_table,
     coverage_table,
@@ -31,6 +22,15 @@ from graphslam.evaluate.tables import (
     ratio_table,
     summarise,
     values_of,
+)
+from graphslam_studies.montecarlo.executors import Job, execute
+from graphslam_studies.montecarlo.trials import (
+    COLUMNS,
+    Measurement,
+    TrialError,
+    check_measurements,
+    run_trials,
+    trial_seed,
 )
 from tests.reference.trials import dies_once, fails_once, gives_a_lambda, notes_its_process, steady
 

@@ -9,7 +9,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import rotation2, se2_compose
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 
 
 def winding(dim: int, n: int = 60) -> Trajectory:

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.definition import find_study
-from graphslam.app.studies.scale import STUDY
-from graphslam.app.studies.scale_trial import averaged_passes, pass_labels
-from graphslam.sim.laps import LapsConfig, draw_laps
+from graphslam_studies.montecarlo.definition import find_study
+from graphslam_studies.scale import STUDY
+from graphslam_studies.scale_trial import averaged_passes, pass_labels
+from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.segmap_graph import STUDY, decision_table, gain_table, nees_table
-from graphslam.app.studies.segmap_trial import GraphTrial, is_right
 from graphslam.core import se3
 from graphslam.core.errors import UnknownNameError
 from graphslam.loops.measure import Loop
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
+from graphslam_studies.segmap_graph import STUDY, decision_table, gain_table, nees_table
+from graphslam_studies.segmap_trial import GraphTrial, is_right
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from graphslam.app.studies import segslam_report as report
+from graphslam_studies import segslam_report as report
 
 COLUMNS = ["world", "run", "algorithm", "submap", "quantity", "value"]
 

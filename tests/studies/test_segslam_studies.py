@@ -10,22 +10,22 @@ import pandas as pd
 import pytest
 
 from graphslam.app.run.front_ends import recommended
-from graphslam.app.studies import segslam_trial
-from graphslam.app.studies.definition import StudyDefinition, find_study, fingerprint
-from graphslam.app.studies.segslam_building import STUDY as BUILDING
-from graphslam.app.studies.segslam_garage import STUDY as GARAGE
-from graphslam.app.studies.segslam_mine import STUDY as MINE
-from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 from graphslam.core.config import build
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, level
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate import segslam_judge as judge
 from graphslam_frontends.grid.filter_drift import FilterDrift
 from graphslam_frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_studies import segslam_trial
+from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study, fingerprint
+from graphslam_studies.segslam_building import STUDY as BUILDING
+from graphslam_studies.segslam_garage import STUDY as GARAGE
+from graphslam_studies.segslam_mine import STUDY as MINE
+from graphslam_studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 
 STUDIES = {"segslam-garage": GARAGE, "segslam-mine": MINE, "segslam-building": BUILDING}
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import DataError
-from graphslam.plots.segslam_study import Curve, plot_by_particles
+from graphslam_studies.plots.segslam_study import Curve, plot_by_particles
 
 
 def test_curves_runs_and_the_paper_are_where_they_belong() -> None:

@@ -9,7 +9,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.sharpness import sharpness
+from graphslam_studies.evaluate.sharpness import sharpness
 
 
 @pytest.fixture(scope="module")

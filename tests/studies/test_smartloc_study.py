@@ -11,13 +11,13 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.studies import smartloc
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.smartloc import CAUCHY, STUDY, Score, chosen, scored, settings_of, windows
-from graphslam.app.studies.study import open_study
 from graphslam.core.errors import GraphSlamError
 from graphslam.io.catalog import load
-from graphslam.sim.satellites import SatelliteConfig, simulate_satellites
+from graphslam_studies import smartloc
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
+from graphslam_studies.montecarlo.study import open_study
+from graphslam_studies.sim.satellites import SatelliteConfig, simulate_satellites
+from graphslam_studies.smartloc import CAUCHY, STUDY, Score, chosen, scored, settings_of, windows
 
 
 def test_it_is_a_study():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, UnknownNameError
-from graphslam.sim.street import (
+from graphslam_studies.sim.street import (
     FREE,
     HOLE,
     NEITHER,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError
-from graphslam.sim.street import FREE, HOLE, PASSAGE, StreetRobot, draw_street
-from graphslam.sim.street_rover import Command, RoverState, StreetRover
+from graphslam_studies.sim.street import FREE, HOLE, PASSAGE, StreetRobot, draw_street
+from graphslam_studies.sim.street_rover import Command, RoverState, StreetRover
 
 ROBOT = StreetRobot(beams=31, beam_step=3.0)
 WAY = np.array([[8.0, 0.0], [12.0, 0.0], [12.0, 3.0]])

@@ -18,11 +18,11 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.app.studies.definition import find_study, fingerprint, source_digest
-from graphslam.app.studies.folder import TABLE_COLUMNS, StudyFolder
-from graphslam.app.studies.study import Study, markdown_table, open_study, study
 from graphslam.core.errors import ConfigError, FormatError, GraphSlamError, RunFolderError, UnknownNameError
-from graphslam.evaluate.montecarlo import Measurement, run_trials, trial_seed
+from graphslam_studies.montecarlo.definition import find_study, fingerprint, source_digest
+from graphslam_studies.montecarlo.folder import TABLE_COLUMNS, StudyFolder
+from graphslam_studies.montecarlo.study import Study, markdown_table, open_study, study
+from graphslam_studies.montecarlo.trials import Measurement, run_trials, trial_seed
 from tests.reference import small_study
 from tests.reference.trials import steady
 
@@ -274,7 +274,7 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
 
 
 def test_code_that_changed_between_trials_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphslam.app.studies.study.source_digest", lambda: "another day")
+    monkeypatch.setattr("graphslam_studies.montecarlo.study.source_digest", lambda: "another day")
     study(FRAGILE, 1, quick=True, out=tmp_path, progress=False)
     monkeypatch.undo()
     assert "code was changed" not in (tmp_path / "report.md").read_text()
@@ -289,7 +289,7 @@ def test_wrong_use_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be loaded"):
         study("no.such.module:STUDY", out=tmp_path)
     with pytest.raises(ConfigError, match="is no study"):
-        study("graphslam.app.studies.study:Study", out=tmp_path)
+        study("graphslam_studies.montecarlo.study:Study", out=tmp_path)
     with pytest.raises(UnknownNameError, match="unknown world 'nar'; did you mean near"):
         study(SMALL, out=tmp_path, worlds=["nar"])
     with pytest.raises(ConfigError, match="0 trials"):
@@ -356,7 +356,7 @@ def test_the_verb_is_exported() -> None:
 
 
 def test_registered_studies_are_found_by_name() -> None:
-    from graphslam.app.studies import STUDIES
+    from graphslam_studies import STUDIES
 
     for name in STUDIES:
         found = find_study(name)

@@ -14,8 +14,8 @@ from scipy import stats
 
 from graphslam.core.errors import DataError
 from graphslam.plots import style
-from graphslam.plots.algorithms import _ALGORITHMS, algorithm_label, algorithm_line, in_order
-from graphslam.plots.study import (
+from graphslam_studies.plots.algorithms import _ALGORITHMS, algorithm_label, algorithm_line, in_order
+from graphslam_studies.plots.study import (
     median_bounds,
     plot_ci,
     plot_error_band,
@@ -23,10 +23,10 @@ from graphslam.plots.study import (
     plot_rms,
     plot_rms_panels,
 )
-from graphslam.plots.study_figures import save_paper_figures
-from graphslam.plots.study_local import plot_local_honesty
-from graphslam.plots.study_table import algorithms_with
-from graphslam.plots.study_time import plot_cumulative_time
+from graphslam_studies.plots.study_figures import save_paper_figures
+from graphslam_studies.plots.study_local import plot_local_honesty
+from graphslam_studies.plots.study_table import algorithms_with
+from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.study_rows import COLUMNS, study_rows
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.studies.study import open_study
-from graphslam.app.studies.terrain_drives import STUDY, DriveTrialConfig, draw_course, harm_of, run_drive_trial
-from graphslam.app.studies.terrain_learning import FIRST_SEED
+from graphslam_studies.montecarlo.study import open_study
+from graphslam_studies.terrain_drives import STUDY, DriveTrialConfig, draw_course, harm_of, run_drive_trial
+from graphslam_studies.terrain_learning import FIRST_SEED
 
 CURB = DriveTrialConfig(maps=("bands",), targets=("curb-15",), begin=4.0, beyond=2.5, longest=30.0)
 

@@ -10,15 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.studies.study import open_study
-from graphslam.app.studies.terrain import STUDY
-from graphslam.app.studies.terrain_learning import FIRST_SEED, learn_tables
-from graphslam.app.studies.terrain_trial import BOX, FixedGrid, TerrainTrialConfig, coarser
 from graphslam.core.errors import ConfigError
 from graphslam.maps.terrain.line_kernels import OVERHANG, STEP
 from graphslam.maps.terrain.pyramid import Pyramid
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
+from graphslam_studies.montecarlo.study import open_study
+from graphslam_studies.terrain import STUDY
+from graphslam_studies.terrain_learning import FIRST_SEED, learn_tables
+from graphslam_studies.terrain_trial import BOX, FixedGrid, TerrainTrialConfig, coarser
 
 
 def test_the_quick_one_on_the_command_line(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.studies.trust import FULL, QUICK, honesty, run_trial, summary_table, world_table
-from graphslam.app.studies.trust_worlds import TrustWorld, draw_world, lasting, world_log
 from graphslam.core.geometry import se2_between
 from graphslam.core.random import SeedTree
+from graphslam_studies.trust import FULL, QUICK, honesty, run_trial, summary_table, world_table
+from graphslam_studies.trust_worlds import TrustWorld, draw_world, lasting, world_log
 
 
 def test_worlds_are_drawn_alike_again_and_half_of_them_are_clean():

@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.studies.definition import StudyDefinition, find_study
-from graphslam.app.studies.study import open_study
-from graphslam.app.studies.withheld_fixes import STUDY, scores_steady, steady_motion, used_of
 from graphslam.core.records import Gps
+from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
+from graphslam_studies.montecarlo.study import open_study
+from graphslam_studies.withheld_fixes import STUDY, scores_steady, steady_motion, used_of
 
 
 def walked(rng: np.random.Generator, density: float, n: int = 240) -> Gps:

@@ -33,12 +33,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies.association_trial import LOCAL, SINGLE, TrialConfig, run_trial
 from graphslam.core.errors import UnknownNameError
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.evaluate.tables import consistency_of
-from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
+from graphslam_studies.association_trial import LOCAL, SINGLE, TrialConfig, run_trial
+from graphslam_studies.evaluate.tables import consistency_of
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.plots.association import plot_runs
 
 WORLDS = {name: TrialConfig(name) for name in ("clutter", "pairs", "rows", "hard")}
 _FEW = ("known", "ekf-nn", "ekf-jcbb", "ekf-jcbb-smoothed", "rbpf-40", "rbpf1-40", "rbpf-paper")
@@ -80,15 +80,15 @@ class AssociationAmbiguity:
     description = "unknown association in clutter, pairs, rows: EKF (NN, JCBB) against RBPF on errors, divergence, NEES"
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return tuple(QUICK if quick else WORLDS)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return 3 if quick else 20
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         known = {**WORLDS, **QUICK}
         if world not in known:
             raise UnknownNameError("world of association-ambiguity", world, known)

@@ -24,12 +24,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evaluate.association import AssociationErrors, association_errors, majority_identity, pair_agreement
 from graphslam.evaluate.consistency import nees, vector_pose_error
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.association import Association
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.order import join_sequential
 from graphslam.join.polish import polish
+from graphslam_studies.montecarlo.trials import Measurement
 
 Ints = npt.NDArray[np.int64]
 Options = Mapping[str, Any]
@@ -82,7 +82,7 @@ class TrialConfig:
 
 
 def run_trial(config: TrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run (see :mod:`graphslam.app.studies.association_ambiguity` for their names)."""
+    """All figures of one run (see :mod:`graphslam_studies.association_ambiguity` for their names)."""
     with one_blas_thread():
         return list(Trial(config, seed).run())
 

@@ -12,7 +12,7 @@ m, rad); ``path``, ``landmarks`` [m], ``nees_poses``, ``nees_landmarks`` by degr
 Of scans: ``relations`` of pairs of poses drawn at random [m], ``…_input`` of the odometry that came in; ``input_told``:
 the verdict says that this is better; ``worse_untold``: it is, by a tenth of its error, and the verdict does not.
 Algorithms: ``stated``, ``calibrated``, ``oracle``, ``preset``; of scans as in
-:func:`graphslam.app.studies.calibration_scanned.scanned`.
+:func:`graphslam_studies.calibration_scanned.scanned`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies.calibration_scanned import Added
-from graphslam.app.studies.calibration_trial import CalibrationTrialConfig, run_calibration_trial
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.calibration_scanned import Added
+from graphslam_studies.calibration_trial import CalibrationTrialConfig, run_calibration_trial
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 
 BIAS = float(np.deg2rad(0.31))
 WORLDS = {

@@ -22,10 +22,10 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Odometry, VelocityControls
 from graphslam.core.se3 import se3_inverse, se3_transform
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.evaluate.trajectory_error import ate
 from graphslam_frontends.odometry.recorded import chain
+from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_studies.montecarlo.trials import Measurement
 
 UNKNOWN = "unknown"
 """Name of a recorded log here: no preset is made for it."""

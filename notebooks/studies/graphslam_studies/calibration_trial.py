@@ -14,13 +14,13 @@ from graphslam.app.run.calibration import calibrate_log, without_noise
 from graphslam.app.run.config import preset
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.source import load_log_source
-from graphslam.app.studies.calibration_robot import DrawnRobot, draw_robot, drive
-from graphslam.app.studies.calibration_scanned import UNKNOWN, Added, faulty, scanned
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import Calibration
 from graphslam.core.config import as_dict
 from graphslam.core.log import SensorLog
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam_studies.calibration_robot import DrawnRobot, draw_robot, drive
+from graphslam_studies.calibration_scanned import UNKNOWN, Added, faulty, scanned
+from graphslam_studies.montecarlo.trials import Measurement
 
 OPTIONS: dict[str, Any] = {
     "frontend": {"association": "known", "particles": 20, "stopping": {"max_distance": 20.0}},

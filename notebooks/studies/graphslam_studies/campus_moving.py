@@ -15,20 +15,20 @@ from time import process_time
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies.campus_trial import CampusTrialConfig
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_transform
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.moving import outvoted
 from graphslam.sim.campus import simulate_campus
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.front_end import ScanWindow
+from graphslam_studies.campus_trial import CampusTrialConfig
+from graphslam_studies.montecarlo.trials import Measurement
 
 ALL = 1_000_000
 """Beams of a step: every one of them is scored."""

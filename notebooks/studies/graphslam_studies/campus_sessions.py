@@ -17,14 +17,14 @@ from scipy import stats
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.pipeline import run as run_log
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
-from graphslam.app.studies.campus_trial import CampusTrialConfig, Judge, submap_lift
 from graphslam.core.config import as_dict
 from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.sim.campus import simulate_campus
+from graphslam_studies.campus_trial import CampusTrialConfig, Judge, submap_lift
+from graphslam_studies.montecarlo.trials import Measurement
 
 NAMES = ("first", "overlap", "far")
 THREE_SIGMA = float(stats.chi2.cdf(9.0, 1))

@@ -25,7 +25,6 @@ from graphslam.core.poses import SE3, level
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.trajectory_error import fit_alignment
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import GpsRecord, level_datum_pose
@@ -35,6 +34,7 @@ from graphslam.solve.solution import Solution
 from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.front_end import ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
+from graphslam_studies.montecarlo.trials import Measurement
 
 KINDS = ("odometry", "odometry-fixes", "alone", "joint-white", "joint")
 PAIRS = {"odometry-fixes": "odometry", "joint-white": "alone", "joint": "alone"}

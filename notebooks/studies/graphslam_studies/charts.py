@@ -32,7 +32,6 @@ import pandas as pd
 from graphslam.app.compare import map_nees
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_exp, wrap_angle
 from graphslam.core.log import SensorLog, Truth
@@ -42,7 +41,6 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations, Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.association import Association
 from graphslam.join.joined_map import JoinResult
@@ -50,6 +48,8 @@ from graphslam.join.polish import polish
 from graphslam.join.registry import JOINERS, methods_for
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 
 RATE, SENSOR_RATE = 10.0, 2.0
 PARTICLES = 40

@@ -30,13 +30,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies.combined_report import report
-from graphslam.app.studies.combined_trial import TrialConfig, run_trial
 from graphslam.core.errors import UnknownNameError
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.plots.save import save
-from graphslam.plots.study_figures import save_paper_figures
-from graphslam.plots.study_growth import plot_growth_panels
+from graphslam_studies.combined_report import report
+from graphslam_studies.combined_trial import TrialConfig, run_trial
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.plots.study_figures import save_paper_figures
+from graphslam_studies.plots.study_growth import plot_growth_panels
 
 # Scans a submap, so that the route makes 126 submaps as in the paper: 35.4 m in A and C, 44.4 m in B.
 _WORLDS = {"A": TrialConfig("A", 59), "B": TrialConfig("B", 74), "C": TrialConfig("C", 59)}
@@ -52,26 +52,26 @@ class CombinedSlam:
     description = "EKF, RBPF, EKF-EIF, RBPF-EKF, RBPF-EIF (sequence, tree) beside iSAM2 and batch: NEES, CI, RMSE, time"
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return tuple(_QUICK if quick else _WORLDS)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return 3 if quick else 20
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         known = {**_WORLDS, **_QUICK}
         if world not in known:
             raise UnknownNameError("world of combined-slam", world, known)
         return partial(run_trial, known[world])
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return report(table, timings)
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         made = save_paper_figures(table, timings, folder)
         for world in dict.fromkeys(table["world"]):
             t = table[table["world"] == world]

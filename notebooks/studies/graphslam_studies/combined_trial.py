@@ -15,7 +15,6 @@ import numpy as np
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.studies.scoring import Judge, Watch, clock, timed, watch_snapshots
 from graphslam.app.worlds import simulate
 from graphslam.core.config import merge
 from graphslam.core.errors import GraphSlamError
@@ -23,7 +22,6 @@ from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
@@ -31,11 +29,13 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
-from graphslam.solve.network.full_batch import full_batch
 from graphslam_frontends.landmarks.ekf_slam import ekf_snapshots
 from graphslam_frontends.landmarks.prepare import prepare
 from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
 from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_studies.baselines.full_batch import full_batch
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.scoring import Judge, Watch, clock, timed, watch_snapshots
 
 CLASSICAL: dict[str, Callable[..., JoinResult]] = {
     "eif": partial(join_sequential, classical=True),
@@ -68,7 +68,7 @@ class TrialConfig:
 
 
 def run_trial(config: TrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run (see :mod:`graphslam.app.studies.combined_slam` for their names)."""
+    """All figures of one run (see :mod:`graphslam_studies.combined_slam` for their names)."""
     with one_blas_thread():
         return list(_Trial(config, seed).run())
 

@@ -21,15 +21,15 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.heights import exit_table
-from graphslam.app.studies.segslam_trial import LEVEL, QUICK, GridTrial, GridTrialConfig
-from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.sim.crawler_config import CrawlerConfig, crawler_preset
 from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.heights import exit_table
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.segslam_trial import LEVEL, QUICK, GridTrial, GridTrialConfig
 
 FACTOR = {
     **{"wheel_sigma": 4.0, "wheel_scale": 4.0, "range_sigma": 4.0, "drop_out": 4.0},

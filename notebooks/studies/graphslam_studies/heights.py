@@ -27,16 +27,16 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.refinement_trial import RefinementTrial, RefinementTrialConfig, drawn_garage
-from graphslam.app.studies.segmap_trial import GraphTrialConfig
-from graphslam.app.studies.segslam_building import SEGSLAM as BUILDING
-from graphslam.app.studies.segslam_trial import LEVEL, QUICK, Figure, GridTrial, GridTrialConfig
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.intervals import grouped_mean_interval, mean_interval
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.refinement_trial import RefinementTrial, RefinementTrialConfig, drawn_garage
+from graphslam_studies.segmap_trial import GraphTrialConfig
+from graphslam_studies.segslam_building import SEGSLAM as BUILDING
+from graphslam_studies.segslam_trial import LEVEL, QUICK, Figure, GridTrial, GridTrialConfig
 
 Likelihood = Literal["endpoint", "cast", "upright"]
 PAIR: tuple[Likelihood, Likelihood] = ("endpoint", "upright")

@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.refinement_trial import FAULTS, RefinementTrialConfig, run_refinement_trial
-from graphslam.app.studies.segmap_graph import QUICK_WORLDS as GRAPH_QUICK
-from graphslam.app.studies.segmap_graph import WORLDS as GRAPH_WORLDS
-from graphslam.app.studies.segmap_trial import GraphTrialConfig
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
+from graphslam_studies.refinement_trial import FAULTS, RefinementTrialConfig, run_refinement_trial
+from graphslam_studies.segmap_graph import QUICK_WORLDS as GRAPH_QUICK
+from graphslam_studies.segmap_graph import WORLDS as GRAPH_WORLDS
+from graphslam_studies.segmap_trial import GraphTrialConfig
 
 
 def _alone(config: GraphTrialConfig) -> GraphTrialConfig:

@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies.segmap_trial import GraphTrial, GraphTrialConfig
-from graphslam.app.studies.segslam_trial import GridTrialConfig, Outcome
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate import segslam_judge as judge
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.refined import heading_error
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.refine.config import RefineConfig
@@ -35,6 +31,10 @@ from graphslam.solve.batch import BatchSolver
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.submaps import base_of
+from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.segmap_trial import GraphTrial, GraphTrialConfig
+from graphslam_studies.segslam_trial import GridTrialConfig, Outcome
 
 ROBOTS = {
     "range_sigma": (0.01, 0.05),

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies.scale_trial import ScaleTrialConfig, run_scale_trial
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
-from graphslam.sim.laps import LapsConfig
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.scale_trial import ScaleTrialConfig, run_scale_trial
+from graphslam_studies.sim.laps import LapsConfig
 
 WORLDS = {
     "laps-2400": ScaleTrialConfig("methods", LapsConfig(poses=2400)),

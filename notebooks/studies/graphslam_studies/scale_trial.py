@@ -12,16 +12,16 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.sim.laps import Laps, LapsConfig, draw_laps
 from graphslam.skeleton.collapse import Collapse, number_by_first_sighting
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.links import relative_links
 from graphslam.skeleton.preconditioner import Levels
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.relax import RelaxConfig, Relaxed, relax_skeleton
 from graphslam.skeleton.schur import Layout, Network, Workers
 from graphslam.solve.network.solve import solve_network
+from graphslam_studies.baselines.links import relative_links
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 
 Labels = npt.NDArray[np.int32]
 Rows = Iterator[Measurement]

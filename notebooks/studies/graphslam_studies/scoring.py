@@ -20,11 +20,11 @@ from graphslam.core.log import Truth
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.joined_map import MapView, landmark_scalars
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_studies.montecarlo.trials import Measurement
 
 Ids = npt.NDArray[np.int64]
 FEATURE_STRIDE = 9

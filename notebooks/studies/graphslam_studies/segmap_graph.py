@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.segmap_trial import GraphStudy, GraphTrialConfig
-from graphslam.app.studies.segslam_building import SEGSLAM as BUILDING
-from graphslam.app.studies.segslam_mine import SEGSLAM as MINE
-from graphslam.app.studies.segslam_trial import LEVEL, QUICK, Figure, GridTrialConfig
-from graphslam.app.studies.worlds_study import draw_runs
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.montecarlo.worlds_study import draw_runs
+from graphslam_studies.segmap_trial import GraphStudy, GraphTrialConfig
+from graphslam_studies.segslam_building import SEGSLAM as BUILDING
+from graphslam_studies.segslam_mine import SEGSLAM as MINE
+from graphslam_studies.segslam_trial import LEVEL, QUICK, Figure, GridTrialConfig
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy")
 _GARAGE = GridTrialConfig(

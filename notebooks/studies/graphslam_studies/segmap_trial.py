@@ -16,16 +16,12 @@ from time import perf_counter
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
-from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate import segslam_judge as judge
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.loops import LoopCloser
@@ -35,6 +31,10 @@ from graphslam.solve.batch import BatchSolver
 from graphslam.solve.solution import Solution
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
+from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 
 RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
 """A loop is right if it is off by less [m], [rad]: three σ of a good registration, and half a pillar's breadth."""

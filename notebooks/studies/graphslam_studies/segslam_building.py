@@ -21,11 +21,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.segslam_garage import path_figure
-from graphslam.app.studies.segslam_trial import DEAD_RECKONING, LEVEL, QUICK, Figure, GridStudy, GridTrialConfig
-from graphslam.app.studies.worlds_study import draw_runs
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.montecarlo.worlds_study import draw_runs
+from graphslam_studies.segslam_garage import path_figure
+from graphslam_studies.segslam_trial import DEAD_RECKONING, LEVEL, QUICK, Figure, GridStudy, GridTrialConfig
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy", "legs", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")

@@ -28,8 +28,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.segslam_trial import (
+from graphslam.core.errors import UnknownNameError
+from graphslam.plots.save import save
+from graphslam.plots.segments import plot_segments
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.montecarlo.worlds_study import draw_runs
+from graphslam_studies.plots.segslam_study import Curve, plot_by_particles
+from graphslam_studies.segslam_trial import (
     DEAD_RECKONING,
     LEVEL,
     QUICK,
@@ -38,11 +43,6 @@ from graphslam.app.studies.segslam_trial import (
     GridTrialConfig,
     family_of,
 )
-from graphslam.app.studies.worlds_study import draw_runs
-from graphslam.core.errors import UnknownNameError
-from graphslam.plots.save import save
-from graphslam.plots.segments import plot_segments
-from graphslam.plots.segslam_study import Curve, plot_by_particles
 
 NUMBERS = (1, 5, 10, 20, 40, 100)
 _FIGURES: tuple[Figure, ...] = ("matches", "exits", "entropy", "path")

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.segslam_garage import path_figure
-from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
-from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
 from graphslam_frontends.segslam.config import SegSlamConfig, WinnowConfig
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.plots.association import plot_runs
+from graphslam_studies.segslam_garage import path_figure
+from graphslam_studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
 
 _FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")

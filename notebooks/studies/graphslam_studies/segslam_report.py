@@ -11,12 +11,12 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies.segslam_trial import family_of
-from graphslam.app.studies.worlds_study import whole
 from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.intervals import grouped_mean_interval, mean_interval, ratio_of_means, share_interval
+from graphslam_studies.montecarlo.worlds_study import whole
+from graphslam_studies.segslam_trial import family_of
 
 Row = dict[str, object]
 

@@ -16,15 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.app.worlds import mesh_world
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate import segslam_judge as judge
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.refined import heading_error
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.sim.court import court
@@ -47,6 +44,9 @@ from graphslam_frontends.segslam.config import (
 )
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
 
 Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path", "climbs"]
 DEAD_RECKONING = "dead-reckoning"
@@ -86,7 +86,7 @@ class GridTrialConfig:
     samples: int = 1
     """Map samples, or particles of a filter, whose entropy is taken at most."""
     placements: int = 1
-    """Ways in which the grid of each stands (see :func:`~graphslam.evaluate.segslam_judge.clarity`)."""
+    """Ways in which the grid of each stands (see :func:`~graphslam_studies.evaluate.segslam_judge.clarity`)."""
     crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
     """The robot."""
     speed: float = 1.0

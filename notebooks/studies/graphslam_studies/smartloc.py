@@ -32,19 +32,19 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies import segslam_report as tables
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.gnss import TangentPlane
 from graphslam.core.log import SensorLog
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.graph.factors.attitude import DOWN
-from graphslam.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.catalog import load
-from graphslam.sim.satellites import SatelliteConfig, simulate_satellites
 from graphslam.solve.batch import BatchSolver
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
+from graphslam_studies.sim.satellites import SatelliteConfig, simulate_satellites
 
 HONEST = (0.7, 1.4)
 """NEES/n that counts as honest."""

@@ -25,10 +25,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.app.studies.surface_trial import SurfaceTrialConfig, run_surface_trial
-from graphslam.app.studies.worlds_study import WorldsStudy
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.sim.lidar import LidarConfig
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.sim.lidar import LidarConfig
+from graphslam_studies.surface_trial import SurfaceTrialConfig, run_surface_trial
 
 WORLDS = {
     "garage": SurfaceTrialConfig(world="garage"),
@@ -50,7 +50,7 @@ class SurfaceStudy(WorldsStudy[SurfaceTrialConfig]):
     run_one: Callable[[SurfaceTrialConfig, int], Iterable[Measurement]] = staticmethod(run_surface_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         out: dict[str, pd.DataFrame] = {}
         for world, rows in table.groupby("world", sort=False):
             wide = rows.pivot_table(index="algorithm", columns="quantity", values="value", sort=False)
@@ -61,7 +61,7 @@ class SurfaceStudy(WorldsStudy[SurfaceTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
         return []
 
 

@@ -16,7 +16,6 @@ from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.maps.surface.layer import SurfaceLayer
@@ -25,9 +24,10 @@ from graphslam.maps.surface.piece import Scan, SurfaceConfig, normals_of
 from graphslam.sim.campus_config import CampusConfig
 from graphslam.sim.campus_world import campus
 from graphslam.sim.garage import garage
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
 from graphslam.sim.raycast import RayCaster
 from graphslam.sim.world import World
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 SAMPLES = 60_000
 """Points of each surface that are compared."""

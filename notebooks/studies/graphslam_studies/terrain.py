@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies.terrain_trial import RINGS, TerrainTrialConfig, run_terrain_trial
-from graphslam.app.studies.worlds_study import WorldsStudy
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.maps.terrain.tables import read_tables
-from graphslam.sim.street import StreetRobot
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.sim.street import StreetRobot
+from graphslam_studies.terrain_trial import RINGS, TerrainTrialConfig, run_terrain_trial
 
 WORLDS = {
     "panning": TerrainTrialConfig(start=12.0),
@@ -52,7 +52,7 @@ class TerrainStudy(WorldsStudy[TerrainTrialConfig]):
     run_one: Callable[[TerrainTrialConfig, int], Iterable[Measurement]] = staticmethod(run_terrain_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         out: dict[str, pd.DataFrame] = {}
         for world, rows in table.groupby("world", sort=False):
             for what, title in (
@@ -78,7 +78,7 @@ class TerrainStudy(WorldsStudy[TerrainTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
         return []
 
 

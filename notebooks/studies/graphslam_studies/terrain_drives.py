@@ -35,25 +35,16 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.ndimage import binary_closing, distance_transform_edt
 
-from graphslam.app.studies.terrain_trial import (
-    BOX,
-    SINGLE,
-    FixedGrid,
-    Mask,
-    TerrainTrialConfig,
-    labelled,
-    statements,
-)
-from graphslam.app.studies.worlds_study import WorldsStudy
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.maps.terrain.lines import ScanLines, lines_of_scans
 from graphslam.maps.terrain.plan import CostConfig, CostMap, PlannedWay, cost_map, plan_way
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass, TerrainMap
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, Vehicle
-from graphslam.sim.street import (
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.sim.street import (
     BEGIN,
     END,
     HALF_WIDTH,
@@ -66,7 +57,16 @@ from graphslam.sim.street import (
     Street,
     draw_street,
 )
-from graphslam.sim.street_rover import Command, RoverState, StreetRover
+from graphslam_studies.sim.street_rover import Command, RoverState, StreetRover
+from graphslam_studies.terrain_trial import (
+    BOX,
+    SINGLE,
+    FixedGrid,
+    Mask,
+    TerrainTrialConfig,
+    labelled,
+    statements,
+)
 
 FIXED = {"one grid, OctoMap": (0.85, 0.4), "one grid, equal": (0.4, 0.4)}
 """Maps with fixed weights: log-odds of a hit and of a miss."""
@@ -337,7 +337,7 @@ class DrivesStudy(WorldsStudy[DriveTrialConfig]):
     run_one: Callable[[DriveTrialConfig, int], Iterable[Measurement]] = staticmethod(run_drive_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         out: dict[str, pd.DataFrame] = {}
         wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
         drives = table[table["quantity"] == "right"].groupby(["world", "algorithm"], sort=False)["value"].count()
@@ -367,7 +367,7 @@ class DrivesStudy(WorldsStudy[DriveTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
         return []
 
 

@@ -12,7 +12,16 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 from tqdm import tqdm
 
-from graphslam.app.studies.terrain_trial import (
+from graphslam.core.errors import ConfigError
+from graphslam.core.geometry import Array
+from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
+from graphslam.maps.terrain.lines import Rows, lines_of_scans
+from graphslam.maps.terrain.pyramid import Pyramid
+from graphslam.maps.terrain.tables import BINS, SCALE, WEIGHTS, Tables, fixed_tables
+from graphslam.maps.terrain.vehicle import CELLS
+from graphslam_studies.maps.learning import count_values, fit_calibration, fit_weights, ratios_of
+from graphslam_studies.sim.street import OBSTACLE, RAMP_LENGTH, TARGETS, Street, draw_street, drive_street
+from graphslam_studies.terrain_trial import (
     BOX,
     SINGLE,
     TerrainTrialConfig,
@@ -22,15 +31,6 @@ from graphslam.app.studies.terrain_trial import (
     snapshots,
     statements,
 )
-from graphslam.core.errors import ConfigError
-from graphslam.core.geometry import Array
-from graphslam.maps.terrain.learning import count_values, fit_calibration, fit_weights, ratios_of
-from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
-from graphslam.maps.terrain.lines import Rows, lines_of_scans
-from graphslam.maps.terrain.pyramid import Pyramid
-from graphslam.maps.terrain.tables import BINS, SCALE, WEIGHTS, Tables, fixed_tables
-from graphslam.maps.terrain.vehicle import CELLS
-from graphslam.sim.street import OBSTACLE, RAMP_LENGTH, TARGETS, Street, draw_street, drive_street
 
 FIRST_SEED = 10_000
 """Of the teaching drives; test drives have the seeds of their study."""
@@ -129,7 +129,7 @@ def learn_tables(
     threshold = good[0] if good else CANDIDATES[-1]
     provenance: dict[str, Any] = {
         "made_by": "graphslam terrain-tables",
-        "streets": "teaching streets of graphslam.sim.street",
+        "streets": "teaching streets of graphslam_studies.sim.street",
         "seeds": [int(s) for s in seeds],
         "targets": list(targets),
         "laser": c.laser,

@@ -14,13 +14,13 @@ from scipy.ndimage import distance_transform_edt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.maps.terrain.line_kernels import OVERHANG
 from graphslam.maps.terrain.lines import Rows, ScanLines, lines_of_scans, observe
 from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
-from graphslam.sim.street import (
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.street import (
     FREE,
     HOLE,
     OBSTACLE,
@@ -140,7 +140,7 @@ def snapshots(drive: StreetDrive, distances: tuple[float, ...]) -> list[int]:
 
 @dataclass(frozen=True)
 class Labelled:
-    """The truth of the finest cells of :data:`BOX`; see :meth:`graphslam.sim.street.Street.labels`."""
+    """The truth of the finest cells of :data:`BOX`; see :meth:`graphslam_studies.sim.street.Street.labels`."""
 
     x: Array
     y: Array

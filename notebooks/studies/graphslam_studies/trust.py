@@ -1,6 +1,6 @@
 """The study ``trust``: what a run without truth says of its covariances, beside what is true.
 
-Worlds are drawn (:mod:`graphslam.app.studies.trust_worlds`): route, features, robot, noise, receiver; every other
+Worlds are drawn (:mod:`graphslam_studies.trust_worlds`): route, features, robot, noise, receiver; every other
 world is clean, the others have one or two things wrong that nobody tells the run. ``graphslam.run`` maps each as a user
 would, with the noise as it is stated (no calibration), identities known, and says its word
 (:mod:`graphslam.evaluate.trust`).
@@ -26,13 +26,13 @@ from scipy import stats
 
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
-from graphslam.app.studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.intervals import share_interval
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
 
 WORDS = ("consistent", "over-confident", "pessimistic", "undecided")
 SAID = {

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphslam.app.studies.charts import RATE, ChartConfig, draw_log
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_exp, se2_transform, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, LandmarkObservations, Odometry, Stream
+from graphslam_studies.charts import RATE, ChartConfig, draw_log
 
 GPS_KINDS = ("none", "white", "rtk", "lasting", "lasting-white", "multipath")
 FRONT_ENDS = ("rbpf-ekf", "ekf")

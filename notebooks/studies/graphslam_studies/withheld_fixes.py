@@ -5,11 +5,11 @@ whether its covariance says so. There is a node at every position, so that what 
 both tell where it is.
 
 ``euroc-…``: EuRoC machine hall 01, IMU and tracked prism. Attitudes and the gyro's bias start from the used positions
-(:mod:`graphslam.graph.inertial_start`); path, velocities, biases, tilt and the place of the map in the frame of the
-positions are solved for. ``kitti-…``: fixes of a car without its IMU; between them it goes on as it went, with white
-noise of the acceleration. Its density is that of the second differences of the used fixes in the plane, times a factor
-(a car's acceleration is smoother than white noise) that is chosen on the first half of the drive, whose withheld fixes
-are then known; the second half is scored.
+(:mod:`graphslam_studies.graph.inertial_start`); path, velocities, biases, tilt and the place of the map in the frame of
+the positions are solved for. ``kitti-…``: fixes of a car without its IMU; between them it goes on as it went, with
+white noise of the acceleration. Its density is that of the second differences of the used fixes in the plane, times a
+factor (a car's acceleration is smoother than white noise) that is chosen on the first half of the drive, whose withheld
+fixes are then known; the second half is scored.
 
 Quantities
 ----------
@@ -31,7 +31,6 @@ import numpy.typing as npt
 import pandas as pd
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.studies.worlds_study import WorldsStudy, draw_runs
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.poses import SE3
@@ -40,14 +39,15 @@ from graphslam.core.se3 import quat_rotate
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.inertial_start import inertial_start, turned_on
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.catalog import load
 from graphslam.solve.batch import BatchSolver
+from graphslam_studies.graph.inertial_start import inertial_start, turned_on
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 
 Mask = npt.NDArray[np.bool_]
 NOTHING = np.repeat([0.5, 3.0], 3)

@@ -14,10 +14,10 @@ from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.random import SeedTree
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, odometry_of
 from graphslam_frontends.lidar_odometry.inertial import Readings, Way, fit, running, tilt_of, upright
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 NOISE = ImuNoise(
     gyro=3e-4,

@@ -14,9 +14,9 @@ from typing import Any, Protocol, cast, runtime_checkable
 import numpy as np
 import pandas as pd
 
-from graphslam.app.studies import STUDIES
-from graphslam.core.errors import ConfigError, UnknownNameError
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam.core.errors import ConfigError
+from graphslam.core.plugins import load_plugin, plugins, unknown
+from graphslam_studies.montecarlo.trials import Measurement
 
 
 @runtime_checkable
@@ -51,40 +51,23 @@ class StudyDefinition(Protocol):
         ...
 
 
+GROUP = "graphslam.studies"
+
+
 def find_study(name: str) -> StudyDefinition:
-    """The study registered as ``name``, or a user's own as ``module:object``.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    StudyDefinition
-        Name, worlds, algorithms, and what one trial is.
-
-    Raises
-    ------
-    UnknownNameError
-        Nothing is registered under that name.
-    ConfigError
-        ``module:object`` cannot be imported, or is no study.
-
-    Examples
-    --------
-    >>> gs.find_study("segslam-garage").worlds(quick=False)
-    ('garage-A', 'garage-B', 'garage-C', 'garage-D', 'garage-drawn')
-    """
-    target = STUDIES.get(name, name)
-    if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", target):
-        raise UnknownNameError("study", name, STUDIES)
-    module_name, _, attribute = target.partition(":")
-    try:
-        found = getattr(importlib.import_module(module_name), attribute)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise ConfigError(f"study {name!r} cannot be loaded from {target}: {error}") from None
+    """See :func:`graphslam.find_study`."""
+    if name in plugins(GROUP):
+        found = load_plugin(GROUP, "study", name)
+    elif re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name):
+        module, _, attribute = name.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), attribute)
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise ConfigError(f"study {name!r} cannot be loaded: {error}") from None
+    else:
+        raise unknown(GROUP, "study", name, plugins(GROUP))
     if not isinstance(found, StudyDefinition):
-        raise ConfigError(f"{target} is no study: it lacks worlds, default_trials, trial, report or figures")
+        raise ConfigError(f"{name} is no study: it lacks worlds, default_trials, trial, report or figures")
     return cast(StudyDefinition, found)
 
 
@@ -94,12 +77,12 @@ def fingerprint(trial: Callable[..., Any]) -> str:
 
 
 def source_digest() -> str:
-    """Short digest of the installed code of graphslam and its front ends.
+    """Short digest of the installed code of graphslam, its front ends and the studies.
 
     Versions change with a release; between releases this tells whether two trials were run by the same code.
     """
     digest = hashlib.sha256()
-    for package in ("graphslam", "graphslam_frontends"):
+    for package in ("graphslam", "graphslam_frontends", "graphslam_studies"):
         root = Path(str(importlib.import_module(package).__file__)).resolve().parent
         for path in sorted(root.rglob("*.py")):
             digest.update(f"{package}/{path.relative_to(root).as_posix()}\0".encode())

@@ -25,7 +25,7 @@ from graphslam.app.folders.lock import locked, make_folder
 from graphslam.core.atomic import read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.npz import flags, floats, ints, texts
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam_studies.montecarlo.trials import Measurement
 
 logger = logging.getLogger(__name__)
 

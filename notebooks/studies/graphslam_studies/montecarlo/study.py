@@ -14,14 +14,14 @@ from tqdm import tqdm
 
 from graphslam.app.folders.generations import new_generation
 from graphslam.app.machine import hold_one_thread, one_blas_thread, versions
-from graphslam.app.studies import STUDIES
-from graphslam.app.studies.definition import StudyDefinition, find_study, fingerprint, source_digest
-from graphslam.app.studies.folder import StudyFolder
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import heeded_interrupts
 from graphslam.core.markup import element, frame, join, table
-from graphslam.evaluate.executors import Executor, Job, execute
-from graphslam.evaluate.montecarlo import Measurement, check_measurements, trial_seed
+from graphslam.core.plugins import plugins
+from graphslam_studies.montecarlo.definition import GROUP, StudyDefinition, find_study, fingerprint, source_digest
+from graphslam_studies.montecarlo.executors import Executor, Job, execute
+from graphslam_studies.montecarlo.folder import StudyFolder
+from graphslam_studies.montecarlo.trials import Measurement, check_measurements, trial_seed
 
 logger = logging.getLogger(__name__)
 
@@ -81,26 +81,26 @@ class Study:
     def plot_consistency(
         self, quantity: str = "pose_nees", *, world: str | None = None, ax: Any = None, **options: Any
     ) -> Any:
-        """Consistency index along the run; see :func:`graphslam.plots.study.plot_ci`."""
-        from graphslam.plots.study import plot_ci
+        """Consistency index along the run; see :func:`graphslam_studies.plots.study.plot_ci`."""
+        from graphslam_studies.plots.study import plot_ci
 
         return plot_ci(ax, self._of(self.table, world), quantity, **options)
 
     def plot_rms(self, *, world: str | None = None, **options: Any) -> Sequence[Any]:
-        """RMS errors of poses and features of every algorithm; see :func:`graphslam.plots.study.plot_rms_panels`."""
-        from graphslam.plots.study import plot_rms_panels
+        """RMS errors of poses and features; see :func:`graphslam_studies.plots.study.plot_rms_panels`."""
+        from graphslam_studies.plots.study import plot_rms_panels
 
         return plot_rms_panels(self._of(self.table, world), **options)
 
     def plot_errors(self, algorithm: str | None = None, *, world: str | None = None, **options: Any) -> Sequence[Any]:
-        """Error of one run with its 3σ band; see :func:`graphslam.plots.study.plot_error_panels`."""
-        from graphslam.plots.study import plot_error_panels
+        """Error of one run with its 3σ band; see :func:`graphslam_studies.plots.study.plot_error_panels`."""
+        from graphslam_studies.plots.study import plot_error_panels
 
         return plot_error_panels(self._of(self.table, world), algorithm, **options)
 
     def plot_time(self, *, world: str | None = None, ax: Any = None, **options: Any) -> Any:
-        """Cumulative time along the run; see :func:`graphslam.plots.study_time.plot_cumulative_time`."""
-        from graphslam.plots.study_time import plot_cumulative_time
+        """Cumulative time along the run; see :func:`graphslam_studies.plots.study_time.plot_cumulative_time`."""
+        from graphslam_studies.plots.study_time import plot_cumulative_time
 
         return plot_cumulative_time(ax, self._of(self.timings, world), **options)
 
@@ -145,49 +145,7 @@ def study(
     quick: bool = False,
     progress: bool = True,
 ) -> Study:
-    """Run a study, or go on with one: trials that are in the folder are not run again, failed ones are.
-
-    Parameters
-    ----------
-    name : str
-        Registered name (``combined-slam``, ``association-ambiguity``), or a study of your own, ``module:object``.
-    trials : int, optional
-        Trials of each world; default the study's own.
-    out : path, optional
-        Folder of the study; default ``study-NAME`` in the working directory.
-    worlds : sequence of str, optional
-        Some of the study's worlds; default all.
-    seed : int
-        Root of the seed tree. Trial k has the same seed in every world, so worlds of one layout share it.
-    workers : int, optional
-        Processes; default none, the trials run here.
-    cluster : str, optional
-        Address of a Dask scheduler, instead of processes.
-    quick : bool
-        The study's small version.
-    progress : bool
-        Show a progress bar on stderr.
-
-    Returns
-    -------
-    Study
-        Also written to the folder: ``table.csv``, ``timings.csv``, ``report.md``, ``figures/``.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-        Unknown study or world, or an impossible option.
-    RunFolderError
-        The folder holds another study.
-    KeyboardInterrupt
-        After what is done has been written.
-
-    Examples
-    --------
-    >>> study = gs.study("charts", 1, quick=True, out="studies/one", progress=False)
-    >>> list(study.table.columns)
-    ['world', 'run', 'algorithm', 'submap', 'quantity', 'value']
-    """
+    """See :func:`graphslam.study`."""
     definition = find_study(name)
     known = tuple(definition.worlds(quick))
     for world in worlds or ():
@@ -264,38 +222,12 @@ def _run(
 
 
 def open_study(folder: str | Path, definition: StudyDefinition | str | None = None) -> Study:
-    """Read a study from its folder, finished or not, without running anything.
-
-    Parameters
-    ----------
-    folder : path
-    definition : StudyDefinition or str, optional
-        A study of your own: itself, or ``module:object``. A folder names its study, too, but a folder that somebody
-        gave you must not choose what is imported: without this argument only the registered studies are opened.
-
-    Returns
-    -------
-    Study
-        Its tidy ``table`` (``world, run, algorithm, submap, quantity, value``), ``report()`` and figures.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        Not the folder of a study.
-    UnknownNameError
-        A study that is not registered.
-
-    Examples
-    --------
-    >>> made = gs.study("charts", 1, quick=True, out="studies/charts", progress=False)
-    >>> gs.open_study("studies/charts")
-    Study('charts': runs strong-drift-quick: 1, space-quick: 1; 0 failed)
-    """
+    """See :func:`graphslam.open_study`."""
     opened = StudyFolder(folder)
     if definition is None:
         name = str(opened.identity()["name"])
-        if name not in STUDIES:
-            raise UnknownNameError("study", name, [*STUDIES, "your own, with open_study(folder, definition)"])
+        if name not in plugins(GROUP):
+            raise UnknownNameError("study", name, [*plugins(GROUP), "your own, with open_study(folder, definition)"])
         definition = name
     return Study.read(find_study(definition) if isinstance(definition, str) else definition, opened)
 

@@ -1,6 +1,6 @@
 """Monte Carlo studies: a trial is a function of its seed, an executor runs it, a tidy table holds the results.
 
-Statistics are elsewhere (:mod:`graphslam.evaluate.tables`): the table is what was measured, and can be judged anew.
+Statistics are elsewhere (:mod:`graphslam_studies.evaluate.tables`): the table is what was measured.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.executors import Executor, Job, execute
+from graphslam_studies.montecarlo.executors import Executor, Job, execute
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ def run_trials(
     seed : int
         Seed of the study.
     executor, workers, address
-        See :func:`graphslam.evaluate.executors.execute`.
+        See :func:`graphslam_studies.montecarlo.executors.execute`.
     timings : bool
         Give the measured times instead of the reproducible figures.
     progress : bool

@@ -10,9 +10,9 @@ from typing import Generic, TypeVar
 import pandas as pd
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.evaluate.montecarlo import Measurement
-from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.plots.association import plot_runs
 
 C = TypeVar("C")
 
@@ -37,15 +37,15 @@ class WorldsStudy(Generic[C]):
         self.full, self.quick, self._trials = full, quick, trials
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return tuple(self.quick if quick else self.full)
 
     def default_trials(self, quick: bool) -> int:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         return 2 if quick else self._trials
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See :class:`~graphslam.app.studies.definition.StudyDefinition`."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
         known = {**self.full, **self.quick}
         if world not in known:
             raise UnknownNameError(f"world of {self.name}", world, known)

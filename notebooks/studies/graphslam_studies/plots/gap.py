@@ -27,8 +27,8 @@ def plot_gap_along(ax: Axes | None, table: pd.DataFrame, *, title: str | None = 
     Parameters
     ----------
     table : DataFrame
-        Of :func:`graphslam.evaluate.gap.gap_along`. Submaps whose optimum is below 1 (nothing was seen twice yet) are
-        left out.
+        Of :func:`graphslam_studies.evaluate.gap.gap_along`. Submaps whose optimum is below 1 (nothing was seen twice
+        yet) are left out.
     """
     if table.empty:
         raise DataError("no objectives to draw")
@@ -56,7 +56,7 @@ def plot_tree_gap(ax: Axes | None, table: pd.DataFrame, *, value: str = "own", t
     Parameters
     ----------
     table : DataFrame
-        Of :func:`graphslam.evaluate.gap.gap_by_tree`.
+        Of :func:`graphslam_studies.evaluate.gap.gap_by_tree`.
     value : {"own", "gap"}
         What a join has added, or the whole gap of the map it made.
     """
@@ -95,7 +95,7 @@ def plot_convergence(
     Parameters
     ----------
     histories : mapping of start to (k,)
-        Objectives, e.g. of :func:`graphslam.evaluate.gap.polish_history`.
+        Objectives, e.g. of :func:`graphslam_studies.evaluate.gap.polish_history`.
     optimum : float, optional
         Default the least of them all.
     """

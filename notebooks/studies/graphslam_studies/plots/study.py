@@ -19,12 +19,12 @@ from scipy import stats
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line
-from graphslam.plots.study_local import plot_local_honesty as plot_local_honesty
-from graphslam.plots.study_table import algorithms_with, curve_of
-from graphslam.plots.study_time import plot_cumulative_time as plot_cumulative_time
+from graphslam_studies.evaluate.tables import values_of
+from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
+from graphslam_studies.plots.study_local import plot_local_honesty as plot_local_honesty
+from graphslam_studies.plots.study_table import algorithms_with, curve_of
+from graphslam_studies.plots.study_time import plot_cumulative_time as plot_cumulative_time
 
 DOF = {"pose_nees": 3, "feature_nees": 2, "local_pose_nees": 3}
 _NAMES = {"pose_nees": "end pose", "feature_nees": "features"}

@@ -8,12 +8,12 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.axes import Axes
 
-from graphslam.plots.algorithms import algorithm_label
 from graphslam.plots.save import save
-from graphslam.plots.study import plot_ci, plot_error_panels, plot_rms_panels
-from graphslam.plots.study_local import plot_local_honesty
-from graphslam.plots.study_table import algorithms_with
-from graphslam.plots.study_time import plot_cumulative_time
+from graphslam_studies.plots.algorithms import algorithm_label
+from graphslam_studies.plots.study import plot_ci, plot_error_panels, plot_rms_panels
+from graphslam_studies.plots.study_local import plot_local_honesty
+from graphslam_studies.plots.study_table import algorithms_with
+from graphslam_studies.plots.study_time import plot_cumulative_time
 
 ERRORS_OF = ("rbpf-eif", "default-online")
 CONSISTENCY = ("ekf", "rbpf", "ekf-eif", "rbpf-ekf", "rbpf-eif", "default-eif", "default-online")

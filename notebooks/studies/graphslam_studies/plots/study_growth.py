@@ -12,10 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from graphslam.core.geometry import Array
-from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line
-from graphslam.plots.study_table import algorithms_with
+from graphslam_studies.evaluate.tables import values_of
+from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
+from graphslam_studies.plots.study_table import algorithms_with
 
 Component = Literal["position", "heading", "features"]
 _LABELS = {"position": "RMS position error [m]", "heading": "RMS heading error [°]", "features": "RMS of features [m]"}

@@ -12,8 +12,8 @@ from scipy import stats
 
 from graphslam.core.errors import DataError
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line
-from graphslam.plots.study_table import algorithms_with, curve_of
+from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
+from graphslam_studies.plots.study_table import algorithms_with, curve_of
 
 
 def plot_local_honesty(

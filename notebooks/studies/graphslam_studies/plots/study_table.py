@@ -6,8 +6,8 @@ import pandas as pd
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.evaluate.tables import values_of
-from graphslam.plots.algorithms import in_order
+from graphslam_studies.evaluate.tables import values_of
+from graphslam_studies.plots.algorithms import in_order
 
 
 def algorithms_with(table: pd.DataFrame, quantity: str, *, online: bool) -> list[str]:

@@ -10,10 +10,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from graphslam.evaluate.tables import values_of
 from graphslam.plots import style
-from graphslam.plots.algorithms import algorithm_label, algorithm_line
-from graphslam.plots.study_table import algorithms_with, curve_of
+from graphslam_studies.evaluate.tables import values_of
+from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
+from graphslam_studies.plots.study_table import algorithms_with, curve_of
 
 
 def plot_cumulative_time(

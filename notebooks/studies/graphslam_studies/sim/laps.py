@@ -17,11 +17,11 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.se3 import quat_multiply, quat_to_matrix, so3_exp
-from graphslam.sim import laps_kernels as kernels
 from graphslam.skeleton.collapse import Collapse
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.tile_store import Tiles, write_tiles
+from graphslam_studies.sim import laps_kernels as kernels
 
 _BLOCK = 20_000
 """Poses drawn at a time; part of what a seed means."""

@@ -15,7 +15,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.sim.crawler_sensors import cast_scans
 from graphslam.sim.raycast import RayCaster
-from graphslam.sim.street import Street, StreetRobot, pose_errors
+from graphslam_studies.sim.street import Street, StreetRobot, pose_errors
 
 _DT = 0.01
 _AHEAD = 0.4

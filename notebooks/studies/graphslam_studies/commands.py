@@ -1,4 +1,4 @@
-"""``graphslam study``."""
+"""``graphslam study``, ``terrain-tables``."""
 
 from __future__ import annotations
 
@@ -8,19 +8,14 @@ import typer
 
 from graphslam.app.cli.run import JSON
 from graphslam.app.cli.terminal import emit, table
-from graphslam.app.studies import STUDIES
 from graphslam.core.errors import GraphSlamError
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to the command line."""
-    app.command()(study)
+from graphslam.core.plugins import plugins
 
 
 def study(
     name: str = typer.Argument(
         ...,
-        help=", ".join(STUDIES) + ", or your own as module:object.",
+        help=", ".join(plugins("graphslam.studies")) + ", or your own as module:object.",
     ),
     trials: int | None = typer.Option(None, help="Number of trials in each world. Default: that of the study."),
     workers: int | None = typer.Option(None, help="Number of processes. Default: the trials run in this process."),
@@ -32,7 +27,7 @@ def study(
     as_json: bool = JSON,
 ) -> None:
     """Run a Monte-Carlo study: all algorithms on the same data, one table, a report, figures. It resumes itself."""
-    from graphslam.app.studies.study import study as run_study
+    from graphslam_studies.montecarlo.study import study as run_study
 
     result = run_study(
         name,
@@ -69,3 +64,21 @@ def study(
             f"{len(failures)} trials failed, first {first['world']}/{first['run']} (seed {first['seed']}): "
             f"{first['error']}; all in {out / 'report.md'}"
         )
+
+
+def terrain_tables(
+    out: Path = typer.Option(..., help="File to write the tables to (.json)."),
+    drives: int = typer.Option(10, help="Number of simulated drives towards each kind of target."),
+    seed: int = typer.Option(10_000, help="Seed of the first drive; the others follow."),
+    as_json: bool = JSON,
+) -> None:
+    """Learn what scan lines say of obstacles, edges and holes, on simulated streets that no study drives through."""
+    from graphslam_studies.terrain_learning import write_learnt_tables
+
+    tables = write_learnt_tables(out, drives=drives, first_seed=seed, progress=not as_json)
+    value = {"out": str(out), "threshold": tables.threshold, **tables.provenance}
+    rows = [
+        {"threshold": t, "false": a, "false on flat ground": b}
+        for t, (a, b) in value["false_alarms_while_learning"].items()
+    ]
+    emit(value, f"{table(rows)}\nthreshold {tables.threshold}; written to {out}", as_json=as_json)
