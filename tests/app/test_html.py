@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 
 import graphslam
+import graphslam_studies
 from graphslam.app.report.report import Report
 from graphslam.app.run.run import Run
 from graphslam.app.run.without_truth import WithoutTruth
@@ -48,7 +49,7 @@ NOTHING = np.zeros(0, dtype=np.int64)
 def classes() -> dict[str, type]:
     """Every class of the package that says how it looks in a notebook."""
     found = {}
-    for package in (graphslam,):
+    for package in (graphslam, graphslam_studies):
         for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if m.name.endswith("__main__"):
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import os
@@ -19,6 +20,7 @@ import pytest
 import graphslam as gs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.core.errors import ConfigError, FormatError, GraphSlamError, RunFolderError, UnknownNameError
+from graphslam.core.plugins import plugins
 from graphslam_studies.montecarlo.definition import find_study, fingerprint, source_digest
 from graphslam_studies.montecarlo.folder import TABLE_COLUMNS, StudyFolder
 from graphslam_studies.montecarlo.study import Study, markdown_table, open_study, study
@@ -350,15 +352,16 @@ def test_a_study_is_read_back_shows_itself_and_draws(serial: Study, tmp_path: Pa
 
 
 def test_the_verb_is_exported() -> None:
-    assert gs.study is study
-    assert gs.open_study is open_study
-    assert {"study", "open_study"} <= set(dir(gs))
+    """With the same arguments; it calls what is installed beside it."""
+    for offered, called in ((gs.study, study), (gs.open_study, open_study), (gs.find_study, find_study)):
+        there, here = (inspect.signature(f).parameters.values() for f in (offered, called))
+        assert [(p.name, p.default, p.kind) for p in there] == [(p.name, p.default, p.kind) for p in here]
+    assert gs.find_study("charts") is find_study("charts")
+    assert {"study", "open_study", "find_study"} <= set(dir(gs))
 
 
 def test_registered_studies_are_found_by_name() -> None:
-    from graphslam_studies import STUDIES
-
-    for name in STUDIES:
+    for name in plugins("graphslam.studies"):
         found = find_study(name)
         assert found.name == name
         for quick in (True, False):
