@@ -95,10 +95,12 @@ def of_systematic(found: Systematic | None) -> list[Evidence]:
     """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
     if found is None:
         return []
-    out = by_size("χ² of motion and sightings in short windows", "map", found.ratio, found.dof)
+    out = by_size("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
     p = len(found.taken)
-    out.append(by_score("constant errors of calibration", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
-    drifts = [by_size("errors that last for a window", "map", v, d) for v, d in zip(found.drift, found.drift_dof)]
+    out.append(by_score("calibration errors", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
+    drifts = [
+        by_size("time-correlated errors within windows", "map", v, d) for v, d in zip(found.drift, found.drift_dof)
+    ]
     worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)
     if worst is not None:
         chance = min(1.0, p * worst.too_large)
@@ -144,7 +146,7 @@ def trust(rows: Sequence[Evidence], *, fixes: bool, nonlinearity: float = 0.0) -
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
     if large:
         return Trust("over-confident", tuple(large), min(1.0, m * large[0].too_large))
-    wanted: dict[Of, str] = {"map": "motion and sightings"}
+    wanted: dict[Of, str] = {"map": "odometry and observations"}
     if fixes:
         wanted["fixes"] = "fixes"
     covers = {of: [r for r in rows if r.of == of and not r.lasting and r.upper <= MATTERS] for of in wanted}

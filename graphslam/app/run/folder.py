@@ -72,7 +72,7 @@ class RunFolder:
             if folder._begun():
                 if not resume:
                     raise RunFolderError(
-                        f"{folder.path}: holds a run already; --resume goes on with it, or choose another --out"
+                        f"{folder.path}: holds a run already; resume it with --resume, or choose another --out"
                     )
                 folder._check_same(old, config)
             else:
@@ -100,10 +100,12 @@ class RunFolder:
             raise RunFolderError(f"{self.path}: damaged ({error})") from None
         now = tomllib.loads(dump_toml(config))
         if isinstance(before.get("run"), dict) and "log" not in before["run"]:
-            logger.warning("%s: an older version did not note which log it read; it is taken to be this one", self.path)
+            logger.warning(
+                "%s: written by an older version without the name of its log; assuming it is this one", self.path
+            )
             now["run"].pop("log", None)
         for key, a, b in _differences(before, now):
-            what = "the log is another one: " if key.startswith("run.log.") else ""
+            what = "another log is given: " if key.startswith("run.log.") else ""
             raise RunFolderError(f"{self.path}: cannot resume, {what}{key} was {a!r} and is {b!r} now")
 
     @property
