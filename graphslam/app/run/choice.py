@@ -58,9 +58,9 @@ def choose_front_end(log: SensorLog) -> Choice:
         return Choice("segslam", "spinning scanners with odometry")
     if has(PointClouds):
         if not any(isinstance(s, Odometry) and _in_space(s) for s in log.streams.values()):
-            return Choice("kiss-icp", "point clouds of a 3-D LiDAR; the odometry is computed from them")
+            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR; the odometry is computed from them")
         if "clouds" in log.meta.get("unplaced", ()):
-            return Choice("kiss-icp", "point clouds of a 3-D LiDAR with unknown mounting, so without odometry")
+            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR with unknown mounting, so without odometry")
         return Choice("segslam", "point clouds of a 3-D LiDAR with odometry")
     if has(LaserScans) and moves:
         return Choice("segslam", "planar laser with odometry")

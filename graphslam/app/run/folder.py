@@ -19,6 +19,7 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_links, is_empty, outputs, sweep
 from graphslam.app.folders.lock import locked, make_folder
+from graphslam.app.run.front_ends import RENAMED
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
@@ -99,6 +100,8 @@ class RunFolder:
         except ConfigError as error:
             raise RunFolderError(f"{self.path}: damaged ({error})") from None
         now = tomllib.loads(dump_toml(config))
+        if isinstance(before.get("run"), dict) and before["run"].get("frontend") in RENAMED:
+            before["run"]["frontend"] = RENAMED[before["run"]["frontend"]]
         if isinstance(before.get("run"), dict) and "log" not in before["run"]:
             logger.warning(
                 "%s: written by an older version without the name of its log; assuming it is this one", self.path

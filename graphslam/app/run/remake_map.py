@@ -189,7 +189,7 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
         raise MissingDataError(
             f"{root}: the run has no evidence grids or clouds, so there is no dense map",
             got=f"front end {run.report.get('frontend')}",
-            wanted="a run of a front end with dense maps: segslam, scan-window, kiss-icp, rbpf-grid",
+            wanted="a run of a front end with dense maps: segslam, scan-window, lidar-odometry, rbpf-grid",
         )
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
