@@ -35,7 +35,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     except GraphSlamError as error:
         return [Noticed("", Finding("bad", "unreadable", str(error)))]
     if not isinstance(log, SensorLog):
-        text = f"{type(log).__name__}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
+        text = f"{source}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
         return [Noticed("", Finding("", "read", text))]
     said = [Noticed("", Finding("", "read", f"{reading_line(log) or log.name}."))]
     said += [Noticed("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)]

@@ -150,12 +150,12 @@ def open_run(path: str | Path) -> Run:
 
 
 def load(source: str | Path, **options: Any) -> SensorLog:
-    """A sensor log by card name, or from a folder.
+    """Load a sensor log by data set name, or from a folder.
 
     Parameters
     ----------
     source : str or path
-        Name of a card (``graphslam data list``), or a folder in a layout that is known.
+        Name of a data set (``graphslam data list``), or a folder in a layout that is known.
     **options
         For its reader.
 

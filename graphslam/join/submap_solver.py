@@ -100,7 +100,7 @@ class SubmapEstimate:
         f = landmarks - self.landmarks
         if (chart or self.chart) == "group":
             if self.anchors is None:
-                raise SolverError("the map does not say what its landmarks hang on: wanted anchors")
+                raise SolverError("the map has no anchors of its landmarks")
             e[:, :2] = along_arc(e[:, :2], e[:, 2])
             f = along_arc(f, e[self.anchors, 2])
         return np.concatenate([e.ravel(), f.ravel()])

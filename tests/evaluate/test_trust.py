@@ -174,7 +174,7 @@ def test_errors_that_last_for_a_window_are_found(rng):
         found = 0
         for _ in range(40):
             rows = of_systematic(sums([windows(rng, 6, lasts), windows(rng, 6, lasts)]))
-            found += next(r for r in rows if r.name.startswith("errors that last")).too_large < 0.01
+            found += next(r for r in rows if r.name.startswith("time-correlated errors")).too_large < 0.01
         return found
 
     assert named(0.0) <= 3

@@ -315,7 +315,7 @@ def _open(home: Path, root: Path) -> Run:
 
 
 def refined_submaps_of(run: Run) -> list[Submap]:
-    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the result."""
+    """Submaps of a run along its refined path, with their dense maps; none without refinement."""
     if run.refined is not None:
         return run.refined.submaps
     if run.folder is None:
