@@ -133,7 +133,7 @@ def join(
     ----------
     submaps : sequence of Submap, or PoseProblem
         In order; submap k+1 starts where submap k ends. Those without landmarks are joined by their poses: with the
-        matches that they carry, or with all ties of a :class:`~graphslam.join.pose_problem.PoseProblem`.
+        matches that they carry, or with all constraints of a :class:`~graphslam.join.pose_problem.PoseProblem`.
     method : str
         ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
         as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``eif-online``: in sequence,
@@ -153,7 +153,7 @@ def join(
     Returns
     -------
     SubmapEstimate
-        A :class:`~graphslam.join.joined_map.JoinResult` for the joiners; of dense submaps a
+        A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps; of dense submaps a
         :class:`~graphslam.join.pose_estimate.PoseEstimate`.
 
     Raises
