@@ -194,7 +194,6 @@ def test_counts_are_those_recorded() -> None:
     assert not fewer, f"plainer than recorded; record it with `{_COMMAND}`:\n" + "\n".join(fewer)
 
 
-@pytest.mark.xfail(reason="pages are being rewritten", strict=False)
 def test_worst_pages_are_plain() -> None:
     """Pages that had the most idioms when they were first counted, wherever they are now."""
     worst = tomllib.loads(RATCHET.read_text(encoding="utf-8"))["worst_at_the_start"]
