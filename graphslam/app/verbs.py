@@ -26,12 +26,13 @@ from graphslam.app.studies import find_study as find_study
 from graphslam.app.studies import open_study as open_study
 from graphslam.app.studies import study as study
 from graphslam.app.submap_sources import submap_source
-from graphslam.app.worlds import MESH_WORLDS, WORLDS
+from graphslam.app.worlds import CAMPUS, GROUP, MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.config import build
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.plugins import plugins
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.join import registry as joining
@@ -44,17 +45,8 @@ from graphslam_frontends.odometry.recorded import chain
 from graphslam_frontends.odometry.step_config import StepConfig
 
 __all__ = [
-    *(
-        "calibrate_log",
-        "compare",
-        "find_study",
-        "first_particles",
-        "front_ends",
-        "join_submaps",
-        "joiners",
-        "load",
-        "local_maps",
-    ),
+    *("calibrate_log", "compare", "find_study", "first_particles", "front_ends"),
+    *("join_submaps", "joiners", "load", "local_maps"),
     *("open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
 ]
 
@@ -100,7 +92,7 @@ def worlds() -> list[str]:
     >>> "garage" in gs.worlds()
     True
     """
-    return sorted({**WORLDS, **MESH_WORLDS})
+    return sorted({*WORLDS, *MESH_WORLDS, CAMPUS, *plugins(GROUP)})
 
 
 def open_run(path: str | Path) -> Run:

@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graphslam.core.errors import ConfigError, UnknownNameError
+from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
+from graphslam.core.plugins import load_plugin
 from graphslam.core.se3 import se3_inverse, se3_transform
 from graphslam.sim.mesh_worlds import MESH_WORLDS as MESH_WORLDS
+from graphslam.sim.mesh_worlds import MeshWorld
 from graphslam.sim.mesh_worlds import mesh_world as mesh_world
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from graphslam.sim.world import World
 
 
+GROUP = "graphslam.worlds"
+"""Entry points of worlds: a :class:`~graphslam.sim.mesh_worlds.MeshWorld`, or a function as in :data:`WORLDS`."""
 CAMPUS = "campus"
 """Streets and buildings, with a robot of their own (:mod:`graphslam.sim.campus`)."""
 
@@ -29,16 +33,9 @@ def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> S
     return simulate_landmark_field(landmark_field_preset(preset or "A", **changes), seed)
 
 
-def _point_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
-    from graphslam.sim.point_field import point_field_preset, simulate_point_field
-
-    return simulate_point_field(point_field_preset(preset or "flight", **changes), seed)
-
-
 # name -> what simulates it from a preset, a seed and changed figures
 WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {
     "landmark-field": _landmark_field,
-    "point-field": _point_field,
 }
 
 
@@ -89,12 +86,14 @@ def simulate(
     >>> gs.simulate("landmark-field", preset="quick", seed=1)
     SensorLog('landmark-field': controls (2080), landmarks (260); truth known)
     """
-    if world in WORLDS:
+    made: Any = WORLDS.get(world)
+    if made is None and world not in MESH_WORLDS and world != CAMPUS:
+        made = load_plugin(GROUP, "world", world, [*WORLDS, *MESH_WORLDS, CAMPUS])
+    if made is not None and not isinstance(made, MeshWorld):
         if layout is not None or world_seed is not None:
             raise ConfigError(f"world {world!r} has neither layout nor world_seed")
-        return WORLDS[world](preset, seed, changes)
-    if world not in MESH_WORLDS and world != CAMPUS:
-        raise UnknownNameError("world", world, [*WORLDS, *MESH_WORLDS, CAMPUS])
+        log: SensorLog = made(preset, seed, changes)
+        return log
     moved = seed if world_seed is None else world_seed
     for name, value in (("seed", seed), ("world_seed", moved)):
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:

@@ -6,6 +6,7 @@ A distribution registers what it brings under one of these groups; names are tho
 * ``graphslam.worlds``: simulated worlds (:func:`graphslam.simulate`);
 * ``graphslam.readers``: readers of data sets (:func:`graphslam.load`);
 * ``graphslam.frontends``: front ends (:func:`graphslam.run`);
+* ``graphslam.presets``: packages of recommended settings, ``SOURCE.FRONTEND.toml``;
 * ``graphslam.commands``: commands of ``graphslam``, functions as Typer takes them;
 * ``graphslam.verbs``: what ``graphslam.study``, ``open_study`` and ``find_study`` call.
 """
@@ -23,7 +24,13 @@ INSTALL_STUDIES = "pip install ./notebooks/studies in a clone of the repository"
 
 IN_STUDIES: dict[str, tuple[str, ...]] = {
     "graphslam.commands": ("study", "terrain-tables"),
+    "graphslam.frontends": ("ekf-slam", "rbpf-slam"),
+    "graphslam.readers": (
+        *("kitti-gps", "lidar-pack", "mrclam", "plaza", "slsjf-local-maps", "slsjf-network"),
+        *("slsjf-observations", "smartloc", "tuc", "ufastslam-detections"),
+    ),
     "graphslam.verbs": ("find_study", "open_study", "study"),
+    "graphslam.worlds": ("building", "mine", "point-field"),
 }
 """What the distribution of the studies brings, by group, so that an error can say what to install."""
 
@@ -33,26 +40,11 @@ def plugins(group: str) -> dict[str, EntryPoint]:
     return {e.name: e for e in sorted(entry_points(group=group), key=lambda e: e.name)}
 
 
-def load_plugin(group: str, kind: str, name: str) -> Any:
-    """The object that is registered under a name.
-
-    Parameters
-    ----------
-    group : str
-    kind : str
-        What it is, for messages: ``"reader"``.
-    name : str
-
-    Raises
-    ------
-    UnknownNameError, MissingExtraError
-        It is not registered; it is part of the studies, which are not installed.
-    GraphSlamError
-        It cannot be imported.
-    """
+def load_plugin(group: str, kind: str, name: str, own: Iterable[str] = ()) -> Any:
+    """The object that is registered under a name; ``kind`` and ``own``, names that are built in, are for messages."""
     found = plugins(group)
     if name not in found:
-        raise unknown(group, kind, name, found)
+        raise unknown(group, kind, name, [*own, *found])
     try:
         return found[name].load()
     except (ImportError, AttributeError) as error:

@@ -19,9 +19,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, antenna_terms
+from graphslam.graph.factors.gps import AntennaRecord, BiasPriorRecord, GpsRecord, antenna_terms
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
-from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.noise import Robust, whitener
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
@@ -340,8 +339,7 @@ class GpsFixes:
     def tidy(self) -> None:
         """A datum that no fix holds any more goes, and the biases with it."""
         g = self.graph
-        holders = (GpsRecord, PseudorangeRecord)
-        if g.structure.count("datum") and not any(isinstance(r, holders) for r in g.records.values()):
+        if g.structure.count("datum") and not any(isinstance(r, AntennaRecord) for r in g.records.values()):
             for fid in [k for k, r in g.records.items() if isinstance(r, BiasPriorRecord)]:
                 g.ledger.refund(fid)
                 del g.records[fid]

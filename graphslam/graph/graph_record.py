@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import ItemsView, Iterator, Mapping, MutableMapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,8 @@ from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import Record, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
-from graphslam.graph.factors.gps import GpsRecord
+from graphslam.graph.factors.gps import AntennaRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
-from graphslam.graph.factors.pseudorange import PseudorangeRecord
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsFixes
 from graphslam.graph.imu import ImuUnits
@@ -443,6 +442,6 @@ class GraphRecord:
         if not self.structure.count("tilt"):
             self.structure.append("tilt", np.zeros(2))
             for fid, r in self.records.items():
-                if isinstance(r, (GpsRecord, PseudorangeRecord)) and self.dim == 3:
-                    self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed
+                if isinstance(r, AntennaRecord) and self.dim == 3:
+                    self.records[fid] = replace(cast(Any, r), tilt=True)  # a new object: solvers see that it changed
             self.revision += 1

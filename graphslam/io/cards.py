@@ -85,6 +85,8 @@ class Card:
         Traps.
     reader : str or None
         Name of a reader (:mod:`graphslam.io.readers`).
+    plugin : str or None
+        Distribution that brings the reader, where graphslam itself has it not.
     options : mapping of str to float
         What the reader must be told of this set, because its files do not say it.
     """
@@ -103,6 +105,7 @@ class Card:
     files: tuple[CardFile, ...]
     archives: tuple[CardArchive, ...] = ()
     reader: str | None = None
+    plugin: str | None = None
     options: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     @property

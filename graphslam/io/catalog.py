@@ -143,11 +143,12 @@ def load(source: str | os.PathLike[str], *, reader: str | None = None, **options
         if c.reader is None and reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
         name = reader or str(c.reader)
+        find_reader(name)  # before its files are looked for
         return _read(name, locate(c), f"data set {c.name}", {"name": c.name}, {**c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
         c = card(name)
-        parts = readers()[c.reader].parts if c.reader in readers() else {}
+        parts = {} if c.reader is None else find_reader(c.reader).parts
         if not parts:
             return _named_file(c, part)
         if part not in parts:

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 
-from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError, UnknownNameError
+from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError
+from graphslam.core.plugins import load_plugin, plugins, unknown
 from graphslam.io.look import Claim, Look
 from graphslam.io.reader import Reader
 from graphslam.io.recognise import BUILT_IN
@@ -30,14 +30,11 @@ GROUP = "graphslam.readers"
 def readers() -> dict[str, Reader]:
     """All readers by name: those of other packages first, then our own, in the order in which they are asked."""
     out: dict[str, Reader] = {}
-    for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
-        try:
-            found = entry.load()
-        except (ImportError, AttributeError) as error:
-            raise GraphSlamError(f"reader {entry.name!r} cannot be imported ({error})") from error
+    for name in plugins(GROUP):
+        found = load_plugin(GROUP, "reader", name)
         if not isinstance(found, Reader):
-            raise GraphSlamError(f"entry point {entry.name!r} of {GROUP} is no Reader; got {type(found).__name__}")
-        out[entry.name] = found
+            raise GraphSlamError(f"entry point {name!r} of {GROUP} is no Reader; got {type(found).__name__}")
+        out[name] = found
     return {**out, **{k: v for k, v in BUILT_IN.items() if k not in out}}
 
 
@@ -46,7 +43,7 @@ def reader(name: str) -> Reader:
     try:
         return readers()[name]
     except KeyError:
-        raise UnknownNameError("reader", name, readers()) from None
+        raise unknown(GROUP, "reader", name, readers()) from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,9 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
-from graphslam.io.look import Claim, Look, ending, plain_name
+from graphslam.io.look import Claim, Look, ending
 from graphslam.io.reader import Reader
 
 CARMEN_SCANS = re.compile(r"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d)\b")
@@ -99,67 +98,6 @@ def _victoria_park(look: Look) -> Claim | None:
     return Claim("laser, speed and steering of the ACFR in the text form of Victoria Park (LASER.txt, DRS.txt)")
 
 
-def _slsjf_maps(look: Look) -> Claim | None:
-    found = [p for p in look.by_ending.get(".mat", []) if re.fullmatch(r"localmap_\d+\.mat", p.name)]
-    if not found:
-        return None
-    return Claim(f"{len(found)} local maps of 2D I-SLSJF") if look.path.is_dir() else Claim("a local map", "its folder")
-
-
-def _slsjf_network(look: Look) -> Claim | None:
-    found = [p for p in look.by_ending.get(".mat", []) if b"clean_data" in look.head(p)[128:4096]]
-    found += [p for p in look.by_ending.get(".mat", []) if p.name.lower().endswith("clean_data.mat") and p not in found]
-    return Claim(f"odometry and observations of 2D I-SLSJF ({found[0].name})") if found else None
-
-
-def _ufastslam(look: Look) -> Claim | None:
-    found = look.named("ufastslam_observationdistance.txt")
-    return Claim("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
-
-
-def _mrclam(look: Look) -> Claim | None:
-    robots = [p for p in look.files if re.fullmatch(r"robot\d+_odometry\.dat", plain_name(p))]
-    if not robots:
-        return None
-    said = f"UTIAS MRCLAM, {len(robots)} robots"
-    if look.path.is_file() or len({p.parent for p in robots}) > 1:
-        return Claim(said, "the one folder that holds Barcodes.dat and the files of its robots")
-    if look.named("barcodes.dat") is None:
-        return Claim(said, "Barcodes.dat beside them: which barcode is which landmark")
-    return Claim(said)
-
-
-def _plaza(look: Look) -> Claim | None:
-    tables = [p for p in look.files if re.fullmatch(r".+_dr\.txt", plain_name(p))]
-    tables = [p for p in tables if (r := rows_of(look, p)) and all(len(x) == 3 for x in r)]
-    if not tables:
-        return None
-    prefix = plain_name(tables[0])[: -len("_dr.txt")]
-    said = f"Plaza (range only), {tables[0].name}"
-    if look.path.is_file() or look.named(f"{prefix}_td.txt") is None:
-        return Claim(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
-    return Claim(said)
-
-
-def _tagged(look: Look, tags: tuple[str, ...]) -> Path | None:
-    return next((p for p in look.texts if look.lines(p, 1)[0].split()[0] in tags), None)
-
-
-def _tuc(look: Look) -> Claim | None:
-    path = _tagged(look, ("odom2", "loop"))
-    return Claim(f"odometry and loop candidates of TU Chemnitz ({path.name})") if path else None
-
-
-def _smartloc(look: Look) -> Claim | None:
-    path = _tagged(look, ("odom3", "pseudorange3"))
-    return Claim(f"odometry and pseudoranges of smartLoc ({path.name})") if path else None
-
-
-def _kitti_gps(look: Look) -> Claim | None:
-    path = next((p for p in look.texts if look.lines(p, 1)[0].split() == ["Time,X,Y,Z"]), None)
-    return Claim(f"positions of KITTI as GTSAM ships them ({path.name})") if path else None
-
-
 def euroc_tables(look: Look) -> dict[str, Path]:
     """Tables of a EuRoC recording by what their header says: ``imu``, ``leica``, ``vicon``, ``truth``."""
     out: dict[str, Path] = {}
@@ -182,11 +120,6 @@ def _euroc(look: Look) -> Claim | None:
         return None
     said = "EuRoC: " + ", ".join(f"{k} ({look.relative(p)})" for k, p in found.items())
     return Claim(said) if "imu" in found and look.path.is_dir() else Claim(said, "a folder with imu0's data.csv in it")
-
-
-def _lidar_pack(look: Look) -> Claim | None:
-    found = look.named("xyz_i16_planar.npy")
-    return Claim("packed clouds (int16)") if found is not None and look.path.is_dir() else None
 
 
 def _bag(look: Look) -> Claim | None:
@@ -298,11 +231,6 @@ def _tum(look: Look) -> Claim | None:
     return Claim(f"a TUM trajectory, {look.relative(path)}") if path else None
 
 
-def _parts() -> Iterator[tuple[str, dict[str, int]]]:
-    for k in range(1, 6):
-        yield f"robot{k}", {"robot": k}
-
-
 _IO = "graphslam.io"
 BUILT_IN: dict[str, Reader] = {
     "log-store": Reader("log of graphslam: a folder with log.json", f"{_IO}.log_store:load_log", _log_store),
@@ -317,41 +245,11 @@ BUILT_IN: dict[str, Reader] = {
         _victoria_park,
         preset="victoria-park",
     ),
-    "slsjf-local-maps": Reader(
-        "local maps of 2D I-SLSJF: localmap_1.mat, localmap_2.mat, …", f"{_IO}.slsjf:read_slsjf_local_maps", _slsjf_maps
-    ),
-    "ufastslam-detections": Reader(
-        "detections of trees as UFastSLAM publishes them",
-        f"{_IO}.victoria_park_published:read_ufastslam_detections",
-        _ufastslam,
-    ),
-    "slsjf-network": Reader(
-        "odometry and observations of 2D I-SLSJF, a pose network: *clean_data.mat",
-        f"{_IO}.victoria_park_published:read_slsjf_network",
-        _slsjf_network,
-    ),
-    "mrclam": Reader(
-        "UTIAS MRCLAM of any number: Robot<k>_Odometry.dat, Robot<k>_Measurement.dat, Barcodes.dat",
-        f"{_IO}.mrclam:read_mrclam",
-        _mrclam,
-        dict(_parts()),
-        preset="mrclam-dataset7",
-    ),
-    "plaza": Reader(
-        "Plaza of any number, ranges to beacons: *_DR.txt, *_TD.txt, perhaps *_.mat",
-        f"{_IO}.plaza:read_plaza",
-        _plaza,
-        preset="plaza1",
-    ),
-    "tuc": Reader("TU Chemnitz: lines odom2 and loop (a study reads it, run does not)", f"{_IO}.tuc:read_tuc", _tuc),
-    "smartloc": Reader("smartLoc: lines odom3 and pseudorange3", f"{_IO}.smartloc:read_smartloc", _smartloc),
-    "kitti-gps": Reader("KITTI positions of GTSAM: Time,X,Y,Z", f"{_IO}.kitti_gps:read_kitti_gps", _kitti_gps),
     "euroc": Reader(
         "EuRoC (ASL) without cameras: data.csv of imu0, perhaps of leica0 or vicon0, and ground truth",
         f"{_IO}.euroc:read_euroc",
         _euroc,
     ),
-    "lidar-pack": Reader("packed clouds: xyz_i16_planar.npy", f"{_IO}.lidar_pack:read_lidar_pack", _lidar_pack),
     "ros-bag": Reader(
         "ROS 1 bag, ROS 2 bag (sqlite3, MCAP) or MCAP of ROS messages: laser, clouds, IMU, odometry, GPS, tf_static",
         f"{_IO}.bags:read_bag",

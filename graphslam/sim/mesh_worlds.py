@@ -6,6 +6,7 @@ import importlib
 from dataclasses import dataclass
 
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.plugins import load_plugin
 from graphslam.sim.world import DRAWN, World, layout_number
 
 
@@ -42,8 +43,6 @@ class MeshWorld:
 
 MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
-    "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
-    "building": MeshWorld("graphslam.sim.building", "building", ("usual",)),
     "court": MeshWorld("graphslam.sim.court", "court"),
 }
 
@@ -65,6 +64,7 @@ def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
     ------
     UnknownNameError, ConfigError
     """
-    if name not in MESH_WORLDS:
+    found = MESH_WORLDS[name] if name in MESH_WORLDS else load_plugin("graphslam.worlds", "world", name, MESH_WORLDS)
+    if not isinstance(found, MeshWorld):
         raise UnknownNameError("world of triangles", name, MESH_WORLDS)
-    return MESH_WORLDS[name].build(name, layout, seed)
+    return found.build(name, layout, seed)

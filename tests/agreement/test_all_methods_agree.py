@@ -10,9 +10,9 @@ import pytest
 from graphslam.app.compare import DEFAULT_METHODS
 from graphslam.core.geometry import se2_compose
 from graphslam.core.submap import Submap
-from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.registry import join
 from graphslam.join.submap_solver import SubmapEstimate
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from tests.reference.submap_chain import submap_chain
 
 

@@ -13,11 +13,11 @@ from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import Robust
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
-from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import solve_submaps
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from tests.reference.graph_chain import make_chain, make_gps
 from tests.reference.gtsam_optimum import optimise_with_gtsam
 

@@ -15,7 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam.io.joined_map import read_joined
 from graphslam.io.submap_store import write_submaps
 from graphslam.join.registry import join
-from graphslam.sim.local_maps import simulate_local_maps
+from graphslam_studies.sim.local_maps import simulate_local_maps
 
 
 @pytest.fixture(scope="module")

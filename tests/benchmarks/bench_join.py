@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.core.submap import Submap
-from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.association import Association
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
@@ -33,7 +32,8 @@ from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
 from graphslam.join.submap_solver import solve_submaps
-from graphslam.sim.local_maps import simulate_local_maps
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
+from graphslam_studies.sim.local_maps import simulate_local_maps
 
 NEAREST = Association(rule="nearest")
 

@@ -15,12 +15,12 @@ import numpy as np
 from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.geometry import Array
-from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.register import Registration, register, register_starts
 from graphslam.registration.search import SearchConfig, correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
+from graphslam_studies.io.lidar_pack import read_lidar_pack
 from tests.reference.box_world import BoxWorld, around, corridor, hall, heading, survey
 
 ANY_SHIFT = RegistrationConfig(max_shift=20.0, max_turn=3.0)

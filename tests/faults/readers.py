@@ -58,29 +58,29 @@ from graphslam.io.cloud_logs import read_clouds, read_kitti
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
 from graphslam.io.joined_map import read_joined, write_joined
-from graphslam.io.kitti_gps import read_kitti_gps
 from graphslam.io.landmark_tables import read_landmark_tables
-from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.io.log_folder import read_log_mesh, write_log_folder
 from graphslam.io.log_store import load_log, save_log
 from graphslam.io.mesh_file import read_mesh, write_mesh
-from graphslam.io.mrclam import read_mrclam
 from graphslam.io.network_file import read_network
-from graphslam.io.plaza import read_plaza
-from graphslam.io.slsjf import read_slsjf_local_maps
-from graphslam.io.smartloc import read_smartloc
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
-from graphslam.io.tuc import read_tuc
 from graphslam.io.tum import read_tum, read_tum_log, write_tum
 from graphslam.io.victoria_park import read_victoria_park
-from graphslam.io.victoria_park_published import (
+from graphslam.maps.refined import base_frames
+from graphslam.refine.scans import Scans
+from graphslam_frontends.odometry.lasting import LEAST
+from graphslam_studies.io.kitti_gps import read_kitti_gps
+from graphslam_studies.io.lidar_pack import read_lidar_pack
+from graphslam_studies.io.mrclam import read_mrclam
+from graphslam_studies.io.plaza import read_plaza
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
+from graphslam_studies.io.smartloc import read_smartloc
+from graphslam_studies.io.tuc import read_tuc
+from graphslam_studies.io.victoria_park_published import (
     read_slsjf_network,
     read_slsjf_observations,
     read_ufastslam_detections,
 )
-from graphslam.maps.refined import base_frames
-from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.lasting import LEAST
 from graphslam_studies.montecarlo.folder import StudyFolder
 from graphslam_studies.montecarlo.study import open_study
 from graphslam_studies.montecarlo.trials import Measurement

@@ -14,9 +14,9 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.io.catalog import load
 from graphslam.io.euroc import read_euroc
-from graphslam.io.kitti_gps import read_kitti_gps
 from graphslam.io.log_store import load_log, save_log
-from graphslam.io.smartloc import read_smartloc
+from graphslam_studies.io.kitti_gps import read_kitti_gps
+from graphslam_studies.io.smartloc import read_smartloc
 from tests.faults import readers
 
 

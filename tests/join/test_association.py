@@ -11,13 +11,13 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
-from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join import association
 from graphslam.join.association import Association, CandidatePairs, associate
 from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinedMap
 from graphslam.join.order import join_sequential, join_tree
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from tests.reference.submap_chain import random_covariance, submap_chain
 
 

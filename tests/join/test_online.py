@@ -15,7 +15,7 @@ from graphslam.join.joined_map import MapView
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential
 from graphslam.join.submap_solver import solve_submaps
-from graphslam.sim.local_maps import simulate_local_maps
+from graphslam_studies.sim.local_maps import simulate_local_maps
 from tests.reference.submap_chain import submap_chain
 
 NEVER = RelinearisationPolicy(closure_gap=10**6, max_heading=math.inf)

@@ -17,7 +17,7 @@ from graphslam.join.association import Association
 from graphslam.join.joined_map import JoinedMap, JoinResult
 from graphslam.join.order import join_tree
 from graphslam.join.polish import polish
-from graphslam.sim.local_maps import simulate_local_maps
+from graphslam_studies.sim.local_maps import simulate_local_maps
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ from graphslam.core.errors import SolverError
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join.order import join_sequential
 from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import SubmapProblem
 from graphslam.join.submap_solver import minimise, solve_submaps
+from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from tests.reference.submap_chain import submap_chain
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.io.lidar_pack import read_lidar_pack
 from graphslam.registration.config import Gates, RegistrationConfig
 from graphslam.registration.register import margin, register, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
+from graphslam_studies.io.lidar_pack import read_lidar_pack
 
 HAND_HELD = RegistrationConfig(gates=Gates(tilt=np.pi, fitness=0.4, fitness_upright=0.0))
 """A single scan of a hand-held lidar covers the one before in part, and no frame stands upright."""

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GeometryError, UnknownNameError
-from graphslam.sim.building import building
 from graphslam.sim.garage import garage
 from graphslam.sim.garage_layouts import garage_layout
 from graphslam.sim.mesh_worlds import mesh_world
-from graphslam.sim.mine import mine
 from graphslam.sim.route import plan_route
-from graphslam.sim.tunnels import surface_nets
 from graphslam.sim.world import World, find_revisits
+from graphslam_studies.sim.building import building
+from graphslam_studies.sim.mine import mine
+from graphslam_studies.sim.tunnels import surface_nets
 from tests.sim.solid import Solid
 
 GARAGES = ["garage-A", "garage-B", "garage-C", "garage-D"]

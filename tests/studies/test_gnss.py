@@ -15,13 +15,13 @@ from graphslam.core.poses import SE3
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.gps import level_datum_pose
-from graphslam.graph.factors.odometer import OdometerPriorRecord, OdometerRecord
-from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
+from graphslam_studies.graph.odometer import OdometerPriorRecord, OdometerRecord
+from graphslam_studies.graph.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 from graphslam_studies.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from graphslam_studies.smartloc import errors, score_of, solve_street
 from tests.graph.factors.test_gps_space import LEVER, built, fixes_along

@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pytest
 
-from graphslam.plots import knobs
+from graphslam_studies.plots import knobs
 
 
 def test_first_middle_and_last_setting_are_drawn_and_titled() -> None:

@@ -15,7 +15,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryE
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform
 from graphslam.io.catalog import load
-from graphslam.io.lidar_pack import MISSING, read_lidar_pack
+from graphslam_studies.io.lidar_pack import MISSING, read_lidar_pack
 
 STEP = 0.004
 COUNTS = [5, 0, 7, 3, 6]
@@ -125,7 +125,7 @@ def test_poses_of_four_rows_carry_the_stamps(bare, matrices):
 
 
 def test_unusable_scans_are_dropped_and_counted(stamped, matrices, units, monkeypatch):
-    monkeypatch.setattr("graphslam.io.lidar_pack.usable_records.__kwdefaults__", {"limit": 0.7})
+    monkeypatch.setattr("graphslam_studies.io.lidar_pack.usable_records.__kwdefaults__", {"limit": 0.7})
     spoilt = matrices.copy()
     spoilt[0, 1, 3] = np.nan
     spoilt[2, :, :3] *= 1.3

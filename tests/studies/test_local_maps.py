@@ -12,8 +12,8 @@ from graphslam.core.geometry import se2_between, se2_transform
 from graphslam.core.submap import Submap
 from graphslam.join.submap_solver import solve_submaps
 from graphslam.sim.landmark_field import landmark_layout
-from graphslam.sim.local_maps import local_map_world, simulate_local_maps
 from graphslam.sim.vehicle import follow_route
+from graphslam_studies.sim.local_maps import local_map_world, simulate_local_maps
 
 
 def exact(count: int, scans: int, seed: int = 0) -> list[Submap]:

@@ -12,7 +12,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDa
 from graphslam.core.geometry import se2_inverse, se2_transform, wrap_angle
 from graphslam.core.log import DropCounter
 from graphslam.io.catalog import load
-from graphslam.io.mrclam import read_mrclam
+from graphslam_studies.io.mrclam import read_mrclam
 
 BARCODES = "# Subject # Barcode #\n 1 5\n 2 14\n 6 63\n 7 81\n"
 LANDMARKS = "# subject x y sx sy\n 6 1.0 2.0 1e-4 1e-4\n 7 3.0 -1.0 1e-4 1e-4\n"

@@ -11,8 +11,8 @@ import scipy.io
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.io.catalog import load
-from graphslam.io.plaza import read_plaza
 from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_studies.io.plaza import read_plaza
 
 T = 10.0 + 0.2 * np.arange(1, 31)
 D, A = np.linspace(0.1, 0.4, 30), 0.02 * np.cos(np.arange(30))
@@ -56,7 +56,7 @@ def test_ranges_are_sorted_grouped_and_without_bearings(folder):
 
 @pytest.fixture
 def lenient(monkeypatch):
-    monkeypatch.setattr("graphslam.io.plaza.MAX_DROPPED", 0.5)
+    monkeypatch.setattr("graphslam_studies.io.plaza.MAX_DROPPED", 0.5)
 
 
 def test_bad_ranges_are_counted(folder, lenient):
@@ -76,7 +76,7 @@ def test_without_the_mat_file_there_is_no_truth(folder):
 
 @pytest.fixture(autouse=True)
 def _five_ranges_allow_one_bad(monkeypatch):
-    monkeypatch.setattr("graphslam.io.plaza.MAX_DROPPED", 0.2)
+    monkeypatch.setattr("graphslam_studies.io.plaza.MAX_DROPPED", 0.2)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,11 @@ from typing import Any
 import pytest
 
 import graphslam as gs
+from graphslam.app.run.front_ends import check_name, make_front_end
 from graphslam.core import plugins
 from graphslam.core.errors import MissingExtraError, UnknownNameError
+from graphslam.io.cards import list_cards
+from graphslam.io.readers import reader, readers
 
 ROOT = Path(__file__).resolve().parents[2]
 HOW = r"is part of graphslam-studies, which is not installed; wanted pip install ./notebooks/studies"
@@ -33,7 +36,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_names_to_install_are_those_of_the_studies() -> None:
     project = tomllib.loads((ROOT / "notebooks" / "studies" / "pyproject.toml").read_text())["project"]
     groups = {group: set(names) for group, names in project["entry-points"].items()}
-    del groups["graphslam.studies"]  # found by what runs them
+    del groups["graphslam.studies"], groups["graphslam.presets"]  # asked for through those that are listed
     assert {group: set(names) for group, names in plugins.IN_STUDIES.items()} == groups
 
 
@@ -44,6 +47,44 @@ def test_names_to_install_are_those_of_the_studies() -> None:
 def test_functions_say_what_to_install(call: Callable[[], Any]) -> None:
     with pytest.raises(MissingExtraError, match=HOW):
         call()
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize(
+    ("call", "what"),
+    [
+        (lambda: gs.simulate("mine"), "world 'mine'"),
+        (lambda: gs.simulate("point-field"), "world 'point-field'"),
+        (lambda: make_front_end("ekf-slam", {}), "front end 'ekf-slam'"),
+        (lambda: check_name("rbpf-slam"), "front end 'rbpf-slam'"),
+        (lambda: reader("mrclam"), "reader 'mrclam'"),
+    ],
+)
+def test_names_that_moved_say_what_to_install(call: Callable[[], Any], what: str) -> None:
+    readers.cache_clear()
+    try:
+        with pytest.raises(MissingExtraError, match=f"^{what} {HOW}"):
+            call()
+    finally:
+        readers.cache_clear()
+
+
+def test_cards_name_the_distribution_of_their_reader() -> None:
+    inside = set(plugins.IN_STUDIES["graphslam.readers"])
+    assert {c.name: c.plugin for c in list_cards() if c.reader in inside or c.plugin} == {
+        c.name: plugins.STUDIES for c in list_cards() if c.reader in inside
+    }
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("name", ["plaza1", "mrclam-dataset7/robot1", "lidar3d-hku1"])
+def test_a_card_says_what_reads_it(name: str) -> None:
+    readers.cache_clear()
+    try:
+        with pytest.raises(MissingExtraError, match=HOW):
+            gs.load(name)
+    finally:
+        readers.cache_clear()
 
 
 @pytest.mark.usefixtures("alone")

@@ -13,13 +13,12 @@ from graphslam.core.gaussian import moment_match
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
-from graphslam_frontends.landmarks.config import RbpfSlamConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.lineage import WholeMapParticles
 from graphslam_frontends.landmarks.prepare import prepare
-from graphslam_frontends.landmarks.rbpf_slam import RbpfSlam, WholeMapFilter, rbpf_snapshots
 from graphslam_frontends.landmarks.summarise import REGULARISER
 from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_studies.frontends.lineage import WholeMapParticles
+from graphslam_studies.frontends.rbpf_slam import RbpfSlam, RbpfSlamConfig, WholeMapFilter, rbpf_snapshots
 from tests.frontends.landmarks.test_fastslam_step import FOV, SENSOR, world
 
 

@@ -10,8 +10,8 @@ from matplotlib.collections import EllipseCollection
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
-from graphslam.plots.segment_exits import plot_exit_nees, plot_segment_exit
 from graphslam_frontends.segslam.covariance import Nees
+from graphslam_studies.plots.segment_exits import plot_exit_nees, plot_segment_exit
 
 
 def ending(sigma: float) -> Submap:

@@ -11,7 +11,7 @@ import scipy.io
 
 from graphslam.core.errors import CovarianceError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_compose, se2_transform, tangent_to_vector_covariance
-from graphslam.io.slsjf import read_slsjf_local_map, read_slsjf_local_maps
+from graphslam_studies.io.slsjf import read_slsjf_local_map, read_slsjf_local_maps
 
 
 @pytest.mark.data

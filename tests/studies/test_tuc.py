@@ -11,7 +11,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_exp, se2_log
 from graphslam.io.catalog import load
-from graphslam.io.tuc import TucLog, read_tuc
+from graphslam_studies.io.tuc import TucLog, read_tuc
 
 
 def write(folder: Path, lines: list[str], truth: list[str] | None = None) -> Path:

@@ -156,16 +156,6 @@ class FilterConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RbpfSlamConfig(FilterConfig):
-    """One particle filter with one map over the whole log."""
-
-    @property
-    def smoothing_noise(self) -> None:
-        """A single map is not smoothed."""
-        return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LastingConfig:
     """Constant errors that a graph estimates with the map: σ of what is known of each beforehand; 0: it is none.
 

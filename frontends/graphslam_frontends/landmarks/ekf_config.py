@@ -71,16 +71,6 @@ class EkfFilterConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EkfSlamConfig(EkfFilterConfig):
-    """EKF-SLAM with a single map over the whole log."""
-
-    @property
-    def smoothing_noise(self) -> None:
-        """A single map is not smoothed."""
-        return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class EkfConfig(EkfFilterConfig):
     """EKF local maps, one Gaussian each."""
 

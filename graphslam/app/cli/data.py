@@ -57,6 +57,7 @@ def info(name: str, as_json: bool = JSON) -> None:
         "licence": c.licence,
         "terms": c.terms,
         "reader": c.reader,
+        "plugin": c.plugin,
         "options": dict(c.options),
         "caveats": list(c.caveats),
         "bytes": c.bytes,

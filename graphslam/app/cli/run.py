@@ -210,7 +210,8 @@ def demo(
 
 def simulate(
     world: str = typer.Argument(
-        ..., help="Name of the world: landmark-field, point-field, garage, mine, building, court or campus."
+        ...,
+        help="Name of the world: landmark-field, garage, court or campus; of the studies: point-field, mine, building.",
     ),
     out: Path = typer.Option(..., help="Folder for the log, with the true path and map."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for movable objects in the world."),

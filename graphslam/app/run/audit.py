@@ -12,15 +12,14 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.association import match_observations, pair_agreement
 from graphslam.evaluate.metrics import Metrics
-from graphslam.io.catalog import locate
-from graphslam.io.victoria_park_published import read_slsjf_observations
+from graphslam.io.catalog import load
 from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 
-# log name -> (card that holds published identities, their reader)
-PUBLISHED = {"victoria-park": ("victoria-park-detections", read_slsjf_observations)}
+# log name -> (card that holds published identities, name of their reader)
+PUBLISHED = {"victoria-park": ("victoria-park-detections", "slsjf-observations")}
 
 
 def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints | None:
@@ -29,9 +28,9 @@ def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints
         return observations.ids
     if log.name not in PUBLISHED:
         return None
-    card, read = PUBLISHED[log.name]
+    card, reader = PUBLISHED[log.name]
     try:
-        published = read(locate(card))
+        published: LandmarkObservations = load(card, reader=reader)
     except GraphSlamError as error:
         logger.info("association is not audited: %s", error)
         return None

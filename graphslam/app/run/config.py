@@ -11,10 +11,12 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
+from importlib.resources.abc import Traversable
 from typing import Any
 
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.calibrate.corrections import CalibrateConfig
+from graphslam.core.plugins import plugins
 from graphslam.maps.run_map import MapConfig
 from graphslam.refine.config import RefineConfig
 
@@ -45,12 +47,19 @@ class RunConfig:
 
 def preset(name: str) -> dict[str, Any]:
     """Recommended settings of a source, or nothing where there are none."""
-    file = resources.files("graphslam.app") / "presets" / f"{name}.toml"
-    return tomllib.loads(file.read_text()) if file.is_file() else {}
+    files = (folder / f"{name}.toml" for folder in _preset_folders())
+    file = next((f for f in files if f.is_file()), None)
+    return {} if file is None else tomllib.loads(file.read_text())
 
 
 def preset_names(frontend: str) -> list[str]:
     """Sources that have recommended settings for a front end."""
     end = f".{frontend}.toml"
-    files = (resources.files("graphslam.app") / "presets").iterdir()
-    return sorted(f.name[: -len(end)] for f in files if f.name.endswith(end))
+    files = (f.name for folder in _preset_folders() for f in folder.iterdir())
+    return sorted({name[: -len(end)] for name in files if name.endswith(end)})
+
+
+def _preset_folders() -> list[Traversable]:
+    """Folders of presets: our own, then those of plug-ins (entry points ``graphslam.presets``)."""
+    packages = [entry.value for entry in plugins("graphslam.presets").values()]
+    return [resources.files("graphslam.app") / "presets", *(resources.files(p) for p in packages)]

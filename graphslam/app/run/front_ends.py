@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Any
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
 from graphslam.core.config import build, merge
-from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
+from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.log import SensorLog
+from graphslam.core.plugins import load_plugin, plugins, unknown
 from graphslam.io.readers import readers
 from graphslam_frontends.base import FrontEnd
 
@@ -22,7 +22,7 @@ RENAMED = {"kiss-icp": "lidar-odometry"}
 
 def front_end_names() -> list[str]:
     """Names of the installed front ends."""
-    return sorted({e.name for e in entry_points(group=GROUP)})
+    return list(plugins(GROUP))
 
 
 def check_name(name: str) -> None:
@@ -32,7 +32,7 @@ def check_name(name: str) -> None:
         return
     if name in RENAMED:
         raise ConfigError(f"front end {name!r} is now called {RENAMED[name]!r}; use that name")
-    raise UnknownNameError("front end", name, known)
+    raise unknown(GROUP, "front end", name, known)
 
 
 def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
@@ -53,11 +53,7 @@ def _kind(name: str | type[FrontEnd]) -> tuple[Any, Any]:
     if isinstance(name, type):
         return name, typing.get_type_hints(name)["config"]
     check_name(name)
-    found = next(e for e in entry_points(group=GROUP) if e.name == name)
-    try:
-        kind = found.load()
-    except ImportError as error:
-        raise GraphSlamError(f"front end {name!r} cannot be imported ({error})") from error
+    kind = load_plugin(GROUP, "front end", name)
     return kind, typing.get_type_hints(kind)["config"]
 
 

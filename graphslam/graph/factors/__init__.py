@@ -11,8 +11,6 @@ from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
 from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
 from graphslam.graph.factors.landmark_submap import PathBatch, SubmapBatch
 from graphslam.graph.factors.lasting import LastingBatch
-from graphslam.graph.factors.odometer import OdometerBatch, OdometerPriorBatch
-from graphslam.graph.factors.pseudorange import ClockBatch, PseudorangeBatch, SatelliteBiasBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
 from graphslam.graph.factors.sighting import SightingBatch
 
@@ -21,6 +19,5 @@ for _batch in (
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
     *(RangeBatch, BeaconRangeBatch, SightingBatch),
-    *(PseudorangeBatch, ClockBatch, SatelliteBiasBatch, OdometerBatch, OdometerPriorBatch),
 ):
     register_factor(_batch)

@@ -40,8 +40,14 @@ Index = npt.NDArray[np.int64]
 Terms = Callable[[gtsam.Values, "list[Array] | None"], Array]
 
 
+class AntennaRecord:
+    """A measurement of where an antenna is in the GPS frame: it holds the datum, and has a field ``tilt``."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class GpsRecord:
+class GpsRecord(AntennaRecord):
     """One position fix inside a submap; see :mod:`graphslam.graph.gps` for the residual.
 
     Parameters

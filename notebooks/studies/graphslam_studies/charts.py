@@ -4,7 +4,7 @@ A robot drives at random (the slow one in rows, like a lawn mower) through featu
 run draws its own route, features and noise. Odometry is white, and stated as it is. Worlds differ in how much the
 heading drifts within a submap of 35 m: ``base``, ``good`` and ``poor`` sensors, ``slow`` (0.6 m/s), ``drift`` (exit
 heading uncertain by about 2.5°) and ``strong-drift`` (7°). In ``space`` and ``space-drift`` (exit rotation uncertain by
-about 6°) a robot flies through points (:mod:`graphslam.sim.point_field`).
+about 6°) a robot flies through points (:mod:`graphslam_studies.sim.point_field`).
 
 Quantities
 ----------
@@ -47,9 +47,9 @@ from graphslam.join.joined_map import JoinResult
 from graphslam.join.polish import polish
 from graphslam.join.registry import JOINERS, methods_for
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
-from graphslam.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field
 
 RATE, SENSOR_RATE = 10.0, 2.0
 PARTICLES = 40

@@ -29,11 +29,11 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.polish import polish
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
-from graphslam_frontends.landmarks.ekf_slam import ekf_snapshots
 from graphslam_frontends.landmarks.prepare import prepare
-from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
-from graphslam_frontends.landmarks.snapshot import Snapshot
 from graphslam_studies.baselines.full_batch import full_batch
+from graphslam_studies.frontends.ekf_slam import ekf_snapshots
+from graphslam_studies.frontends.rbpf_slam import rbpf_snapshots
+from graphslam_studies.frontends.snapshot import Snapshot
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.scoring import Judge, Watch, clock, timed, watch_snapshots
 

@@ -23,7 +23,7 @@ from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_
 from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.joined_map import MapView, landmark_scalars
 from graphslam.join.submap_solver import SubmapEstimate
-from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_studies.frontends.snapshot import Snapshot
 from graphslam_studies.montecarlo.trials import Measurement
 
 Ids = npt.NDArray[np.int64]

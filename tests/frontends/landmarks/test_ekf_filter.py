@@ -8,7 +8,7 @@ import pytest
 from graphslam.core.errors import ConfigError, CovarianceError
 from graphslam.core.geometry import se2_compose
 from graphslam_frontends.landmarks import ekf_filter
-from graphslam_frontends.landmarks.ekf_config import EkfSlamConfig
+from graphslam_frontends.landmarks.ekf_config import EkfFilterConfig
 from graphslam_frontends.landmarks.ekf_filter import EkfMap
 from graphslam_frontends.landmarks.ekf_kernels import linearise
 from tests.reference.ekf_slam import DenseEkf, DenseEkfByDistance, measurement
@@ -46,7 +46,7 @@ def drive(seed, *, scans=160, laps=1.4, landmarks=30, clutter=0.0, ranges_only=0
 
 
 def ekf(**config):
-    return EkfMap(EkfSlamConfig(max_range=10.0, active_margin=4.0, **config), SENSOR, FOV, np.inf)
+    return EkfMap(EkfFilterConfig(max_range=10.0, active_margin=4.0, **config), SENSOR, FOV, np.inf)
 
 
 @pytest.fixture
@@ -228,4 +228,4 @@ def test_bad_motion_is_named_at_once():
 )
 def test_impossible_configuration_is_refused(bad):
     with pytest.raises(ConfigError, match=next(iter(bad))):
-        EkfSlamConfig(**bad)
+        EkfFilterConfig(**bad)

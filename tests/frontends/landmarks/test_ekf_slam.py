@@ -17,10 +17,11 @@ from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.landmarks.config import StoppingConfig
-from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
-from graphslam_frontends.landmarks.ekf_slam import Ekf, EkfSlam, ekf_snapshots
-from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_frontends.landmarks.ekf import Ekf
+from graphslam_frontends.landmarks.ekf_config import EkfConfig
 from graphslam_studies.charts import ChartConfig, draw_log
+from graphslam_studies.frontends.ekf_slam import EkfSlam, EkfSlamConfig, ekf_snapshots
+from graphslam_studies.frontends.snapshot import Snapshot
 
 SEED = SeedTree(0)
 CUTS = StoppingConfig(scans=59)

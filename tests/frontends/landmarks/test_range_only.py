@@ -16,7 +16,7 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig, RbpfSlamConfig, StoppingConfig
+from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.prepare import prepare
 from graphslam_frontends.landmarks.range_only import WaitingRanges
@@ -33,9 +33,9 @@ from graphslam_frontends.landmarks.range_only_kernels import (
     trilaterate,
 )
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
 from graphslam_frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_studies.frontends.rbpf_slam import RbpfSlamConfig, rbpf_snapshots
 from tests.reference import trilateration as slow
 
 BEACON = np.array([6.0, 9.0])

@@ -21,15 +21,25 @@ from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
-from graphslam_frontends.landmarks.config import RbpfSlamConfig
-from graphslam_frontends.landmarks.lineage import WholeMapParticles
+from graphslam_frontends.landmarks.config import FilterConfig
 from graphslam_frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
-from graphslam_frontends.landmarks.snapshot import Snapshot
 from graphslam_frontends.landmarks.summarise import REGULARISER, Moments
 from graphslam_frontends.landmarks.systematic import systematic
+from graphslam_studies.frontends.lineage import WholeMapParticles
+from graphslam_studies.frontends.snapshot import Snapshot
 
 Ints = npt.NDArray[np.int64]
 Joint = Literal["never", "last", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RbpfSlamConfig(FilterConfig):
+    """One particle filter with one map over the whole log."""
+
+    @property
+    def smoothing_noise(self) -> None:
+        """A single map is not smoothed."""
+        return None
 
 
 class WholeMapFilter:

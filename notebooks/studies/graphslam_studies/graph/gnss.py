@@ -1,6 +1,6 @@
 """Pseudoranges and the odometer of a car become factors of a graph: start values, clocks, biases of satellites.
 
-The factors themselves are in :mod:`graphslam.graph.factors.pseudorange` and :mod:`graphslam.graph.factors.odometer`.
+The factors themselves are in :mod:`graphslam_studies.graph.pseudorange` and :mod:`graphslam_studies.graph.odometer`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from graphslam.core.gnss import Pseudoranges, TangentPlane
 from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry
 from graphslam.graph.factors.gps import antenna_terms
-from graphslam.graph.factors.odometer import OdometerPriorRecord, OdometerRecord
-from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 from graphslam.graph.gps import datum_columns, start_datum
 from graphslam.graph.graph_record import GraphRecord
 from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners
+from graphslam_studies.graph.odometer import OdometerPriorRecord, OdometerRecord
+from graphslam_studies.graph.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 
 Index = npt.NDArray[np.int64]
 UNKNOWNS = 4

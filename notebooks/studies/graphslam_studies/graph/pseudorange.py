@@ -20,7 +20,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.factors.gps import antenna_terms
+from graphslam.graph.factors.gps import AntennaRecord, antenna_terms
 from graphslam.graph.factors.range import TOUCHING
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.graph.variables import VariableKind, register_variable
@@ -40,7 +40,7 @@ register_variable(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PseudorangeRecord:
+class PseudorangeRecord(AntennaRecord):
     """One pseudorange at a node.
 
     Parameters

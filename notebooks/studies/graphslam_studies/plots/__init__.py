@@ -4,6 +4,12 @@ from graphslam.core.face import face
 
 _FACE = {
     "gap": "plot_convergence plot_gap_along plot_tree_gap",
+    "knobs": "knob",
+    "local_map": "plot_correlation plot_local_map",
+    "method_maps": "plot_method_maps",
+    "particles": "plot_ancestry plot_exit plot_exit_panels plot_handovers plot_histories plot_lineage plot_pasts",
+    "segment_exits": "plot_exit_nees plot_segment_exit",
+    "segmap": "plot_expansion plot_score_map plot_segmap",
     "segslam_study": "plot_by_particles",
     "study_growth": "plot_growth_panels",
     "study_local": "plot_local_honesty",

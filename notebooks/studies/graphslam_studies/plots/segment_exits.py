@@ -13,9 +13,9 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.plots import style
-from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.paths import position_covariances
 from graphslam_frontends.segslam.covariance import Nees
+from graphslam_studies.plots.exit_points import draw_exits
 
 _COLOURS = (style.ESTIMATE, style.PURPLE, style.GREEN)
 

@@ -15,8 +15,8 @@ from graphslam.core.random import SeedTree
 from graphslam.sim.clutter import KeepClear
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.route import Route, plan_route
-from graphslam.sim.tunnels import Gallery, Rock, rock_field, surface_nets
 from graphslam.sim.world import World, describe_route, layout_number
+from graphslam_studies.sim.tunnels import Gallery, Rock, rock_field, surface_nets
 
 _RADIUS = 2.5
 _SPEED = 0.75

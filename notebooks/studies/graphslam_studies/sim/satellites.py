@@ -1,6 +1,6 @@
 """A car among high buildings that hears satellites: pseudoranges with walls in their way, wheels and gyro, truth.
 
-What is drawn is what :mod:`graphslam.graph.factors.pseudorange` says: biases of satellites are Gauss–Markov processes
+What is drawn is what :mod:`graphslam_studies.graph.pseudorange` says: biases of satellites are Gauss–Markov processes
 whose size grows as the carrier-to-noise density falls, the clock drifts, the odometer has a bias and a scale error. So
 a solution that is told the same figures must be honest; a recorded street need not be like that.
 """

@@ -1,26 +1,25 @@
-"""EKF-SLAM front ends: local maps (``ekf``), a single map over the whole log (``ekf-slam``), and snapshots of it."""
+"""The front end ``ekf``: EKF local maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.errors import MissingDataError
 from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
-from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.log import DropCounter
 from graphslam.core.path_points import PathPoints
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
-from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
+from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfFilterConfig
 from graphslam_frontends.landmarks.ekf_filter import EkfMap
 from graphslam_frontends.landmarks.fix_points import (
     carried_points,
@@ -29,33 +28,26 @@ from graphslam_frontends.landmarks.fix_points import (
     fixes_inside,
     way_of_fixes,
 )
-from graphslam_frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
-from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_frontends.landmarks.prepare import Prepared, Preparing, known_slots
 from graphslam_frontends.landmarks.stopping import Stopping
 from graphslam_frontends.landmarks.summarise import Smoothed, smooth
 from graphslam_frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
-OnScan = Callable[[int], None]
 
 
-def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> Prepared:
-    data = prepare(log, config, drops if drops is not None else DropCounter())
-    _require_bearings(data, log.name)
-    return data
-
-
-def _require_bearings(data: Prepared, where: str) -> None:
+def require_bearings(data: Prepared, where: str) -> None:
+    """Refuse ranges alone."""
     if len(data.rows) and not np.any(np.isfinite(data.rows[:, 3])):
         raise MissingDataError(
             "an EKF cannot start a landmark from ranges alone", where=where, wanted="bearings in some observations"
         )
 
 
-class _Run:
+class EkfRun:
     """One EKF map growing from scan ``first`` on, with the path it took."""
 
-    def __init__(self, data: Prepared, config: EkfSlamConfig | EkfConfig, first: int, t_start: float) -> None:
+    def __init__(self, data: Prepared, config: EkfFilterConfig, first: int, t_start: float) -> None:
         obs = data.observations
         self.local = isinstance(config, EkfConfig)
         self.data, self.config, self.first, self.t_start = data, config, first, t_start
@@ -254,7 +246,7 @@ class Ekf(FrontEnd):
         data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
         yield from data.reach(0)
         if data.done:
-            _require_bearings(data.prepared, feed.name)
+            require_bearings(data.prepared, feed.name)
         key, scan, t_start = 0, 0, data.prepared.t_start
         if after is not None:
             t_start, key = after.interval[1], after.key + 1
@@ -269,7 +261,7 @@ class Ekf(FrontEnd):
         self, growing: Preparing, key: int, first: int, t_start: float
     ) -> Generator[None, None, tuple[Submap, int]]:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
-        run = _Run(growing.prepared, self.config, first, t_start)
+        run = EkfRun(growing.prepared, self.config, first, t_start)
         stopping = Stopping(self.config.stopping)
         ended, previous = None, t_start
         while ended is None and (yield from growing.reach(run.next)):
@@ -289,99 +281,3 @@ class Ekf(FrontEnd):
         if self.config.handover == "filter":
             return run.submap(key, report, growing.feed), run.next
         return run.smoothed_submap(growing.feed, key, report, self.config.trim), run.next
-
-
-@dataclass(frozen=True, slots=True)
-class EkfSlam(FrontEnd):
-    """The front end ``ekf-slam``: one EKF map over the whole log, handed over as a single submap.
-
-    Parameters
-    ----------
-    on_scan : callable, optional
-        Called with the number of scans taken in, after each: to watch progress or to take the time. It has no part in
-        the result.
-    """
-
-    config: EkfSlamConfig = field(default_factory=EkfSlamConfig)
-    on_scan: OnScan | None = None
-    name: ClassVar[str] = "ekf-slam"
-
-    def submaps(
-        self,
-        log: SensorLog,
-        *,
-        seed: SeedTree,
-        after: Submap | None = None,
-        drops: DropCounter | None = None,
-        watch: Watch | None = None,
-    ) -> Iterator[Submap]:
-        """See :class:`graphslam_frontends.base.FrontEnd`; there is nothing after the one submap."""
-        if after is not None:
-            return
-        data = _prepare(log, self.config, drops)
-        run = _Run(data, self.config, 0, data.t_start)
-        while run.next < len(data):
-            run.advance()
-            if self.on_scan is not None:
-                self.on_scan(run.next)
-        yield run.submap(0, {"ended": "end-of-log"})
-
-
-def ekf_snapshots(
-    log: SensorLog,
-    config: EkfSlamConfig | EkfConfig,
-    *,
-    seed: SeedTree | None = None,
-    cuts: Sequence[int],
-    joint: Literal["last", "all", "never"] = "last",
-    drops: DropCounter | None = None,
-    on_scan: OnScan | None = None,
-) -> Iterator[Snapshot]:
-    """Run EKF-SLAM with a single map and tell what it believes after given numbers of scans.
-
-    Parameters
-    ----------
-    config : EkfSlamConfig or EkfConfig
-        Of the latter, what concerns local maps alone is not read.
-    seed : SeedTree, optional
-        Not used: the filter draws nothing. Here so that every filter is called alike.
-    cuts : sequence of int
-        Numbers of scans, strictly increasing, from 1 to the number of scans that can be used. The filter stops after
-        the last of them.
-    joint : {"last", "all", "never"}
-        Which snapshots carry the joint Gaussian.
-    drops : DropCounter, optional
-        Where records that are not used are counted.
-    on_scan : callable, optional
-        As in :class:`EkfSlam`.
-    """
-    if joint not in ("last", "all", "never"):
-        raise ConfigError(f"joint = {joint!r}; known: last, all, never")
-    wanted = [int(k) for k in cuts]
-    data = _prepare(log, config, drops)
-    if not wanted or wanted[0] < 1 or any(b <= a for a, b in pairwise(wanted)) or wanted[-1] > len(data):
-        raise ConfigError(f"cuts must increase strictly within 1 … {len(data)}, got {wanted[:3]} … {wanted[-1:]}")
-    return _snapshots(_Run(data, config, 0, data.t_start), wanted, joint, on_scan)
-
-
-def _snapshots(run: _Run, cuts: list[int], joint: str, on_scan: OnScan | None) -> Iterator[Snapshot]:
-    for cut in cuts:
-        while run.next < cut:
-            run.advance()
-            if on_scan is not None:
-                on_scan(run.next)
-        slots = run.map.landmarks(run.config.min_hits)
-        gaussian = None
-        if joint == "all" or (joint == "last" and cut == cuts[-1]):
-            gaussian = Gaussian(*run.map.joint(slots), (2,))
-        positions, covariances = run.map.marginals(slots)
-        yield Snapshot(
-            scan=cut,
-            time=float(run.data.observations.times[cut - 1]),
-            pose=run.map.pose,
-            pose_covariance=run.map.pose_covariance,
-            landmark_ids=run.identities(slots),
-            landmarks=positions,
-            landmark_covariances=covariances,
-            gaussian=gaussian,
-        )

@@ -1,0 +1,1 @@
+"""Front ends with a single map over the whole log: baselines to compare submaps with."""

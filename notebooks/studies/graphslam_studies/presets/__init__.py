@@ -1,0 +1,1 @@
+"""Recommended settings, ``SOURCE.FRONTEND.toml``."""
