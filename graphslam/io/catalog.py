@@ -17,7 +17,7 @@ from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.io.cards import Card, CardFile, card, list_cards
 from graphslam.io.readers import reader as find_reader
-from graphslam.io.readers import readers, recognise
+from graphslam.io.readers import recognise
 
 DATA_VARIABLE = "GRAPHSLAM_DATA"
 CACHE_VARIABLE = "GRAPHSLAM_CACHE"
