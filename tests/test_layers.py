@@ -219,3 +219,9 @@ def test_kernels_group_their_arrays() -> None:
                 if len([*a.posonlyargs, *a.args, *a.kwonlyargs]) > MOST_ARGUMENTS:
                     found.setdefault("/".join(path.parts[-2:]), set()).add(n.name)
     assert found == MORE_ARGUMENTS
+
+
+@pytest.mark.parametrize("path", BESIDE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_studies_import_no_private_name(path: Path) -> None:
+    ours = [i for i in imports(path) if i.startswith(("graphslam.", "graphslam_frontends."))]
+    assert not [i for i in ours if any(part.startswith("_") for part in i.split("."))]

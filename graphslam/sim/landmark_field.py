@@ -61,7 +61,9 @@ def _measure_controls(world: _World) -> SteeringControls:
     )
 
 
-def _visible(c: LandmarkFieldConfig, poses: Array, landmarks: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
+def visible_landmarks(
+    c: LandmarkFieldConfig, poses: Array, landmarks: Array
+) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     """(scan, landmark, range, bearing) of every feature inside the sensor's sector."""
     if not len(landmarks):
         none = np.zeros(0)
@@ -78,7 +80,7 @@ def _visible(c: LandmarkFieldConfig, poses: Array, landmarks: Array) -> tuple[np
 def _measure_landmarks(world: _World) -> LandmarkObservations:
     c, rng = world.config, world.noise("landmarks")
     steps = np.arange(c.scan_stride, c.steps + 1, c.scan_stride)
-    scan, ids, ranges, bearings = _visible(c, world.poses[steps], world.landmarks)
+    scan, ids, ranges, bearings = visible_landmarks(c, world.poses[steps], world.landmarks)
     # the tree's order is its own affair: sort, so that the draws below belong to the same features everywhere
     order = np.lexsort((ids, scan))
     scan, ids, ranges, bearings = scan[order], ids[order], ranges[order], bearings[order]

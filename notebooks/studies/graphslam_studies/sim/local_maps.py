@@ -20,9 +20,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.sim.landmark_field import (
     LandmarkFieldConfig,
-    _visible,
     landmark_field_preset,
     landmark_layout,
+    visible_landmarks,
 )
 from graphslam.sim.vehicle import follow_route
 
@@ -73,7 +73,7 @@ def simulate_local_maps(
         steering_rate=c.steering_rate, look_ahead=c.look_ahead,
     )  # fmt: skip
     at_scan = poses[:: c.scan_stride]
-    scan, feature, *_ = _visible(c, at_scan[1:], landmarks)
+    scan, feature, *_ = visible_landmarks(c, at_scan[1:], landmarks)
     order = np.lexsort((feature, scan))
     scan, feature = scan[order], feature[order]
     bounds = np.searchsorted(scan, scans * np.arange(count + 1))
