@@ -157,9 +157,9 @@ def command_line() -> str:
 
     def add(command: Any, path: str) -> None:
         context = click.Context(command, info_name=path, terminal_width=100, max_content_width=100)
-        if getattr(command, "commands", None):
-            for name, part in command.commands.items():
-                add(part, f"{path} {name}")
+        if hasattr(command, "list_commands"):  # those of plug-ins, too
+            for name in command.list_commands(context):
+                add(command.get_command(context, name), f"{path} {name}")
             return
         text.append(f"## {path}\n\n```text\n{command.get_help(context)}\n```\n")
 
