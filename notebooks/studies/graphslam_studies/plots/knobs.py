@@ -54,7 +54,7 @@ def knob(
 
     Examples
     --------
-    >>> row = gs.plots.knob(lambda ax, n: ax.plot(np.sin(n * np.arange(9.0))), [1, 2, 3], name="frequency", shown=2)
+    >>> row = knob(lambda ax, n: ax.plot(np.sin(n * np.arange(9.0))), [1, 2, 3], name="frequency", shown=2)
     >>> [ax.get_title() for ax in row.axes]
     ['frequency: 1', 'frequency: 3']
     """
