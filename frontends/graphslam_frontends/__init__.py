@@ -1,8 +1,8 @@
 """Layer 2: front ends: sensor data in, submaps out. Imports no gtsam."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "odometry.make_steps": "make_steps",
     "detectors.trees": "TreeDetectorConfig detect_trees",
     "grid.config": "GridFilterConfig",
@@ -16,4 +16,4 @@ _FACE = {
     "lidar_odometry.config": "LidarOdometryConfig",
     "lidar_odometry.odometry": "LidarOdometry",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -105,9 +105,9 @@ class DemoProgress(Observer):
         paths = at.paths()
         truth = self.truth
         if truth is not None:  # as the map is, in the frame of the first base
-            from graphslam.core.poses import group_of, level
+            from graphslam.core.poses import group_of, remove_roll_pitch
 
-            truth = truth.transformed(group_of(truth.poses).inverse(level(truth.poses[0])))
+            truth = truth.transformed(group_of(truth.poses).inverse(remove_roll_pitch(truth.poses[0])))
         title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closed yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
         part = part_path(self.picture, ".png")

@@ -9,7 +9,7 @@ from graphslam.app.run.files import read_events, read_options
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.sessions import InnerTie, ties_of_network
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.graph.noise import NO_KERNEL, Robust
@@ -37,7 +37,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
         Where its outputs lie.
     """
     stated: dict[str, Any] = read_options(root).get("backend", {})
-    config: BackEndConfig = build(BackEndConfig, {k: v for k, v in stated.items() if v is not None}, "backend")
+    config: BackEndConfig = build_config(BackEndConfig, {k: v for k, v in stated.items() if v is not None}, "backend")
     network = read_g2o(files / "graph.g2o")
     graph = PoseGraph(submaps[0].dim)
     for s in submaps:

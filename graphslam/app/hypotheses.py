@@ -27,13 +27,13 @@ from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
 from graphslam.backend.refining import Refined, refine_run
 from graphslam.backend.streams import ImuPart
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.network import to_network
@@ -180,7 +180,7 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
     if run.folder is None:
         return found
     values = read_options(run.folder)
-    config: RefineConfig = build(RefineConfig, values.get("refine", {}), "refine")
+    config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
     taken, generation = consistent(run.folder, read_taken) if config.use else (None, None)
     if taken is None or taken.scans is None:
         return found
@@ -189,11 +189,11 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
     solved = make_map(solution, list(submaps), {}, 1)
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
-        gps = (run.fixes, build(GpsOptions, values.get("gps", {}), "gps"))
+        gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))
     refined, said = refine_run(config, taken.scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
         return replace(found, refined=refined, findings=said)
-    options: MapConfig = build(MapConfig, values.get("map", {}), "map")
+    options: MapConfig = build_config(MapConfig, values.get("map", {}), "map")
     made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=sensor_reach(values), config=options)
     return replace(found, refined=refined, refined_map=made, findings=said)
 
@@ -201,23 +201,23 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
     """How the graph of a run was made, and what makes the GPS and IMU of one graph more, as `built` takes them."""
     values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
-    gps: GpsOptions = build(GpsOptions, values.get("gps", {}), "gps")
+    gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
         raise MissingDataError(
             f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
-    imu: ImuOptions = build(ImuOptions, values.get("imu", {}), "imu")
-    feed: Feed | None = None
+    imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")
+    feed: RecordSource | None = None
     if imu.use != "none" and run.folder is not None:
         taken, generation = consistent(run.folder, read_taken)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
-        feed = Feed(taken.log)
+        feed = RecordSource(taken.log)
 
     def streams() -> dict[str, Any]:
         return {"fixes": run.fixes, "gps": gps, "imu": ImuPart(feed, imu) if feed and feed.names(Imu) else None}
 
-    return build(BackEndConfig, values.get("backend", {}), "backend"), streams
+    return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
 
 
 def write_clearest(

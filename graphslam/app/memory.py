@@ -21,7 +21,7 @@ from pathlib import Path
 from types import TracebackType
 
 import graphslam
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.join.registry import Material, join
 
@@ -110,7 +110,7 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
     first = submaps[:2] if isinstance(submaps, Sequence) else submaps.part(0, min(2, len(submaps.keys)))
     join(first, method, polish=polish)  # modules and thread pools that load on first use
     gc.collect()
-    give_back()  # or the join would reuse it unseen
+    trim_heap()  # or the join would reuse it unseen
     before = _status("VmRSS")
     try:
         Path("/proc/self/clear_refs").write_text("5")

@@ -28,7 +28,7 @@ from graphslam.app.studies.study import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
@@ -216,7 +216,7 @@ def refine_path(
     log = source if isinstance(source, SensorLog) else load(source)
     if steps is None:
         steps = recommended(log, "segslam").get("frontend", {}).get("steps", {})
-    cut = make_steps(log, steps if isinstance(steps, StepConfig) else build(StepConfig, dict(steps), "steps"))
+    cut = make_steps(log, steps if isinstance(steps, StepConfig) else build_config(StepConfig, dict(steps), "steps"))
     start = chain(cut.odometry) if path is None else path
     if start.times[0] > cut.times[0] or start.times[-1] < cut.times[-1]:
         raise DataError(

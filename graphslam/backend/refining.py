@@ -198,7 +198,7 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
     # gravity that the front end had of a stream which it used for nothing else that weighs
-    gravity = frozenset().union(*(s.aids for s in submaps)) if "gravity" in r.parts else frozenset()
+    gravity = frozenset().union(*(s.assisting_streams for s in submaps)) if "gravity" in r.parts else frozenset()
     out.spend(SCAN_PAIRS, "scan-pairs", streams | gravity, (float(r.times[0]), float(r.times[-1])))
     held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
     for stream in sorted(held):

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from graphslam.backend.config import BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.core.errors import MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_floor import fix_segments
 from graphslam.graph.ledger import EXCLUSIVE
@@ -58,7 +58,7 @@ def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
 class FixPart:
     """The fixes of a run: the graph is given them submap by submap, as they come."""
 
-    def __init__(self, feed: Feed, config: GpsOptions) -> None:
+    def __init__(self, feed: RecordSource, config: GpsOptions) -> None:
         self.feed, self.config = feed, config
         self._given = 0
         self._all: Gps | None = None
@@ -78,7 +78,7 @@ class FixPart:
         return used.take(slice(first, last)) if last > first else None
 
 
-def imus_of(feed: Feed) -> dict[str, Imu]:
+def imus_of(feed: RecordSource) -> dict[str, Imu]:
     """The IMUs of a log by name, as far as they have come."""
     return {name: feed.part(name) for name in feed.names(Imu)}  # type: ignore[misc]
 
@@ -116,7 +116,7 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
 class ImuPart:
     """The IMUs of a run: axes are looked at, and factors are made, while it goes on."""
 
-    def __init__(self, feed: Feed, config: ImuOptions) -> None:
+    def __init__(self, feed: RecordSource, config: ImuOptions) -> None:
         self.feed, self.config = feed, config
         self._looked: set[str] = set()
         self._given: set[str] = set()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.calibrate.corrections import Corrections
-from graphslam.core.config import as_dict
+from graphslam.core.config import options_dict
 from graphslam.core.findings import Finding
 
 SURE = 3.0
@@ -203,14 +203,14 @@ class Calibration:
 
     def config(self) -> dict[str, Any]:
         """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""
-        return {"use": "none", "given": as_dict(self.corrections)}
+        return {"use": "none", "given": options_dict(self.corrections)}
 
     def as_dict(self) -> dict[str, Any]:
         """JSON object."""
         return {
             "kind": self.kind,
             "data": self.data,
-            "given": as_dict(self.corrections),
+            "given": options_dict(self.corrections),
             "estimates": [
                 {k: _number(getattr(e, k)) for k in e.__dataclass_fields__} | {"applied": e.applied}
                 for e in self.estimates
@@ -218,7 +218,7 @@ class Calibration:
             "noise": {k: float(v) for k, v in self.noise.items()},
             "prediction": None
             if self.prediction is None
-            else as_dict(self.prediction) | {"taken": self.prediction.taken},
+            else options_dict(self.prediction) | {"taken": self.prediction.taken},
             "lines": [f.as_row() for f in self.findings()],
         }
 

@@ -1,8 +1,8 @@
 """Layer 7: accuracy (ATE, RPE) and consistency (NEES, consistency index), with and without ground truth."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "consistency": "Consistency",
     "submap_consistency": "submap_nees submaps_consistency",
     "montecarlo": "trial_seed",
@@ -14,4 +14,4 @@ _FACE = {
     "gap": "gap_along gap_by_tree polish_history pose_consistency_along",
     "segslam_judge": "dead_reckoned exit_errors fused_grid match_errors path_errors relative",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

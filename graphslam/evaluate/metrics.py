@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.core.charts import along_arc
+from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
@@ -280,14 +280,14 @@ def truth_metrics(
     n_pose = len(error)
     turned = np.zeros(len(solution.poses))  # what the headings differ by
     turned[node] = e_pose[:, 2]
-    charted = np.column_stack([along_arc(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
+    charted = np.column_stack([apply_inverse_left_jacobian(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
     if identities:
         ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
         points = solution.landmarks[ours]
         e_lm = truth.landmarks[theirs] - points
         out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
         error = np.concatenate([error, e_lm.ravel()])
-        charted = np.concatenate([charted, along_arc(e_lm, turned[solution.anchors[ours]]).ravel()])
+        charted = np.concatenate([charted, apply_inverse_left_jacobian(e_lm, turned[solution.anchors[ours]]).ravel()])
         ix = np.concatenate([ix, (first_landmark + 2 * ours[:, None] + np.arange(2)).ravel()])
         if len(ours) >= 2:
             rigid = landmark_error(

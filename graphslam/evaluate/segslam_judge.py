@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, arc_length, wrap_angle
-from graphslam.core.poses import group_of, heading_of, level
+from graphslam.core.poses import group_of, heading_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
@@ -39,7 +39,7 @@ CLOSED_DISTANCE = 1.0
 def relative(poses: Array) -> Array:
     """Poses ``(n, d)`` in the level frame of the first."""
     group = group_of(poses)
-    return group.between(np.broadcast_to(level(poses[0]), poses.shape), poses)
+    return group.between(np.broadcast_to(remove_roll_pitch(poses[0]), poses.shape), poses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None)
     """
     est, true = relative(path.poses), relative(truth)
     group = group_of(est)
-    last = est[-1] if final_pose is None else group.between(level(path.poses[0]), final_pose)
+    last = est[-1] if final_pose is None else group.between(remove_roll_pitch(path.poses[0]), final_pose)
     reference = Trajectory(path.times, true)
     moved = Trajectory(path.times, est)
     return PathErrors(
@@ -323,7 +323,7 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
         for d, m in ((by_path, False), (by_path, True), (stated, False))
     ]
     t = segmap.table
-    ends = level(truth) if segmap.gravity else truth
+    ends = remove_roll_pitch(truth) if segmap.gravity else truth
     true = g.between(ends[t.start[chain]], ends[t.end[chain]])
     # roll and pitch of level frames are exact by definition
     components = (2, 3, 4, 5) if segmap.gravity else None
@@ -348,7 +348,7 @@ def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
         At the steps.
     """
     g = group_of(truth)
-    true = g.between(level(truth[0]), truth[-1])
+    true = g.between(remove_roll_pitch(truth[0]), truth[-1])
     blocks = {"": (2, 3, 4, 5), "heading": (2,), "plan": (3, 4), "height": (5,)}
     return {k: exit_nees(submap.exit_pose, submap.exit_covariance[None], true, components=c) for k, c in blocks.items()}
 

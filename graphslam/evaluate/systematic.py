@@ -164,7 +164,8 @@ ESTIMATED = {
     "mount_x": "mount-x",
     "mount_y": "mount-y",
 }
-"""Constant errors that a graph may estimate with the map (:mod:`graphslam.core.lasting`), as they are called here."""
+"""Constant errors that a graph may estimate with the map (:mod:`graphslam.core.sensor_biases`), as they are called
+here."""
 
 
 def sums(reports: Sequence[Mapping[str, Any]]) -> Systematic | None:

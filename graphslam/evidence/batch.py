@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.mark_kernels import (
     BRICKS,
@@ -99,7 +99,7 @@ def update_grids(
         if not free:
             return UpdateReport(locked=locked)
         grids, T = [grids[k] for k in free], T[free]
-    with first.pool.lock, deferred_interrupts():
+    with first.pool.lock, defer_interrupts():
         tally = insert(grids, T, scan, threads)
     return report_of(tally, locked)
 
@@ -146,7 +146,7 @@ def own_grids(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int64
 def write_packed(grid: GridTree, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
     """Replace bricks by packed offset coordinates ``(n,)`` and values ``(n, 512)``, unchecked."""
     pool = grid.pool
-    with pool.lock, deferred_interrupts():
+    with pool.lock, defer_interrupts():
         own_grids((grid,), pool)  # first: it may take a node itself
         pool.reserve(len(keys) * (pool.levels - 1), len(keys))
         write_bricks(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.evidence.batch import own_grids
 from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
 from graphslam.evidence.grid_tree import GridTree
@@ -100,7 +100,7 @@ def compact(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     pool = several[0].pool
     if any(g.pool is not pool for g in several):
         raise GridError("grids to be compacted together are of different pools", wanted="one pool")
-    with pool.lock, deferred_interrupts():
+    with pool.lock, defer_interrupts():
         nodes, bricks = pool.used_nodes, pool.used_bricks
         states = find_all_states(several)
         # flags of occupied voxels depend on the threshold, so grids of different ones share nothing

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import element, join, pairs
+from graphslam.core.markup import html_element, join_parts, pair_list
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import insert, report_of, write_packed
 from graphslam.evidence.compact import pieces_of
@@ -262,7 +262,7 @@ class EvidenceGrid(GridTree):
             "memory, own / shared": f"{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB",
         }
         said = f" {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
-        return join([element("b", "EvidenceGrid"), said, pairs(facts)])
+        return join_parts([html_element("b", "EvidenceGrid"), said, pair_list(facts)])
 
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""

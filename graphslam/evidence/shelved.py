@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.shelf import SHELF, Arrays, Shelf, Slot
+from graphslam.core.spill_cache import SPILL_CACHE, Arrays, CacheEntry, SpillCache
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.compact import Pieces, grid_of, pieces_of
 from graphslam.evidence.formats import load_npz
@@ -33,9 +33,9 @@ class ShelvedGrid(EvidenceGrid):
 
     __slots__ = ("_own", "_slot")
 
-    def __init__(self, grid: EvidenceGrid, slot: Slot[GridPool]) -> None:
+    def __init__(self, grid: EvidenceGrid, slot: CacheEntry[GridPool]) -> None:
         self.voxel_size, self.model, self.dim, self.locked = grid.voxel_size, grid.model, grid.dim, grid.locked
-        self._slot: Slot[GridPool] | None = slot
+        self._slot: CacheEntry[GridPool] | None = slot
         self._own: tuple[GridPool, RootBox] | None = None
 
     @property
@@ -67,26 +67,26 @@ class ShelvedGrid(EvidenceGrid):
         self._own, self._slot = (self.pool, box), None
 
 
-def shelved(grid: EvidenceGrid, shelf: Shelf | None = None) -> EvidenceGrid:
+def shelved(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceGrid:
     """The same map on a shelf, in a pool of its own; the memory of ``grid`` goes with its last owner.
 
     Parameters
     ----------
-    shelf : Shelf, optional
+    shelf : SpillCache, optional
         By default that of the process.
     """
     if isinstance(grid, ShelvedGrid) and grid.on_shelf:
         return grid
-    return _put(grid, _pool_of(_kind(grid, grid.pool.levels), pieces_of(grid)), SHELF if shelf is None else shelf)
+    return _put(grid, _pool_of(_kind(grid, grid.pool.levels), pieces_of(grid)), SPILL_CACHE if shelf is None else shelf)
 
 
 def load_shelved(path: str | os.PathLike[str]) -> EvidenceGrid:
     """Read what `EvidenceGrid.save` wrote, onto the shelf of the process; errors are those of `formats.load_npz`."""
     grid = load_npz(path)
-    return _put(grid, _with(grid.pool, grid._box), SHELF)
+    return _put(grid, _with(grid.pool, grid._box), SPILL_CACHE)
 
 
-def _put(grid: EvidenceGrid, pool: GridPool, shelf: Shelf) -> EvidenceGrid:
+def _put(grid: EvidenceGrid, pool: GridPool, shelf: SpillCache) -> EvidenceGrid:
     kind = (grid.voxel_size, grid.model, grid.dim)
     return ShelvedGrid(
         grid, shelf.put(pool, pool.nbytes, partial(_packed, kind), partial(_unpacked, kind, pool.levels))

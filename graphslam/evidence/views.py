@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.dense import CloudMap, MapView
+from graphslam.core.dense import CloudMap, DenseMapView
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.points import thin
+from graphslam.core.points import voxel_downsample
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
@@ -19,7 +19,7 @@ from graphslam.evidence.shelved import shelved
 
 
 class GridView:
-    """A `graphslam.core.dense.MapView` of an evidence grid."""
+    """A `graphslam.core.dense.DenseMapView` of an evidence grid."""
 
     cloud: CloudMap | None = None
     knows_space = True
@@ -50,7 +50,8 @@ class GridView:
 
 
 class CloudView:
-    """A `graphslam.core.dense.MapView` of a cloud: points as measured, space from the grid beside it or its own beams.
+    """A `graphslam.core.dense.DenseMapView` of a cloud: points as measured, space from the grid beside it or its own
+    beams.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class CloudView:
 
     def points(self, level: int = 0) -> Array:
         """Means of the points in cells."""
-        return thin(self._cloud.points, self._cloud.cell * 2**level)
+        return voxel_downsample(self._cloud.points, self._cloud.cell * 2**level)
 
     def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
         """See `MapView`. Where no space is known, that is in a column through one of its points."""
@@ -108,7 +109,7 @@ class CloudView:
         return shelved(grid)
 
 
-def view_of(submap: Submap) -> MapView:
+def view_of(submap: Submap) -> DenseMapView:
     """The dense map of a submap."""
     grid = submap.grid
     if submap.cloud is not None and (grid is None or isinstance(grid, EvidenceGrid)):

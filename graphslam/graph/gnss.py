@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.gnss import Pseudoranges, TangentPlane
@@ -54,7 +54,7 @@ class PseudorangeConfig:
     """Walk of the receiver's clock beside its drift [m/√s]."""
     drift_walk: float = 0.05
     """Walk of that drift [m/s/√s]."""
-    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each pseudorange, and its width in standard deviations."""
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
@@ -56,7 +56,7 @@ class GpsConfig:
         first (:mod:`graphslam.backend.fix_errors`). With a ``bias_sigma`` it is stated, and nothing is fitted.
     """
 
-    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
+    robust: Robust = flattened_field(Robust("none", 2.385), robust="kind", robust_width="k")
     sigma: float | None = None
     baseline: float = 20.0
     bias_sigma: float | None = None

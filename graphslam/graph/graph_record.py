@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
 from graphslam.core.geometry import Array, se2_transform
-from graphslam.core.markup import Markup, element, join
+from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.factors.attitude import AttitudeRecord
@@ -390,7 +390,7 @@ class GraphRecord:
 
     def _repr_html_(self) -> str:
         said = f" {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, {len(self.records)} factors"
-        return join([element("b", "PoseGraph"), said, Markup(self.objective()._repr_html_())])
+        return join_parts([html_element("b", "PoseGraph"), said, Markup(self.objective()._repr_html_())])
 
     # ---------------------------------------------------------------- inside
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError
-from graphslam.core.markup import frame
+from graphslam.core.markup import html_frame
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -151,7 +151,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return pd.DataFrame(rows, columns=["factor_id", "factor", "stream", "t_start", "t_end", "kind", "note"])
 
     def _repr_html_(self) -> str:
-        return frame(self.table())
+        return html_frame(self.table())
 
 
 def _overlap(a0: float, a1: float, b0: float, b1: float) -> bool:

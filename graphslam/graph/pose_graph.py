@@ -35,9 +35,9 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
 from graphslam.core.imu import Imu
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.factors.attitude import DOWN, LEVELLED, AttitudeRecord, without_tilt
 from graphslam.graph.factors.batch import Record
@@ -159,7 +159,7 @@ class PoseGraph(GraphRecord):
         )
         node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
-        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
+        self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
         # from here on nothing fails
         fresh = np.flatnonzero(ids < 0)
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
@@ -184,7 +184,7 @@ class PoseGraph(GraphRecord):
         self.readings.tie(self.submaps[-1])
         return fid
 
-    def _tell_lasting(self, lasting: LastingErrors, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
+    def _tell_lasting(self, lasting: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
         """What the last submap's own measurements say of the constant errors: it comes and goes with the submap.
 
         All submaps of the same streams share them; the first one brings what is known of them beforehand.
@@ -213,12 +213,12 @@ class PoseGraph(GraphRecord):
         robot = self._robots.get(submap.uses)
         before = np.zeros(SIZE), np.diag(submap.landmarks.lasting.sigmas**2)
         known = before if robot is None else self.lasting_errors(robot)
-        return replace(submap, landmarks=submap.landmarks.erring(*known))
+        return replace(submap, landmarks=submap.landmarks.with_biases(*known))
 
     def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
-        In the order of :data:`~graphslam.core.lasting.CONSTANTS`; what is known beforehand is in it.
+        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is known beforehand is in it.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class PoseGraph(GraphRecord):
             for k, (T, P) in enumerate(zip(cut.increments, cut.covariances))
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
-        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
+        self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
         # from here on nothing fails
         self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances, stated)
         if level_sigma is not None:

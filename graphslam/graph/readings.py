@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.records import Compass, LandmarkObservations
@@ -62,7 +62,7 @@ class CompassConfig:
     """Its standard deviation [rad]."""
     hard_iron: float | None = None
     """Standard deviation of the deviation by iron on the robot [rad], which is then estimated; none: there is none."""
-    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each reading, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
@@ -103,7 +103,7 @@ class BeaconConfig:
     """Distances to a beacon before it gets a place."""
     spread: float = 0.1
     """Least ratio of the smallest to the largest extent of the places from which a beacon was heard."""
-    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each distance, and its width in standard deviations."""
 
     def __post_init__(self) -> None:

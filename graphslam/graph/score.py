@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from graphslam.core.geometry import Array
-from graphslam.core.markup import table
+from graphslam.core.markup import html_table
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.variables import KINDS
 
@@ -68,7 +68,7 @@ class Score:
             {"class": n, "factors": c.factors, "χ²": c.chi2, "dof": c.dof, "χ²/dof": c.chi2_per_dof}
             for n, c in self.classes.items()
         ]
-        return table(rows, ["class", "factors", "χ²", "dof", "χ²/dof"])
+        return html_table(rows, ["class", "factors", "χ²", "dof", "χ²/dof"])
 
 
 def score(flat: FlatGraph, chi2: Array) -> Score:

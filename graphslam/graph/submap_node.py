@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.path_points import PathPoints
 from graphslam.core.poses import Group, group_of
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.noise import whitener
@@ -65,7 +65,7 @@ class InnerPoints:
         Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
     rows : mapping of int to int
         Points that are used → rows of the graph's points.
-    lasting : LastingErrors or None
+    lasting : SensorBiases or None
         What all of it is with constant errors.
     """
 
@@ -75,7 +75,7 @@ class InnerPoints:
     scale: float = 1.0
     factor_id: int | None = None
     rows: Mapping[int, int] = field(default_factory=dict)
-    lasting: LastingErrors | None = None
+    lasting: SensorBiases | None = None
 
     def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
         """Factor of the points that are used, beside the submap's own."""
@@ -119,7 +119,7 @@ class SubmapNode:
         relative poses by itself is worth, for instance in cycles of loops and chain.
     inner_points : InnerPoints or None
         Of a landmark submap that holds points of its path.
-    lasting : LastingErrors or None
+    lasting : SensorBiases or None
         What a landmark submap is with constant errors of the robot's wheels and sensor, and
     robot : int
         their row in the graph; -1: it has none.
@@ -139,7 +139,7 @@ class SubmapNode:
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     inner_points: InnerPoints | None = None
-    lasting: LastingErrors | None = None
+    lasting: SensorBiases | None = None
     robot: int = -1
 
     @property

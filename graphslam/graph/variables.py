@@ -96,8 +96,8 @@ for _kind in (
         "point", "y", {2: "mm"}, classes=("path",),
         remedy="a point of a submap's path hangs on no submap: remove the fixes that hang on it.",
     ),
-    # Constant errors of a robot (graphslam.core.lasting): turn and log distance of its wheels; ranges and bearings of
-    # its sensor, and where that stands.
+    # Constant errors of a robot (graphslam.core.sensor_biases): turn and log distance of its wheels; ranges and
+    # bearings of # its sensor, and where that stands.
     VariableKind(
         "wheels", "w", {2: "rr"}, classes=("lasting",),
         remedy="constant errors of the wheels need what is known of them beforehand.",

@@ -37,7 +37,7 @@ from graphslam.core.gnss import TangentPlane
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
-from graphslam.core.reading import most_bytes, usable
+from graphslam.core.reading import finite_mask, most_bytes
 from graphslam.core.records import Gps, LaserScans, Odometry, Stream
 from graphslam.io import ros_messages as ros
 from graphslam.io.clock import usable_records
@@ -335,7 +335,7 @@ class _Frames:
             key = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
             pose = ros.pose_of(t.transform)
             norm = float(np.linalg.norm(pose[3:]))
-            if not np.all(usable(pose)) or abs(norm - 1.0) > 0.05:
+            if not np.all(finite_mask(pose)) or abs(norm - 1.0) > 0.05:
                 continue
             if static:
                 self.fixed[key] = pose
@@ -650,7 +650,7 @@ def _place(
 ) -> Array:
     """``T_base_sensor`` ``(7,)``."""
     if mount is not None:
-        if not np.all(usable(mount)):
+        if not np.all(finite_mask(mount)):
             raise ConfigError(f"bag: mount is {mount}; wanted 6 finite numbers")
         q = np.array([0.0, 0, 0, 1.0])
         for axis, angle in ((2, mount[5]), (1, mount[4]), (0, mount[3])):
@@ -704,7 +704,7 @@ def _laser(
     scans, odd, reach = [], np.zeros(len(r.values), np.bool_), []
     for k, (ranges, start, step, low, high) in enumerate(r.values):
         n = len(ranges)
-        if n < 2 or not np.all(usable([start, step])) or not 0 < abs(step) * (n - 1) <= 2.2 * np.pi:
+        if n < 2 or not np.all(finite_mask([start, step])) or not 0 < abs(step) * (n - 1) <= 2.2 * np.pi:
             odd[k] = True
             scans.append((np.zeros(2, np.float32), np.array([0.0, 1.0])))
             continue
@@ -739,9 +739,9 @@ def _odometry(
     where: str,
 ) -> Odometry:
     a = np.array(r.values)
-    norm = np.linalg.norm(np.where(usable(a[:, 3:]), a[:, 3:], 0.0), axis=1)
+    norm = np.linalg.norm(np.where(finite_mask(a[:, 3:]), a[:, 3:], 0.0), axis=1)
     bad = {
-        "pose is not finite": np.asarray(~usable(a).all(axis=1)),
+        "pose is not finite": np.asarray(~finite_mask(a).all(axis=1)),
         "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.05,
     }
     times, keep = _kept(r, "odometry", bad, counter, notes, where)
@@ -769,7 +769,9 @@ def _odometry(
 
 def _imu(r: _Rows, place: Array | None, unit: str, counter: DropCounter, notes: list[str], where: str) -> Imu:
     a = np.array(r.values)
-    times, keep = _kept(r, "imu", {"reading is not finite": np.asarray(~usable(a).all(axis=1))}, counter, notes, where)
+    times, keep = _kept(
+        r, "imu", {"reading is not finite": np.asarray(~finite_mask(a).all(axis=1))}, counter, notes, where
+    )
     force = a[keep, 3:] * (GRAVITY if unit == "g" else 1.0)
     T = np.array([0.0, 0, 0, 0, 0, 0, 1]) if place is None else place
     return Imu(times=times, angular_rate=a[keep, :3], specific_force=force, noise=IMU_NOISE, T_base_imu=T)
@@ -778,7 +780,7 @@ def _imu(r: _Rows, place: Array | None, unit: str, counter: DropCounter, notes: 
 def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, notes: list[str], where: str) -> Gps | None:
     g = np.array([v[0] for v in r.values])
     status = np.array([v[2] for v in r.values])
-    place_ok = usable(g[:, :2]).all(axis=1) & (np.abs(g[:, 0]) <= 90) & (np.abs(g[:, 1]) <= 360)
+    place_ok = finite_mask(g[:, :2]).all(axis=1) & (np.abs(g[:, 0]) <= 90) & (np.abs(g[:, 1]) <= 360)
     bad = {
         "no fix (status)": status < 0,
         "no place on Earth": ~np.asarray(place_ok),
@@ -796,8 +798,8 @@ def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, note
         counter.drop("gps", reason, int(mask.sum()))
     inner = usable_records(times[good], {}, stream="gps", where=f"{where}, gps", drops=counter, limit=0.5)
     keep = good[inner]
-    flat = planar or not np.all(usable(g[keep, 2]))
-    heights = np.where(usable(g[keep, 2]), g[keep, 2], 0.0)
+    flat = planar or not np.all(finite_mask(g[keep, 2]))
+    heights = np.where(finite_mask(g[keep, 2]), g[keep, 2], 0.0)
     llh = np.column_stack([g[keep, :2], heights])
     plane = TangentPlane(*llh[0].tolist())
     enu = plane.from_ecef(geodetic_to_ecef(llh))
@@ -806,7 +808,7 @@ def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, note
     for k, row in enumerate(keep):
         stated, kind = r.values[row][1], r.values[row][3]
         S = 0.5 * (stated + stated.T)
-        if kind > 0 and np.all(usable(S)) and np.linalg.eigvalsh(S)[0] > 1e-6:
+        if kind > 0 and np.all(finite_mask(S)) and np.linalg.eigvalsh(S)[0] > 1e-6:
             P[k] = S
         else:
             unknown += 1

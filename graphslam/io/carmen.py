@@ -28,7 +28,7 @@ from scipy.optimize import isotonic_regression
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_inverse
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
@@ -238,7 +238,7 @@ def _parse(words: list[str]) -> _Line | str:
         return "scan is truncated, or of another size"
     except ValueError:
         return "scan holds something that is no number"
-    if not np.all(usable([*rest, *head])):
+    if not np.all(finite_mask([*rest, *head])):
         return "pose or stamp is not finite"
     if at == 1:
         return _Line((-0.5 * np.pi, 0.0, n), ranges.astype(np.float32), rest[:6], rest[6], None)
@@ -264,7 +264,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
                 w = [float(x) for x in (*words[-3:-2], *words[1:4])]
             except ValueError:
                 w = [np.nan]
-            if len(w) == 4 and np.all(usable(w)):
+            if len(w) == 4 and np.all(finite_mask(w)):
                 odom.append((w[0], w[1], w[2], w[3]))
             else:
                 drops.drop("odometry", "line ODOM is truncated or not finite")

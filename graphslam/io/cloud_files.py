@@ -19,7 +19,7 @@ import numpy.typing as npt
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
-from graphslam.core.reading import check_size, read_bytes, usable
+from graphslam.core.reading import check_size, finite_mask, read_bytes
 from graphslam.io.look import ending, plain_name
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestampoffset", "time_offset", "gps_time")
@@ -63,9 +63,9 @@ class Cloud:
 
 def clean(points: Array, times: Array | None = None, field: str = "") -> Cloud:
     """A cloud of what is usable of ``points`` ``(m, 3)``."""
-    finite = np.asarray(usable(points).all(axis=1))
+    finite = np.asarray(finite_mask(points).all(axis=1))
     if times is not None:
-        finite &= np.asarray(usable(times))
+        finite &= np.asarray(finite_mask(times))
     with np.errstate(invalid="ignore"):
         zero = finite & (points == 0.0).all(axis=1)
     keep = finite & ~zero

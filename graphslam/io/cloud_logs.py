@@ -28,7 +28,7 @@ from graphslam.core.gnss import TangentPlane
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Gps, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
@@ -233,7 +233,7 @@ def _cloud_log(
                 got=f"{len(matrices)} poses, {n} clouds",
                 wanted="one pose a cloud, or option poses=none",
             )
-        bad["pose is not finite"] = ~np.asarray(usable(matrices).all(axis=(1, 2)))
+        bad["pose is not finite"] = ~np.asarray(finite_mask(matrices).all(axis=(1, 2)))
     keep = np.flatnonzero(usable_records(stamps, bad, stream="clouds", where=str(root), drops=counter))
     if path_poses is not None:
         slack = 0.5 * float(np.median(np.diff(path_poses.times)))
@@ -354,9 +354,9 @@ def _tum(path: Path, counter: DropCounter) -> Trajectory:
         if v is not None:
             rows.append(v if len(v) == 8 else [np.nan] * 8)
     a = np.array(rows).reshape(-1, 8)
-    norm = np.linalg.norm(np.where(usable(a[:, 4:]), a[:, 4:], 0.0), axis=1)
+    norm = np.linalg.norm(np.where(finite_mask(a[:, 4:]), a[:, 4:], 0.0), axis=1)
     bad = {
-        "row is not 8 finite numbers": np.asarray(~usable(a[:, 1:]).all(axis=1)),
+        "row is not 8 finite numbers": np.asarray(~finite_mask(a[:, 1:]).all(axis=1)),
         "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.01,
     }
     keep = usable_records(a[:, 0], bad, stream="poses", where=str(path), drops=counter)
@@ -457,7 +457,7 @@ def _calibration(look: Look) -> Array | None:
     path = look.named("calib.txt")
     row = next((s for s in look.lines(path) if s.startswith(("Tr:", "Tr ", "Tr_velo"))), None) if path else None
     v = numbers(row.partition(":")[2] or row[2:]) if row else None
-    if v is None or len(v) != 12 or not np.all(usable(v)):
+    if v is None or len(v) != 12 or not np.all(finite_mask(v)):
         return None
     m = np.array(v).reshape(3, 4)
     if np.abs(m[:, :3] @ m[:, :3].T - np.eye(3)).max() > 1e-2:
@@ -479,13 +479,13 @@ def _oxts(root: Path, look: Look, counter: DropCounter) -> dict[str, Stream]:
     assert times is not None
     rows = [numbers(read_text(p)) or [] for p in files]
     a = np.array([r[:30] if len(r) >= 30 else [np.nan] * 30 for r in rows])
-    place = usable(a[:, :3]).all(axis=1) & (np.abs(a[:, 0]) <= 90) & (np.abs(a[:, 1]) <= 360)
-    bad = {"record is not whole": np.asarray(~(place & usable(a[:, 8:26]).all(axis=1)))}
+    place = finite_mask(a[:, :3]).all(axis=1) & (np.abs(a[:, 0]) <= 90) & (np.abs(a[:, 1]) <= 360)
+    bad = {"record is not whole": np.asarray(~(place & finite_mask(a[:, 8:26]).all(axis=1)))}
     keep = usable_records(times, bad, stream="oxts", where=str(files[0].parent), drops=counter)
     a, t = a[keep], times[keep]
     plane = TangentPlane(*a[0, :3].tolist())
     enu = plane.from_ecef(geodetic_to_ecef(a[:, :3]))
-    accuracy = np.clip(np.where(usable(a[:, 23]), a[:, 23], 1.0), 0.05, 100.0)
+    accuracy = np.clip(np.where(finite_mask(a[:, 23]), a[:, 23], 1.0), 0.05, 100.0)
     gps = Gps.upright(times=t, positions=enu, horizontal=accuracy, vertical=2 * accuracy, lever=np.zeros(3))
     imu = Imu(times=t, angular_rate=a[:, 17:20], specific_force=a[:, 11:14], noise=IMU_NOISE)
     return {"gps": gps, "imu": imu}

@@ -11,10 +11,10 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from graphslam.core.errors import DataError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LaserScans, Stream
 from graphslam.io.log_kinds import KINDS, Kind, kind_name
 
@@ -24,7 +24,7 @@ ROWS = ("n", "q")
 """Lengths that grow with the records."""
 
 
-class GrowingLog(Feed):
+class GrowingLog(RecordSource):
     """A log whose records come one by one, or in portions.
 
     A portion is a stream of the usual kind with one record or more. What does not change from record to record
@@ -63,45 +63,45 @@ class GrowingLog(Feed):
 
     @property
     def name(self) -> str:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._name
 
     @property
     def ended(self) -> bool:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._whole is not None
 
     @property
     def log(self) -> SensorLog:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         if self._whole is None:
             raise DataError("the log has not ended", where=self._name)
         return self._whole
 
     def names(self, kind: type) -> list[str]:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return [name for name, held in self._held.items() if issubclass(held.kind.cls, kind)]
 
     def count(self, stream: str) -> int:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._of(stream).ends[-1] if self.ended or stream in self._held else 0
 
     def until(self, stream: str) -> float:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._of(stream).until if self.ended or stream in self._held else -np.inf
 
     def part(self, stream: str, first: int = 0, last: int | None = None) -> Stream:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         if self._whole is not None:
             whole: Stream = self._whole[stream]
             return whole.take(slice(first, last))
         held = self._of(stream)
         return held.part(first, held.ends[-1] if last is None else min(last, held.ends[-1]))
 
-    def let_go(self, stream: str, before: int) -> None:
-        """See :class:`~graphslam.core.feed.Feed`; records of beams leave the memory."""
+    def discard_before(self, stream: str, before: int) -> None:
+        """See :class:`~graphslam.core.record_source.RecordSource`; records of beams leave the memory."""
         if self._whole is None:
-            self._of(stream).let_go(before)
+            self._of(stream).discard_before(before)
 
     @property
     def held_records(self) -> dict[str, int]:
@@ -166,7 +166,7 @@ class _Held:
         here = self.parts[a] if b == a + 1 else joined(self.kind, self.parts[a:b])
         return here.take(slice(first - self.ends[a], last - self.ends[a]))
 
-    def let_go(self, before: int) -> None:
+    def discard_before(self, before: int) -> None:
         if self.spool is None:
             return
         k = int(np.searchsorted(self.ends, before, side="right")) - 1

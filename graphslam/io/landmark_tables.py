@@ -23,7 +23,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
 from graphslam.io.clock import usable_records
 from graphslam.io.look import Claim, Look
@@ -291,7 +291,11 @@ def _motion(
     kind = header.odometry
     a = _in_order(a, "odometry", counter)
     names = ("v", "w") if kind == "velocity" else ("x", "y", "theta")
-    bad = {"a number is missing or not finite": np.asarray(~usable(np.column_stack([a[k] for k in names])).all(axis=1))}
+    bad = {
+        "a number is missing or not finite": np.asarray(
+            ~finite_mask(np.column_stack([a[k] for k in names])).all(axis=1)
+        )
+    }
     keep = usable_records(a["t"], bad, stream="odometry", where=str(path), drops=counter)
     if keep.sum() < 2:
         raise DataError("holds too few records", where=str(path), got=int(keep.sum()), wanted="2 or more")
@@ -324,7 +328,7 @@ def _sightings(
     ids = a.get("id")
     good = np.ones(n, dtype=np.bool_)
     for reason, wrong in (
-        ("stamp, range or bearing is missing or not finite", ~(usable(t) & usable(r) & usable(b))),
+        ("stamp, range or bearing is missing or not finite", ~(finite_mask(t) & finite_mask(r) & finite_mask(b))),
         ("range is not positive", ~(r > 0)),
         ("stamp outside the time of the odometry", ~((span[0] <= t) & (t <= span[1]))),
     ):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.config import convert
+from graphslam.core.config import convert_option
 from graphslam.core.errors import ConfigError
 from graphslam.io.look import Claim, Look
 
@@ -69,5 +69,5 @@ class Reader:
             elif key not in known:
                 raise ConfigError(f"unknown reader option {key!r}; known: {', '.join(sorted(known)) or 'none'}")
             else:
-                values[key] = convert(hints.get(key, Any), value, f"reader option {key}")
+                values[key] = convert_option(hints.get(key, Any), value, f"reader option {key}")
         return function(path, **values)

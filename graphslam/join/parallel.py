@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError
 from graphslam.join.association import Association, associate
 from graphslam.join.eif import join_maps, match_by_id
@@ -103,7 +103,7 @@ def _pool(executor: str | Pool, workers: int | None) -> Iterator[tuple[Pool, int
         with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
             yield pool, count
     elif isinstance(executor, str):
-        with connect(executor) as client:
+        with connect_cluster(executor) as client:
             yield client, _hands(client)
     else:
         yield executor, _hands(executor)

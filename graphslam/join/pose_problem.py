@@ -26,7 +26,7 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.npz import floats, ints
-from graphslam.core.poses import SE2, SE3, Group, chained
+from graphslam.core.poses import SE2, SE3, Group, compose_increments
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, attitude_terms
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord, between_terms
@@ -202,7 +202,7 @@ class PoseProblem(Ties):
         """The chain alone ``(n, 3|7)``: every node by its first edge to the one before."""
         g, edge = self.group, self._steps[1]
         back = (self.ends[edge, 0] > self.ends[edge, 1])[:, None]
-        return chained(np.where(back, g.inverse(self.measured[edge]), self.measured[edge]))
+        return compose_increments(np.where(back, g.inverse(self.measured[edge]), self.measured[edge]))
 
     def submap_of(self, nodes: npt.ArrayLike) -> Index:
         """The first submap that holds each node: an exit belongs to the submap that ends there."""
@@ -289,7 +289,8 @@ class PoseProblem(Ties):
 
     @classmethod
     def of_graph(cls, graph: PoseGraph) -> PoseProblem:
-        """The relative poses and levelled bases of a graph of dense submaps, ties at the weight of their kernels there."""
+        """The relative poses and levelled bases of a graph of dense submaps, ties at the weight of their kernels
+        there."""
         chain = graph.submaps
         if not chain:
             raise DataError("there are no submaps", got=0, wanted="at least one")

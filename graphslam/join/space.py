@@ -18,7 +18,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from tqdm.auto import tqdm
 
-from graphslam.core.charts import bent, pose_differences
+from graphslam.core.charts import chart_difference, pose_differences
 from graphslam.core.errors import CovarianceError, DataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
@@ -81,7 +81,7 @@ class SpaceEstimate(JoinResult):
         chart = chart or self.chart
         assert self.anchors is not None
         e, w = pose_differences(poses, self.poses[1:], chart)
-        return np.concatenate([e.ravel(), bent(landmarks - self.landmarks, w[self.anchors], chart).ravel()])
+        return np.concatenate([e.ravel(), chart_difference(landmarks - self.landmarks, w[self.anchors], chart).ravel()])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from graphslam.core.charts import along_arc
+from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
-from graphslam.core.markup import element, join
+from graphslam.core.markup import html_element, join_parts
 from graphslam.core.submap import Submap
 from graphslam.join.submap_blocks import SubmapProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
@@ -101,8 +101,8 @@ class SubmapEstimate:
         if (chart or self.chart) == "group":
             if self.anchors is None:
                 raise SolverError("the map does not say what its landmarks hang on: wanted anchors")
-            e[:, :2] = along_arc(e[:, :2], e[:, 2])
-            f = along_arc(f, e[self.anchors, 2])
+            e[:, :2] = apply_inverse_left_jacobian(e[:, :2], e[:, 2])
+            f = apply_inverse_left_jacobian(f, e[self.anchors, 2])
         return np.concatenate([e.ravel(), f.ravel()])
 
     @property
@@ -165,7 +165,7 @@ class SubmapEstimate:
             f": {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
             f"objective {self.objective:.4f}{polished}, {self.iterations} iterations, {self.seconds:.3f} s"
         )
-        return join([element("b", "Joined map"), said])
+        return join_parts([html_element("b", "Joined map"), said])
 
 
 # A step is halved no further than this before its direction is given up and damped.

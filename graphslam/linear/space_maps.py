@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from graphslam.core.charts import arc_matrices, arc_slopes
+from graphslam.core.charts import inverse_left_jacobian_slopes, inverse_left_jacobians
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import (
@@ -95,7 +95,7 @@ class Placed:
         blocks = _Blocks()
         back, w, V, e = seen.back, seen.w, seen.V, seen.e
         if self.map.chart == "group":
-            curve = arc_slopes(seen.turn, e)  # of every position by the turn that it goes along
+            curve = inverse_left_jacobian_slopes(seen.turn, e)  # of every position by the turn that it goes along
             true = V
         else:
             curve, true = np.zeros((m + n, 3, 3)), so3_left_jacobian_inverse(w)
@@ -129,7 +129,7 @@ class Placed:
             q = quat_multiply(np.broadcast_to(base[3:] * _CONJUGATE, q.shape), q)
         w = so3_log(quat_multiply(q, M.poses[:, 3:] * _CONJUGATE)) if m else np.zeros((0, 3))
         e = off @ back.T - np.concatenate([M.poses[:, :3], M.points])
-        V = arc_matrices(w) if M.chart == "group" else np.broadcast_to(np.eye(3), (m, 3, 3))
+        V = inverse_left_jacobians(w) if M.chart == "group" else np.broadcast_to(np.eye(3), (m, 3, 3))
         held = np.concatenate([np.arange(m), M.anchors])
         turn = np.where(held[:, None] >= 0, w[held], 0.0) if m else np.zeros((len(held), 3))
         Va = np.where(held[:, None, None] >= 0, V[held], np.eye(3)) if m else np.tile(np.eye(3), (len(held), 1, 1))

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, upright
+from graphslam.core.poses import group_of, level_poses
 from graphslam.loops.candidates import APPEARANCE, Candidate
 from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import Descriptors, similarity
@@ -99,7 +99,7 @@ def appearance_candidates(
                     i=int(rows[k]),
                     j=j,
                     source=APPEARANCE,
-                    T_ij=np.array([0.0, 0.0, turn[k]]) if g.dim == 2 else upright(np.zeros(3), turn[k]),
+                    T_ij=np.array([0.0, 0.0, turn[k]]) if g.dim == 2 else level_poses(np.zeros(3), turn[k]),
                     covariance=covariance,
                     gain=math.nan,
                     score=float(correlation[k]),

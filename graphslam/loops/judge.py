@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.robust import truncated_least_squares
 
@@ -49,7 +49,7 @@ def settled_loops(
     out = np.ones(len(ends), dtype=np.bool_)
     if not asked.any():
         return out
-    poses = chained(increments)
+    poses = compose_increments(increments)
     n = len(poses)
     steps = np.arange(n - 1)
     network = PoseNetwork(

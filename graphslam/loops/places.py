@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, arc_length
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.core.submap import Submap
 from graphslam.graph.inner_nodes import inner_rows
 
@@ -151,7 +151,7 @@ class ChainRelative:
         T, Q = chain_increments(submaps, places)
         g = group_of(T)
         self.increments, self.covariances = T, Q
-        self.poses = chained(T)
+        self.poses = compose_increments(T)
         """In the frame of the first ``(n + 1, 7|3)``; the last is the end of the chain."""
         # in the axes of the first place contributions add: W = Σ Ad(X_k) Q_k Ad(X_k)ᵀ
         A = g.adjoint(self.poses[1:])

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.dense import CloudMap
 from graphslam.core.geometry import Array
-from graphslam.core.points import thin
-from graphslam.core.poses import group_of, level
+from graphslam.core.points import voxel_downsample
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.evidence.views import has_view, view_of
 from graphslam.maps.pieces import DivisionConfig, owning_places
@@ -40,14 +40,14 @@ def fused_points(
             continue
         times, T_world = nodes[s.key]
         local = local_nodes(s, times, level_nodes) if len(times) > 1 else group_of(T_world).identity[None]
-        T_world = level(T_world) if level_nodes else T_world
+        T_world = remove_roll_pitch(T_world) if level_nodes else T_world
         made.append(_placed(cloud, s, times, local, T_world, DivisionConfig() if config is None else config))
         cells.append(cloud.cell)
     if not made:
         return None
     points = np.concatenate(made)
     made.clear()
-    return thin(points, min(cells))
+    return voxel_downsample(points, min(cells))
 
 
 def _placed(cloud: CloudMap, s: Submap, times: Array, local: Array, T_world: Array, config: DivisionConfig) -> Array:

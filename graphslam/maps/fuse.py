@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.batch import write_packed
 from graphslam.evidence.beams import BeamModel
@@ -260,7 +260,7 @@ class FusedMap:
                 written.append(some)
                 empty += gone_empty
             changed = np.concatenate(written)
-            with deferred_interrupts():
+            with defer_interrupts():
                 self._grid.take(work)
                 self._posed = posed
                 for name in gone:

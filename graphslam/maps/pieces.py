@@ -32,7 +32,7 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import SE2, SE3
-from graphslam.core.shelf import SHELF, Arrays
+from graphslam.core.spill_cache import SPILL_CACHE, Arrays
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
@@ -109,7 +109,8 @@ class _Bricks:
 class Piece:
     """Voxels that move with one node: a value that does not change, in the lattice of the frame of its submap's base.
 
-    Its bricks lie on the shelf of the process (:mod:`graphslam.core.shelf`): take an array of them once, and use it.
+    Its bricks lie on the shelf of the process (:mod:`graphslam.core.spill_cache`): take an array of them once, and use
+    it.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ class Piece:
         which = np.stack(np.meshgrid(*[[0, 1]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
         base = ends[which, np.arange(dim)] if self.known else np.zeros((0, dim))
         self.corners = group.transform(group.inverse(np.broadcast_to(T, (len(base), group.size))), base)
-        self._bricks = SHELF.put(bricks, bricks.nbytes, _Bricks.packed, partial(_Bricks.unpacked, first, size))
+        self._bricks = SPILL_CACHE.put(bricks, bricks.nbytes, _Bricks.packed, partial(_Bricks.unpacked, first, size))
 
     @property
     def coordinates(self) -> Ints:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.core.shelf import SHELF, Slot, as_it_is, the_only
+from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry, pack_array, unpack_array
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
 from graphslam.evidence.pool import GridPool
 from graphslam.maps.fuse_kernels import find_bricks, list_marked, meet_bricks, sample_piece, sum_bricks
@@ -44,7 +44,7 @@ class Posed:
 
     def __init__(self, T_world_node: Array, keys: Ints, starts: Ints, entries: Entries) -> None:
         self.T_world_node, self.keys, self.starts = T_world_node, keys, starts
-        self._entries: Slot[Entries] = SHELF.put(entries, entries.nbytes, as_it_is, the_only)
+        self._entries: CacheEntry[Entries] = SPILL_CACHE.put(entries, entries.nbytes, pack_array, unpack_array)
 
     @property
     def entries(self) -> Entries:

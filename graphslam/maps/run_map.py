@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import MAX_LEVELS, half_edge
@@ -168,7 +168,7 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
     for name in divided.pieces:
         assert isinstance(name, tuple)
         T = nodes[name[0]][1][name[1]]
-        out[name] = level(T) if divided.level_nodes else T
+        out[name] = remove_roll_pitch(T) if divided.level_nodes else T
     return out
 
 
@@ -268,5 +268,5 @@ def _one_piece(s: Submap, nodes: Mapping[int, tuple[Array, Array]]) -> Submap:
 def _levelled(bases: Array) -> bool:
     """Do all bases ``(k, 7)`` stand about level?"""
     group = group_of(bases)
-    lean = group.log(group.between(level(bases), bases))[:, :2]
+    lean = group.log(group.between(remove_roll_pitch(bases), bases))[:, :2]
     return bool(np.all(np.linalg.norm(lean, axis=1) < MOST_TILT))

@@ -259,7 +259,7 @@ class MotionModel:
         """
         steps, n = self.steps, len(self.steps)
         assert steps.tilt is not None
-        seen, D = se3.roll_pitch(poses)
+        seen, D = se3.roll_pitch_jacobian(poses)
         e = steps.tilt - seen - states[1][[ROLL, PITCH]]
         sigma = max(steps.tilt_sigma, 1e-5)
         phi = np.exp(-self.dt / max(steps.tilt_time, 1e-6))

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.core.shelf import Slot
+from graphslam.core.spill_cache import CacheEntry
 from graphslam.graph.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
@@ -309,7 +309,7 @@ class _Work:
         self.alike = 1.0
         self.found = NOTHING
         self.surfaces: Surfaces | None = None
-        self.first: Slot[Surfaces] | None = None
+        self.first: CacheEntry[Surfaces] | None = None
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
         self.most = max(FEWEST, round(self.reach / config.chunk_length))
@@ -435,7 +435,7 @@ class _Work:
         if passes:
             self.cloud = self.problem.cloud = self.raw
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
-        give_back()
+        trim_heap()
         if again or self.surfaces is None:
             self.surfaces = None
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
@@ -535,7 +535,7 @@ class _Work:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
         assert self.first is not None
-        give_back()
+        trim_heap()
         before = self.agreement(self.raw, self.first.get(), self.start, self.noise)
         r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         self.alike = alike(self.found, self.cloud, r, self.noise)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
-from graphslam.core.shelf import SHELF, Slot
+from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
 from graphslam.refine.scans import Scans
 from graphslam.registration.plane_kernels import Pairs
 from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations, thin_places
@@ -155,11 +155,11 @@ class Surfaces:
     stands: Index
     tilts: npt.NDArray[np.float32]
 
-    def put_aside(self) -> Slot[Surfaces]:
+    def put_aside(self) -> CacheEntry[Surfaces]:
         """On the shelf of the process: surfaces that are asked for once more at the end."""
         parts = [self.normals, self.flat, self.stands, self.tilts]
         size = sum(a.nbytes for a in parts)
-        return SHELF.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
+        return SPILL_CACHE.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
 
 
 def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:

@@ -20,10 +20,10 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from graphslam.core.dense import MapView
+from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 
 Ints = npt.NDArray[np.int64]
 
@@ -86,7 +86,7 @@ class Descriptors:
         return np.asarray(self.values.sum(axis=2) / np.maximum(some, 1e-9) * np.sqrt(some / self.known.shape[2]))
 
 
-def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
+def describe(view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
     """Descriptors of places of one map.
 
     Parameters
@@ -95,7 +95,7 @@ def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | 
         In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
     """
     c = DescriptorConfig() if config is None else config
-    T = level(np.asarray(T_base_place, dtype=np.float64))
+    T = remove_roll_pitch(np.asarray(T_base_place, dtype=np.float64))
     g = group_of(T)
     if T.ndim != 2 or g.dim != view.dim:
         raise GeometryError("places do not fit the map", got=T.shape, wanted=f"(n, {7 if view.dim == 3 else 3})")

@@ -20,7 +20,7 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.points import check_pose, transform
+from graphslam.core.points import check_pose, transform_points
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.degeneracy import calibrated_covariance, feigned_information, translational_degeneracy
 from graphslam.registration.planar import Aligned, align_planar
@@ -285,7 +285,7 @@ def _measure(
 ) -> Registration:
     """Everything about a result but the verdict."""
     dim, planar = target.dim, target.dim == 2
-    moved = transform(found.T, source.points)
+    moved = transform_points(found.T, source.points)
     reach = max(config.near, config.radii[-1])
     distance, which = target.tree.query(moved, distance_upper_bound=reach)
     near = distance < config.near

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
-from graphslam.core.points import check_pose, finite_points, spread, thin, transform
+from graphslam.core.points import check_pose, evenly_spaced, finite_points, transform_points, voxel_downsample
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima, score_block
 
@@ -156,7 +156,7 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lat
     back = np.rint(first / field.cell).astype(np.int64)
     still = np.zeros_like(lattice.yaw)
     turned = offset_pose(around, np.stack([still, still, still, lattice.yaw], -1))
-    cells = field._cells(transform(turned[:, None], points).reshape(-1, field.dim)) + back
+    cells = field._cells(transform_points(turned[:, None], points).reshape(-1, field.dim)) + back
     score_block(cells.reshape(len(turned), -1, 3), counts, steps, phases, scores)
     return scores
 
@@ -235,7 +235,7 @@ def correlative_search(
         raise GeometryError("source and field differ in dimension", got=p.shape[1], wanted=field.dim)
     if keep < 1:
         raise ConfigError(f"search: {keep} modes wanted; wanted at least 1")
-    p = spread(thin(p, field.cell), config.most_points)
+    p = evenly_spaced(voxel_downsample(p, field.cell), config.most_points)
     step = (*[2.0 * (coarse or field).cell] * field.dim, 0.0) if steps is None else steps
     reach = float(np.quantile(np.hypot(p[:, 0], p[:, 1]), 0.9)) if len(p) else 1.0
     lattice = make_lattice(field, half_widths, step, reach)
@@ -246,7 +246,7 @@ def correlative_search(
         few, seen, modes = p, lattice, 4 * keep
         sums = score_lattice(p, field, T, lattice)
     else:
-        few, modes = spread(p, config.coarse_points), max(config.coarse_modes, keep)
+        few, modes = evenly_spaced(p, config.coarse_points), max(config.coarse_modes, keep)
         seen = make_lattice(coarse, half_widths, step, reach)
         sums = score_lattice(few, coarse, T, seen)
     weights, scores = _weigh(sums, len(few), seen, sigmas, config)

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from graphslam.core.dense import MapView
+from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.points import check_pose, spread
+from graphslam.core.points import check_pose, evenly_spaced
 from graphslam.core.poses import Group, group_of
 from graphslam.registration.gates import match_fails, second_modes
 from graphslam.registration.pair_config import PairConfig
@@ -36,11 +36,11 @@ class PreparedMap:
 
     Parameters
     ----------
-    view : MapView
+    view : DenseMapView
         In the frame of the submap's base.
     """
 
-    def __init__(self, view: MapView, config: PairConfig) -> None:
+    def __init__(self, view: DenseMapView, config: PairConfig) -> None:
         self.view, self.config = view, config
 
     @cached_property
@@ -78,7 +78,7 @@ class PreparedMap:
         near = np.hypot(*(p[:, :2] - T[:2]).T) <= self.config.radius
         if g.dim == 3:
             near &= np.abs(p[:, 2] - T[2]) <= self.config.height
-        chosen = spread(p[near], self.config.source_points)
+        chosen = evenly_spaced(p[near], self.config.source_points)
         return g.transform(np.broadcast_to(g.inverse(T), (len(chosen), g.size)), chosen)
 
 

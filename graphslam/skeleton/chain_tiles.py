@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.atomic import read_json, sweep_parts, write_json
-from graphslam.core.cluster import hands
+from graphslam.core.cluster import task_runner
 from graphslam.core.errors import ConfigError, DataError, FormatError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton import chain_kernels as chains
@@ -188,7 +188,7 @@ def relax_tiles(
     known: list[bool] = []
     given = {index["ties"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
 
-    with hands(workers, cluster) as run:
+    with task_runner(workers, cluster) as run:
 
         def step(names: list[str], x: Array | None, scale: float = 1.0) -> list[Done]:
             work = [

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import Markup, element, join
+from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
@@ -287,7 +287,7 @@ class Solution:
             f" ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
             f"{self.objective:.4f}, {verdict}{gap}, {self.iterations} iterations, {self.seconds:.2f} s"
         )
-        return join([element("b", "Solution"), said, Markup(self.score._repr_html_())])
+        return join_parts([html_element("b", "Solution"), said, Markup(self.score._repr_html_())])
 
 
 # The decrement at which a solution counts as the optimum, relative to max(1, objective): far below what any figure

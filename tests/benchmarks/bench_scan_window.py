@@ -18,7 +18,7 @@ import numpy as np
 
 import graphslam as gs
 from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import align_se3, se3_transform
@@ -97,7 +97,7 @@ def main() -> None:
         for seed in seeds:
             log = gs.simulate("garage", seed=seed, layout=layout)
             options = recommended(log, "scan-window").get("frontend", {})
-            config: ScanWindowFrontEndConfig = build(ScanWindowFrontEndConfig, options, "frontend")
+            config: ScanWindowFrontEndConfig = build_config(ScanWindowFrontEndConfig, options, "frontend")
             rows.append(odometry(make_steps(log, config.steps), config))
             print(f"  {layout} {seed}: {rows[-1][0]:.3f} m, {1e3 * rows[-1][1]:.1f} mrad", flush=True)
             if seed - args.first < args.runs:

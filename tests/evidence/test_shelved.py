@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.core.shelf import Shelf
+from graphslam.core.spill_cache import SpillCache
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.shelved import ShelvedGrid, load_shelved, packed_values, shelved, unpacked_values
@@ -35,7 +35,7 @@ def same(a: EvidenceGrid, b: EvidenceGrid) -> bool:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_grids_are_the_same_from_memory_and_from_disk(dim: int) -> None:
     plain = [scanned(k, dim) for k in range(8)]
-    shelf = Shelf(room=1)  # of all of them one is in memory
+    shelf = SpillCache(room=1)  # of all of them one is in memory
     put = [shelved(g, shelf) for g in plain]
     points = np.random.default_rng(99).uniform(-9.0, 9.0, (500, dim))
     for a, b in zip(plain, put):
@@ -57,10 +57,10 @@ def test_no_more_trees_are_alive_than_there_is_room_for(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(GridPool, "__init__", counted)
     one = scanned(0)
-    size = shelved(one, Shelf()).pool.nbytes
+    size = shelved(one, SpillCache()).pool.nbytes
     del one
     gc.collect()
-    shelf, put, most = Shelf(room=4 * size), [], 0
+    shelf, put, most = SpillCache(room=4 * size), [], 0
     for k in range(20):
         put.append(shelved(scanned(k), shelf))
         most = max(most, len(alive))
@@ -72,7 +72,7 @@ def test_no_more_trees_are_alive_than_there_is_room_for(monkeypatch: pytest.Monk
 
 
 def test_files_are_the_same_bytes(tmp_path: Path) -> None:
-    plain, shelf = scanned(3), Shelf(room=1)
+    plain, shelf = scanned(3), SpillCache(room=1)
     put, _ = shelved(plain, shelf), shelved(scanned(4), shelf)
     plain.save(tmp_path / "a.npz")
     put.save(tmp_path / "b.npz")
@@ -83,7 +83,7 @@ def test_files_are_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_who_writes_has_a_grid_of_his_own() -> None:
-    shelf = Shelf(room=1)
+    shelf = SpillCache(room=1)
     put, other = shelved(scanned(5), shelf), shelved(scanned(6), shelf)
     twin, points = put.copy(), np.array([[1.0, 2.0, 0.5]])
     other.voxel_counts()  # the first is on disk now, but for the twin
@@ -98,7 +98,7 @@ def test_who_writes_has_a_grid_of_his_own() -> None:
 
 
 def test_two_on_disk_are_merged() -> None:
-    shelf = Shelf(room=1)
+    shelf = SpillCache(room=1)
     put = [shelved(scanned(k), shelf) for k in range(3)]
     T = np.array([0.4, -0.2, 0.6, 0.0, 0.0, np.sin(0.2), np.cos(0.2)])
     plain = scanned(0)
@@ -111,12 +111,12 @@ def test_two_on_disk_are_merged() -> None:
 def test_locked_stays_locked() -> None:
     grid = scanned(7)
     grid.lock()
-    assert shelved(grid, Shelf()).locked
-    assert not shelved(grid, Shelf()).copy().locked
+    assert shelved(grid, SpillCache()).locked
+    assert not shelved(grid, SpillCache()).copy().locked
 
 
 def test_an_empty_grid() -> None:
-    shelf = Shelf(room=1)
+    shelf = SpillCache(room=1)
     put, _ = shelved(EvidenceGrid(0.1), shelf), shelved(scanned(1), shelf)
     assert len(put.brick_coordinates()) == 0
     assert put.root == 0 or put.voxel_counts().known == 0

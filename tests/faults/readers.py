@@ -359,11 +359,11 @@ def read_config(root: Path) -> Any:
     """What a resumed run does first."""
     from graphslam.app.run.files import read_options
     from graphslam.backend.config import BackEndConfig, GpsOptions
-    from graphslam.core.config import build
+    from graphslam.core.config import build_config
 
     values = read_options(root)
     for part, kind in (("backend", BackEndConfig), ("gps", GpsOptions)):
-        build(kind, values.get(part, {}), part)
+        build_config(kind, values.get(part, {}), part)
     return read_toml(root / "config.toml")
 
 

@@ -163,9 +163,9 @@ def ring(
 
 def true_end(steps: Steps) -> Array:
     """True pose ``(7,)`` or ``(3,)`` at the end in the gravity-aligned frame of the first base."""
-    from graphslam.core.poses import group_of, level
+    from graphslam.core.poses import group_of, remove_roll_pitch
 
     assert steps.truth is not None
     poses = steps.truth.poses
     group = group_of(poses)
-    return group.between(level(poses[0]), poses[-1])
+    return group.between(remove_roll_pitch(poses[0]), poses[-1])

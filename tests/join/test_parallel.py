@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError, CovarianceError, IndeterminateError
 from graphslam.core.extras import import_extra
 from graphslam.core.submap import Submap
@@ -52,7 +52,7 @@ def test_a_cluster_and_a_pool_give_the_same_bits(
 ) -> None:
     alone = join_tree(chain, association=association)
     assert_same(join_tree(chain, association=association, executor=scheduler), alone)
-    with connect(scheduler) as client:
+    with connect_cluster(scheduler) as client:
         shared = join_tree(chain, association=association, executor=client)
         assert client.submit(math.sqrt, 4).result() == 2.0  # the caller's client is left open
     assert_same(shared, alone)

@@ -16,7 +16,7 @@ from graphslam.core.errors import DataError, IndeterminateError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.graph.noise import Robust
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
@@ -49,7 +49,7 @@ class LoopNetwork:
         g = group_of(increments)
         for k, P in enumerate(covariances):
             check_covariance(P, what=f"covariance of increment {k}", dim=g.dof)
-        self._poses = chained(increments)
+        self._poses = compose_increments(increments)
         n = len(increments)
         self._ends = [(k, k + 1) for k in range(n)]
         self._measured = [T.copy() for T in increments]

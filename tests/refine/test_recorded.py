@@ -9,7 +9,7 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.trajectory import Trajectory
@@ -53,7 +53,7 @@ def refined(building: SensorLog) -> Refinement:
 def test_relations_of_a_planar_log_are_better_than_those_of_its_odometry(
     building: SensorLog, refined: Refinement
 ) -> None:
-    steps = make_steps(building, build(StepConfig, recommended(building, "segslam")["frontend"]["steps"]))
+    steps = make_steps(building, build_config(StepConfig, recommended(building, "segslam")["frontend"]["steps"]))
     before = relations(chain(steps.odometry), building["reference"])
     after = relations(path_of(refined), building["reference"])
     assert after["translation_mean"] < before["translation_mean"]
@@ -91,7 +91,7 @@ def test_scans_of_a_lidar_pack_agree_no_less_than_along_its_odometry(name: str, 
 def test_a_path_that_is_off_is_brought_back(data_dir: Path) -> None:
     log = part("lidar3d-hku1", 30.0, data_dir)
     start = chain(log["odometry"])
-    bent = chain(make_steps(log, build(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
+    bent = chain(make_steps(log, build_config(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
     before = relations(bent, log["reference"])
     found = gs.refine_path(log, bent, steps={**FREEHAND, "yaw_bias": 0.01})
     after = relations(path_of(found), log["reference"])

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphslam.app.studies.segslam_trial import QUICK
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.refine.scans import Scans
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -26,5 +26,5 @@ def court_scans(seed: int, **changes: float) -> tuple[Scans, Array, Array]:
     assert steps.truth is not None
     truth = steps.truth.interpolate(steps.times)
     g = group_of(truth)
-    truth = g.between(np.broadcast_to(level(truth[0]), truth.shape), truth)
+    truth = g.between(np.broadcast_to(remove_roll_pitch(truth[0]), truth.shape), truth)
     return Scans.of(steps), chain(steps.odometry).poses, truth

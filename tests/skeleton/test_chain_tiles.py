@@ -127,7 +127,7 @@ def test_tasks_are_as_long_as_what_was_measured_makes_them(
     wanted = relax_tiles(folders[0])
     monkeypatch.setattr(tiles, "POSE_SECONDS", 0.01 / 5)
     monkeypatch.setattr(tiles, "work_on_tiles", slow)
-    monkeypatch.setattr(tiles, "hands", lambda workers, cluster: nullcontext(run))
+    monkeypatch.setattr(tiles, "task_runner", lambda workers, cluster: nullcontext(run))
     found = relax_tiles(folders[1], task_seconds=0.095)
     assert sizes[:2] == [[20], [10, 10]]  # first there is no step to take, and half to do
     assert all(set(s) == {1} for s in sizes[2:])

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, rotation2
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 
 _NODES = 64
 """Places along a path at which the heading may err; more change nothing that a Monte Carlo could see."""
@@ -153,7 +153,7 @@ class FilterDrift:
         if poses.ndim != 2 or len(poses) == 0 or particles < 1:
             raise DataError("no path or no particle to say the drift of", got=(poses.shape, particles))
         group = group_of(poses)
-        end = level(poses[-1]) if gravity and group.dim == 3 else poses[-1]
+        end = remove_roll_pitch(poses[-1]) if gravity and group.dim == 3 else poses[-1]
         steps = np.concatenate([[0.0], np.linalg.norm(np.diff(poses[:, : group.dim], axis=0), axis=1)])
         s = np.cumsum(steps)
         k = np.unique(np.linspace(0, len(s) - 1, min(_NODES, len(s))).round().astype(np.int64))

@@ -196,7 +196,8 @@ class LastingConfig:
                 raise ConfigError(f"lasting.{one} and lasting.{other} cannot be told apart; wanted 0 for one of them")
 
     def chosen(self) -> tuple[tuple[str, ...], Array]:
-        """Name and σ of each of :data:`~graphslam.core.lasting.CONSTANTS`; what is none has no name, and a σ of 1."""
+        """Name and σ of each of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is none has no name, and a σ of
+        1."""
         pairs = (("yaw_bias", "turn_per_metre"), ("distance_scale",), ("range_offset",), ("sensor_yaw", "range_scale"))
         names = tuple(next((n for n in some if getattr(self, n) > 0.0), "") for some in pairs)
         sigmas = [getattr(self, n) if n else 1.0 for n in names]

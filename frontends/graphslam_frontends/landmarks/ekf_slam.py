@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.path_points import PathPoints
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
@@ -141,7 +141,7 @@ class _Run:
             min_hits=self.config.min_hits,
         )
 
-    def submap(self, key: int, report: dict[str, Any], feed: Feed | None = None) -> Submap:
+    def submap(self, key: int, report: dict[str, Any], feed: RecordSource | None = None) -> Submap:
         """The filter's own Gaussian as a submap; points of its path at the fixes of a feed are smoothed beside it."""
         slots = self.map.landmarks(self.config.min_hits)
         mean, P = self.map.joint(slots)
@@ -165,7 +165,7 @@ class _Run:
             points,
         )
 
-    def smoothed_submap(self, feed: Feed, key: int, report: dict[str, Any], trim: float) -> Submap:
+    def smoothed_submap(self, feed: RecordSource, key: int, report: dict[str, Any], trim: float) -> Submap:
         """The optimum under the filter's association as a submap."""
         obs, c = self.data.observations, self.config
         slots = self.map.landmarks(c.min_hits)
@@ -243,7 +243,7 @@ class Ekf(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,

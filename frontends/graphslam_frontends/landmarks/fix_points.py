@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import (
     Array,
@@ -20,6 +19,7 @@ from graphslam.core.geometry import (
     wrap_angle,
 )
 from graphslam.core.path_points import SAME_TIME, PathPoints
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam_frontends.landmarks.smoothing_kernels import path_covariances
 from graphslam_frontends.landmarks.summarise import Smoothed
@@ -30,7 +30,7 @@ FLOOR = 1e-4
 """σ that a point has by itself at least [m]."""
 
 
-def fixes_awaited(feed: Feed, until: float) -> bool:
+def fixes_awaited(feed: RecordSource, until: float) -> bool:
     """May fixes of a log that grows still come that are older than ``until`` [s]?
 
     What a front end makes must not depend on the portions in which a log comes.
@@ -39,7 +39,7 @@ def fixes_awaited(feed: Feed, until: float) -> bool:
     return not feed.ended and name is not None and feed.until(name) < until
 
 
-def fixes_inside(feed: Feed, t_start: float, times: Array) -> bool:
+def fixes_inside(feed: RecordSource, t_start: float, times: Array) -> bool:
     """Was any fix taken between the ends of a submap?"""
     name = feed.of_type(Gps)
     if name is None:
@@ -92,7 +92,7 @@ class Way:
     by_second: Array
 
 
-def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> Way | None:
+def way_of_fixes(feed: RecordSource, smoothed: Smoothed, t_start: float, times: Array) -> Way | None:
     """Where the fixes inside a submap were taken; None where none was taken, or none has come yet.
 
     Parameters

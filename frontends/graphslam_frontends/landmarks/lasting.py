@@ -1,5 +1,5 @@
 """Constant errors of wheels and sensor beside a smoothed submap, for a graph to estimate
-(:mod:`graphslam.core.lasting`).
+(:mod:`graphslam.core.sensor_biases`).
 
 What is measured is taken to be: turns ``b`` too large for each second in motion, or each metre driven; distances too
 long by the factor ``e^s``; ranges too long by ``o``; the sensor turned to the left by ``y``, or ranges that have no
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.geometry import Array, rotation2, se2_between
-from graphslam.core.lasting import CONSTANTS, LastingErrors
+from graphslam.core.sensor_biases import CONSTANTS, SensorBiases
 from graphslam_frontends.landmarks.config import LastingConfig
 from graphslam_frontends.landmarks.fix_points import Way
 from graphslam_frontends.landmarks.smoothing_kernels import responses
@@ -23,7 +23,7 @@ MOVING = 1e-6
 
 def lasting_errors(
     config: LastingConfig, smoothed: Smoothed, seconds: Array, way: Way | None, *, base: bool
-) -> LastingErrors:
+) -> SensorBiases:
     """What a smoothed submap is with constant errors, and what it says of them.
 
     Parameters
@@ -71,7 +71,7 @@ def lasting_errors(
     points, before = np.zeros((0, len(CONSTANTS))), np.concatenate([np.zeros((1, 3, len(CONSTANTS))), moved])
     if way is not None:
         points = (way.by_first @ before[way.at + 1] + way.by_second @ before[way.at + 2]).reshape(-1, len(CONSTANTS))
-    return LastingErrors(
+    return SensorBiases(
         names=names, sigmas=sigmas, response=np.concatenate([exit_moved, shifted]), score=score,
         information=information, path=before if base else moved, points=points,
     )  # fmt: skip

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
 from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from graphslam_frontends.landmarks.config import RangeBearingNoise
@@ -159,7 +159,7 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     drops : DropCounter
         Where scans and observations that are not used are counted.
     """
-    made = Preparing(Feed(log), config, drops)
+    made = Preparing(RecordSource(log), config, drops)
     made.advance()
     return made.prepared
 
@@ -175,7 +175,7 @@ class Preparing:
         As in :func:`prepare`.
     """
 
-    def __init__(self, feed: Feed, config: PrepareConfig, drops: DropCounter) -> None:
+    def __init__(self, feed: RecordSource, config: PrepareConfig, drops: DropCounter) -> None:
         self.feed, self.config, self.drops = feed, config, drops
         self.made: Prepared | None = None
         self.done = False
@@ -215,7 +215,7 @@ class Preparing:
             part = part if n == len(part.times) else part.take(slice(0, n))
         self._taken += len(part.times)
         self._take(part, motion_name, motion, stream, ended)
-        self.feed.let_go(stream, self._taken)
+        self.feed.discard_before(stream, self._taken)
         self.done = ended
         return True
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
@@ -44,7 +44,7 @@ class RbpfEkf(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,
@@ -56,7 +56,7 @@ class RbpfEkf(FrontEnd):
             yield None if found is None else found[0]
 
     def with_particles(
-        self, feed: Feed, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self, feed: RecordSource, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[tuple[Submap, ParticleSet] | None]:
         """The submaps of :meth:`follow`, each with the particles it was made of as they stood at its last scan.
 

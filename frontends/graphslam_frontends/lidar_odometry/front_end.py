@@ -14,13 +14,13 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.dense import CloudMap
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -153,7 +153,7 @@ class LidarFrontEnd(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,
@@ -193,7 +193,7 @@ class LidarFrontEnd(FrontEnd):
             wheels.hear(float(clouds.times[0]))
             seen.append(self._follow(odometry, clouds, 0))
             mapped, most = mapped or seen[-1].seen.state in MAPPED, max(most, seen[-1].seen.points)
-            feed.let_go(name, k + 1)
+            feed.discard_before(name, k + 1)
             if k == 0:
                 odometry.errors.begin()
             kept.append(seen[-1])
@@ -232,7 +232,7 @@ class LidarFrontEnd(FrontEnd):
         name, clouds = self._clouds(log)
         made = bool(self._made) and self._made[0].ended and self._made[0].log is log
         if not (made and len(self._made[1]) == len(clouds)):
-            feed = Feed(log)
+            feed = RecordSource(log)
             unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
             for _ in unit.rehearse(name):
                 pass
@@ -250,7 +250,7 @@ class LidarFrontEnd(FrontEnd):
         """Let go of the path and the scans of the last log."""
         self._made.clear()
 
-    def _stream(self, streams: SensorLog | Feed) -> str | None:
+    def _stream(self, streams: SensorLog | RecordSource) -> str | None:
         return self.config.stream or streams.of_type(PointClouds)
 
     def _named(self, where: str, name: str | None) -> str:
@@ -267,7 +267,7 @@ class LidarFrontEnd(FrontEnd):
         name = self._named(log.name, self._stream(log))
         return name, self._checked(name, log[name])
 
-    def _imu(self, feed: Feed, clouds: str) -> str | None:
+    def _imu(self, feed: RecordSource, clouds: str) -> str | None:
         """Name of the IMU that is taken: one that reads as soon as the first scans are made."""
         name = feed.of_type(Imu) if self.config.imu == "auto" else self.config.imu
         if name is None or name == "none":
@@ -278,7 +278,7 @@ class LidarFrontEnd(FrontEnd):
         scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
         return name if len(stream.times) and len(scans) and stream.times[0] <= scans[-1] else None
 
-    def _wheels(self, feed: Feed, clouds: str) -> str | None:
+    def _wheels(self, feed: RecordSource, clouds: str) -> str | None:
         """Name of the odometry that is taken: one that tells motions as soon as the first scans are made."""
         asked = self.config.wheels
         name = feed.of_type(Odometry) if asked == "auto" else asked
@@ -314,7 +314,7 @@ class _Heard(ABC):
         None: there is none, and nothing is waited for.
     """
 
-    def __init__(self, feed: Feed, name: str | None) -> None:
+    def __init__(self, feed: RecordSource, name: str | None) -> None:
         self.feed, self.name = feed, name
         self._heard, self._last = 0, -np.inf
 
@@ -344,7 +344,7 @@ class _Heard(ABC):
 class _Unit(_Heard):
     """The IMU of a feed, if there is one, and what of it is known."""
 
-    def __init__(self, feed: Feed, name: str | None, config: LidarOdometryConfig) -> None:
+    def __init__(self, feed: RecordSource, name: str | None, config: LidarOdometryConfig) -> None:
         super().__init__(feed, name)
         self.config = config
         self.inertial: Inertial | None = None
@@ -403,7 +403,7 @@ class _Unit(_Heard):
 class _Wheels(_Heard):
     """The odometry of a feed, if there is one that is taken."""
 
-    def __init__(self, feed: Feed, name: str | None) -> None:
+    def __init__(self, feed: RecordSource, name: str | None) -> None:
         super().__init__(feed, name)
         self.reckoned = None if name is None else Reckoned(self._part(0, 0))
 
@@ -420,7 +420,7 @@ def odometry_of(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | Non
     believed; then they are to be followed anew, so that not even the first of them is bent.
     """
     streams: dict[str, Stream] = {"clouds": clouds} if imu is None else {"clouds": clouds, "imu": imu}
-    unit = _Unit(Feed(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
+    unit = _Unit(RecordSource(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
     for _ in unit.rehearse("clouds"):
         pass
     return unit.odometry()
@@ -543,7 +543,9 @@ def _submap(
         grid=grid,
         cloud=cloud,
         uses=frozenset(n for n, used in ((names[0], True), (names[2], bridged)) if n is not None and used),
-        aids=frozenset(n for n, of in ((names[1], aided), (names[2], watched and not bridged)) if n is not None and of),
+        assisting_streams=frozenset(
+            n for n, of in ((names[1], aided), (names[2], watched and not bridged)) if n is not None and of
+        ),
         report=report,
     )
 

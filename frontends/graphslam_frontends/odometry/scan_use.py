@@ -16,7 +16,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.make_steps import make_steps
@@ -99,7 +99,7 @@ def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path:
             continue
         P, there = reckoned_covariance(steps, a - 1, b), path[b - first]
         if group.dim == 3 and steps.tilt is not None:
-            there = level(there)
+            there = remove_roll_pitch(there)
         A = group.adjoint(group.between(path[-1], there))
         total += A @ P @ A.T
     return 0.5 * (total + total.T)

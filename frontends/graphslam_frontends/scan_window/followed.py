@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.records import Odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
@@ -57,7 +57,7 @@ class FollowedErrors:
         if start == end:
             d = len(joint) // 2
             joint = np.tile(joint[d:, d:], (2, 2))
-        frames = level(a) if level_start else a, level(b) if level_end else b
+        frames = remove_roll_pitch(a) if level_start else a, remove_roll_pitch(b) if level_end else b
         return group_of(a).between(*frames), relative_covariance(poses, frames, joint)
 
     def _of(self, start: int, end: int) -> Track | None:
@@ -78,7 +78,7 @@ def followed(steps: Steps, config: ScanWindowConfig) -> Steps:
     """
     made, g = track(steps, config), group_of(steps.odometry.increments)
     increments = np.concatenate([g.identity[None], g.between(made.poses[:-1], made.poses[1:])])
-    tilt = None if steps.tilt is None else se3.roll_pitch(made.poses)[0]
+    tilt = None if steps.tilt is None else se3.roll_pitch_jacobian(made.poses)[0]
     return replace(
         steps,
         odometry=Odometry(times=steps.times, increments=increments, covariances=steps.odometry.covariances),

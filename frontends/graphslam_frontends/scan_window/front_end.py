@@ -13,7 +13,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -196,7 +196,7 @@ def _base(body: Array, lift: float, gravity: bool) -> Array:
     """The frame of a submap that begins at a body."""
     if not gravity:
         return body
-    base = level(body)
+    base = remove_roll_pitch(body)
     base[2] -= lift
     return base
 

@@ -181,7 +181,7 @@ class Tracker:
     def _level(self) -> None:
         """Roll and pitch as gravity tells them, with their constant and their fading error."""
         assert self.steps.tilt is not None
-        seen, D = se3.roll_pitch(self.pose[None])
+        seen, D = se3.roll_pitch_jacobian(self.pose[None])
         H = np.zeros((2, self.x))
         H[:, :6] = D[0]
         H[:, -4:-2] = H[:, -2:] = np.eye(2)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.poses import frame_between, heading_of, upright
+from graphslam.core.poses import frame_between, heading_of, level_poses
 from graphslam_frontends.segslam.segmap import NEW, Entry, SegMap
 
 Ints = npt.NDArray[np.int64]
@@ -371,7 +371,7 @@ class _Upright:
         """``(m, 7)`` or ``(m, 3)``."""
         p = np.array(self.at)
         if self.dim == 3:
-            return upright(p[:, :3], p[:, 3])
+            return level_poses(p[:, :3], p[:, 3])
         return np.stack([p[:, 0], p[:, 1], wrap_angle(p[:, 3])], axis=1)
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE2, SE3, Group, normalised
+from graphslam.core.poses import SE2, SE3, Group, normalise_weights
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
@@ -186,7 +186,7 @@ class SegMap:
         """
         chosen = self._which(which, len(grids), "grids")
         self._which(which, len(paths), "paths")
-        w = normalised(weights, self.particles)
+        w = normalise_weights(weights, self.particles)
         last = len(self.times) - 1
         rows = [
             check_path(path, self.entries[p], p, (int(self.start[p]), step), last) for p, path in zip(chosen, paths)

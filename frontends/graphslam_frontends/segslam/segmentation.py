@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.poses import group_of, normalised
+from graphslam.core.poses import group_of, normalise_weights
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood
 from graphslam.evidence.queries import cast_grids
@@ -131,7 +131,7 @@ def predictive_score(
         The result is the same for any number.
     """
     n = len(grids)
-    w = normalised(weights, n)
+    w = normalise_weights(weights, n)
     if not len(window):
         nan = np.full(n, np.nan)
         return Score(shares=nan, log_likelihoods=nan, share=math.nan, log_likelihood=math.nan, beams=0)

@@ -19,7 +19,7 @@ from tqdm.auto import tqdm
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
@@ -275,7 +275,7 @@ class _Run:
             return Entry(T_entry=pose, kind=SAME, source=segment)
         if not self.segmap.gravity:
             return Entry(T_entry=self.group.identity, kind=NEW)
-        T = self.group.between(level(pose), pose)
+        T = self.group.between(remove_roll_pitch(pose), pose)
         T[2] += self.segmap.lift
         return Entry(T_entry=T, kind=NEW)
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import frame_between, group_of, level, normalised, pose_scatter
+from graphslam.core.poses import frame_between, group_of, normalise_weights, pose_scatter, remove_roll_pitch
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
@@ -162,7 +162,7 @@ def base_of(segmap: SegMap, body: Array) -> Array:
     """
     if not segmap.gravity:
         return np.array(body)
-    base = level(body)
+    base = remove_roll_pitch(body)
     base[..., 2] -= segmap.lift
     return base
 
@@ -172,14 +172,14 @@ def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array,
     g, t = segmap.group, segmap.table
     i = segmap.in_interval(interval)
     entry, exit = t.entry[i], t.exit[i]
-    base = level(entry) if segmap.gravity else entry
+    base = remove_roll_pitch(entry) if segmap.gravity else entry
     T = g.between(base, exit)
-    return (level(T) if segmap.gravity else T), _shares(t.weight[i])
+    return (remove_roll_pitch(T) if segmap.gravity else T), _shares(t.weight[i])
 
 
 def _shares(weights: Array) -> Array:
     """Weights that sum to one; equal where what is left of an interval weighs nothing."""
-    return normalised(weights if weights.sum() > 0 else None, len(weights))
+    return normalise_weights(weights if weights.sum() > 0 else None, len(weights))
 
 
 def _submap(

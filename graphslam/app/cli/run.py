@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.terminal import emit, table, verdict_text
-from graphslam.core.config import merge, parse_setting, read_toml
+from graphslam.core.config import merge_options, parse_setting, read_toml
 from graphslam.core.reading import set_size_limit
 
 
@@ -136,7 +136,7 @@ def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
     values: dict[str, Any] = read_toml(config) if config else {}
     values.pop("run", None)  # an effective config.toml of another run may be given as it is
     for text in settings:
-        values = merge(values, parse_setting(text))
+        values = merge_options(values, parse_setting(text))
     return values
 
 

@@ -32,7 +32,7 @@ from typing import Any, TypeVar
 
 from graphslam.app.folders.lock import LOCK, is_lock, locked
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.core.atomic import is_part, part_path, sweep_parts, sync
+from graphslam.core.atomic import is_part, part_path, sweep_parts, sync_to_disk
 from graphslam.core.errors import FormatError, GraphSlamError
 
 GENERATIONS, CURRENT = "generations", "current"
@@ -194,9 +194,9 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
             raise
         names = _names(staged, everything=True)
         for name in names:
-            sync(staged / name)
+            sync_to_disk(staged / name)
         for part in (*{(staged / n).parent for n in names}, staged, staged.parent):
-            sync(part)
+            sync_to_disk(part)
         (_commit if linked else _replace_plainly)(home, staged, names)
 
 
@@ -204,7 +204,7 @@ def _commit(home: Path, staged: Path, names: list[str]) -> None:
     for name in names:
         _point(home, name)
     _symlink(f"{GENERATIONS}/{staged.name}", home / CURRENT)  # the new state, from here on
-    sync(home)
+    sync_to_disk(home)
     sweep(home)
 
 
@@ -218,7 +218,7 @@ def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
     for name in gone:
         (home / name).unlink(missing_ok=True)
     shutil.rmtree(staged.parent, ignore_errors=True)
-    sync(home)
+    sync_to_disk(home)
 
 
 def sweep(folder: str | os.PathLike[str]) -> None:
@@ -307,8 +307,8 @@ def _into_generations(home: Path) -> None:
         for name in names:
             (home / target / name).parent.mkdir(parents=True, exist_ok=True)
             _link(home / name, home / target / name)
-            sync(home / target / name)
-        sync(home / target)
+            sync_to_disk(home / target / name)
+        sync_to_disk(home / target)
         _symlink(target, home / CURRENT)
     for name in _names(home / target, everything=True):  # all of them plain, or some after a kill just here
         path = home / name

@@ -12,7 +12,7 @@ from graphslam.app.report.markup import missing, note, picture, section
 from graphslam.app.run.files import read_map, read_merged_dense
 from graphslam.backend.sessions import SESSION
 from graphslam.core.errors import DataError, GraphSlamError
-from graphslam.core.markup import Markup, join
+from graphslam.core.markup import Markup, join_parts
 from graphslam.evaluate.consistency import Consistency, nees
 from graphslam.evaluate.path_consistency import map_errors
 from graphslam.io.submap_store import read_truth
@@ -159,4 +159,7 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
         None, {"this run": made}, submaps=truth.keys[here], title=f"n = {dof}, first base fixed, one run"
     )
     text = "NEES/n of the ends of the submaps against the truth, with the 95 % bounds of an honest run"
-    return [picture(png(ax), text), note(join(["Ends of one run share their errors: they lie in or out together."]))]
+    return [
+        picture(png(ax), text),
+        note(join_parts(["Ends of one run share their errors: they lie in or out together."])),
+    ]

@@ -8,7 +8,7 @@ from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import folded, missing, note, section
-from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, join, table
+from graphslam.core.markup import Markup, Row, html_element, html_table, is_numeric, join_parts, value_text
 
 ORDER = ("accepted", "switched-off", "undone", "rejected")
 COLUMNS = {
@@ -69,7 +69,7 @@ def _rank(row: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _ledger(rows: list[dict[str, Any]]) -> Markup:
-    return table([Row(r, str(r["verdict"]), {"loop": r["loop"]}) for r in rows], COLUMNS, class_="loops")
+    return html_table([Row(r, str(r["verdict"]), {"loop": r["loop"]}) for r in rows], COLUMNS, class_="loops")
 
 
 def _history(folder: ReportFolder) -> list[Markup]:
@@ -85,7 +85,7 @@ def _history(folder: ReportFolder) -> list[Markup]:
         return []
     columns = {k: COLUMNS[k] for k in ("loop", "verdict", "chi2", "weight", "effect", "why")}
     of = sum(n > 1 for n in times.values())
-    return [folded(f"{of} loops were decided on more than once: each decision in order", table(rows, columns))]
+    return [folded(f"{of} loops were decided on more than once: each decision in order", html_table(rows, columns))]
 
 
 def _ties(folder: ReportFolder) -> list[Markup]:
@@ -100,12 +100,12 @@ def _ties(folder: ReportFolder) -> list[Markup]:
                 said = "accepted" if c.get("accepted") else "rejected"
                 rows.append(Row({**c, "session": s.get("name"), "verdict": said}, said))
     if not rows:
-        return [element("h3", "Ties between sessions"), note("No places were compared: see the sessions above.")]
+        return [html_element("h3", "Ties between sessions"), note("No places were compared: see the sessions above.")]
     columns = {
         **{"session": "session", "verdict": "verdict", "submap_map": "submap in the map", "submap_here": "submap here"},
         **{"i": "node i", "j": "node j", "source": "source", "score": "score", "why": "why", "gates": "gates"},
     }
-    return [element("h3", "Ties between sessions"), table(rows, columns, class_="ties")]
+    return [html_element("h3", "Ties between sessions"), html_table(rows, columns, class_="ties")]
 
 
 def hypotheses(folder: ReportFolder) -> Markup:
@@ -122,10 +122,10 @@ def hypotheses(folder: ReportFolder) -> Markup:
         **{"entropy": "entropy [nat m³]", "known_volume": "known [m³]", "why": "why"},
     }
     shown = {k: v for k, v in columns.items() if any(k in c for c in candidates)}
-    why = note(join(["Why: ", str(found.get("why", "not said")), "."]))
-    parts = [table(candidates, shown), why]
+    why = note(join_parts(["Why: ", str(found.get("why", "not said")), "."]))
+    parts = [html_table(candidates, shown), why]
     entropy = found.get("refined_entropy")
-    if is_figure(entropy):
+    if is_numeric(entropy):
         text = "All are judged by the maps of their graphs; the chosen one was then refined by its scans: entropy "
-        parts.append(note(text, figure_text(entropy), "."))
+        parts.append(note(text, value_text(entropy), "."))
     return section("hypotheses", title, *parts)

@@ -7,7 +7,7 @@ from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import missing, note, picture, section
-from graphslam.core.markup import Markup, is_figure, pairs, table
+from graphslam.core.markup import Markup, html_table, is_numeric, pair_list
 
 MEANING = {
     "scale": ("scale of the wheels, distance too long by", "share"),
@@ -38,7 +38,7 @@ def refinement(folder: ReportFolder) -> Markup:
         return section("refinement", title, note("The path is that of the graph: the verdict says why, where it may."))
     m = folder.values()
     rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
-    parts: list[Any] = [table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
+    parts: list[Any] = [html_table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
     parts += [_constants(found), *_bias(found)]
     rounds = found.get("rounds") or []
     columns = {
@@ -46,11 +46,14 @@ def refinement(folder: ReportFolder) -> Markup:
         **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other passes"},
         **{"spread": "spread of the residuals [m]", "moved": "path moved by [m]"},
     }
-    parts.append(table(rounds, columns) if rounds else missing("rounds of the refinement."))
+    parts.append(html_table(rounds, columns) if rounds else missing("rounds of the refinement."))
     apart = found.get("left_apart") or []
     if apart:
         listed = {f"{k + 1}": f"{a:.1f} s and {b:.1f} s" for k, (a, b) in enumerate(apart[:20])}
-        parts += [note(f"Places that the graph drew together and the scans contradict ({len(apart)}):"), pairs(listed)]
+        parts += [
+            note(f"Places that the graph drew together and the scans contradict ({len(apart)}):"),
+            pair_list(listed),
+        ]
     parts.append(note("What the refined path spends, and what was only its start: see the part on evidence."))
     return section("refinement", title, *parts)
 
@@ -60,11 +63,11 @@ def _constants(found: Mapping[str, Any]) -> Markup:
     for name, entry in (found.get("constants") or {}).items():
         words, unit = MEANING.get(name, (name, ""))
         rows.append({"what": words, "value": entry["value"], "sigma": entry["sigma"], "unit": unit})
-    return table(rows, {"what": "lasting error", "value": "value", "sigma": "σ", "unit": "unit"})
+    return html_table(rows, {"what": "lasting error", "value": "value", "sigma": "σ", "unit": "unit"})
 
 
 def _bias(found: Mapping[str, Any]) -> list[Markup]:
-    knots = [k for k in found.get("yaw_bias") or [] if all(is_figure(v) for v in k)]
+    knots = [k for k in found.get("yaw_bias") or [] if all(is_numeric(v) for v in k)]
     if not knots:
         return []
     from graphslam.plots.refined import plot_yaw_bias

@@ -26,7 +26,7 @@ from graphslam.app.report.sections import (
 )
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
-from graphslam.core.markup import element, plain
+from graphslam.core.markup import html_element, plain_text
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Report:
 
     def _repr_html_(self) -> str:
         """The page inside a notebook, apart from the notebook's own style and scripts."""
-        return element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
+        return html_element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
 
 
 def make_report(folder: str | Path) -> Report:
@@ -86,9 +86,9 @@ def _page(home: Path, root: Path) -> Report:
     said, lines = verdict_lines(found)
     shown = scene(found)
     html = page(
-        title=plain(f"{_TITLES[found.kind]}: {found.name}"),
+        title=plain_text(f"{_TITLES[found.kind]}: {found.name}"),
         headline=said,
-        findings=[replace(f, text=plain(f.text)) for f in lines],
+        findings=[replace(f, text=plain_text(f.text)) for f in lines],
         scene=shown,
         parts={name: part(found) for name, part in _PARTS.items()},
     )

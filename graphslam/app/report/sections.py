@@ -15,7 +15,17 @@ from graphslam.app.run.summary import headline, summary
 from graphslam.app.run.verdict import CONFIDENCE, Figures, class_rows, verdict
 from graphslam.core.config import dump_toml
 from graphslam.core.findings import Finding
-from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
+from graphslam.core.markup import (
+    Markup,
+    Row,
+    html_element,
+    html_table,
+    is_numeric,
+    item_list,
+    join_parts,
+    pair_list,
+    value_text,
+)
 from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.ledger import EXCLUSIVE
@@ -40,22 +50,22 @@ def what_was_run(folder: ReportFolder) -> Markup:
             "T_world_first_base": "first base (x y θ, or x y z qx qy qz qw)",
         }
         shown = {k: v for k, v in columns.items() if any(k in s for s in folder.sessions)}
-        parts += [pairs(facts), table(folder.sessions, shown) if shown else missing("sessions in merge.json.")]
+        parts += [pair_list(facts), html_table(folder.sessions, shown) if shown else missing("sessions in merge.json.")]
         parts.append(note("Options and versions are those of the single runs: see their own reports."))
         return section("run", "What was run", *parts)
     said = said if isinstance(said, dict) else {}
     names = ("source", "frontend", "solver", "seed")
-    parts.append(pairs({k: r.get(k, said.get(k)) for k in names}))
+    parts.append(pair_list({k: r.get(k, said.get(k)) for k in names}))
     if folder.kind == "interrupted":
         parts.append(note(stopped(folder)))
     versions = folder.part("versions")
-    parts.append(pairs(versions) if versions else missing("versions; ", _why(folder, "run.json")))
+    parts.append(pair_list(versions) if versions else missing("versions; ", _why(folder, "run.json")))
     if folder.config:
-        parts.append(folded("Every option with its value (config.toml)", element("pre", _toml(folder.config))))
+        parts.append(folded("Every option with its value (config.toml)", html_element("pre", _toml(folder.config))))
     else:
         parts.append(missing("options; ", _why(folder, "config.toml")))
     if folder.part("source_meta"):
-        parts.append(folded("What the log says of itself", pairs(_flat(folder.part("source_meta")))))
+        parts.append(folded("What the log says of itself", pair_list(_flat(folder.part("source_meta")))))
     return section("run", "What was run", *parts)
 
 
@@ -69,15 +79,15 @@ def records(folder: ReportFolder) -> Markup:
         return section("records", title, missing("counts of records; ", said))
     read, dropped = folder.part("records_read"), folder.part("records_dropped")
     flagged = {k: v for k, v in folder.part("flagged_submaps").items() if k != "any"}
-    parts: list[Any] = [element("h3", "Read")]
+    parts: list[Any] = [html_element("h3", "Read")]
     rows = [{"stream": stream, "records": n, "used": _use(stream, folder.ledger)} for stream, n in read.items()]
-    parts.append(table(rows, ["stream", "records", "used"]) if rows else missing("counts of records read."))
-    parts.append(element("h3", "Dropped"))
+    parts.append(html_table(rows, ["stream", "records", "used"]) if rows else missing("counts of records read."))
+    parts.append(html_element("h3", "Dropped"))
     lines = [{"what": k, "records": v} for k, v in dropped.items()]
-    parts.append(table(lines, {"what": "stream and why", "records": "records"}) if lines else note("Nothing."))
-    parts.append(element("h3", "Submaps flagged by the front end"))
+    parts.append(html_table(lines, {"what": "stream and why", "records": "records"}) if lines else note("Nothing."))
+    parts.append(html_element("h3", "Submaps flagged by the front end"))
     marks = [{"why": k, "submaps": v} for k, v in flagged.items()]
-    parts.append(table(marks, ["why", "submaps"]) if marks else note("None."))
+    parts.append(html_table(marks, ["why", "submaps"]) if marks else note("None."))
     return section("records", title, *parts)
 
 
@@ -110,7 +120,7 @@ def metrics(folder: ReportFolder) -> Markup:
         "metrics",
         "Metrics",
         note("What each means: docs/how-to.md, docs/concepts.md, docs/without-truth.md. – : no value."),
-        table(out, columns),
+        html_table(out, columns),
     )
 
 
@@ -140,17 +150,17 @@ def times(folder: ReportFolder) -> Markup:
     timed = [r for r in folder.metrics if is_time(r.get("key"))]
     seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
     seconds = seconds or folder.part("seconds")
-    if not seconds and is_figure(folder.report.get("seconds")):  # of a merge by an older version
+    if not seconds and is_numeric(folder.report.get("seconds")):  # of a merge by an older version
         seconds = {"merge": folder.report["seconds"]}
     rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else "the folder does not say."
         return section("times", "Times", missing("seconds of the stages; ", said))
-    parts: list[Any] = [table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
+    parts: list[Any] = [html_table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
     if rows:
-        parts.append(table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
+        parts.append(html_table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
     resumed = folder.values().get(RESUMED, folder.report.get(RESUMED))
-    if is_figure(resumed) and resumed:
+    if is_numeric(resumed) and resumed:
         parts.append(note(f"{resumed:.0f} submaps were there already: the run was resumed."))
     return section("times", "Times", *parts)
 
@@ -169,7 +179,7 @@ def graph(folder: ReportFolder) -> Markup:
         "objective Σ rᵀ P⁻¹ r": m.get("objective", m.get("join_chi2")),
         "gap to the batch optimum": m.get("gap"),
     }
-    parts: list[Any] = [pairs(facts)]
+    parts: list[Any] = [pair_list(facts)]
     if not g:
         parts.append(missing("numbers of nodes and factors; the folder does not say them."))
     rows = class_rows(figures_of(folder))
@@ -180,7 +190,7 @@ def graph(folder: ReportFolder) -> Markup:
         **{"chi2_per_dof": "χ²/dof", "low": f"{CONFIDENCE * 100:g} % from", "high": "to", "verdict": "verdict"},
         **{"mean_weight": "mean weight", "least_weight": "least weight"},
     }
-    parts.append(table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
+    parts.append(html_table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
     parts.append(
         note(
             "dof: scalars less what of the unknowns a kind determined; χ² without robust kernels; weights are those "
@@ -213,8 +223,8 @@ def evidence(folder: ReportFolder) -> Markup:
     return section(
         "evidence",
         title,
-        table(groups, columns),
-        element("h3", "Declared exceptions"),
+        html_table(groups, columns),
+        html_element("h3", "Declared exceptions"),
         _exceptions(t),
         note("Kind “measurement”: spent once, a second spending is refused. Row by row in ledger.csv."),
     )
@@ -225,7 +235,7 @@ def _exceptions(t: pd.DataFrame) -> Markup:
     rows = []
     for (kind, said), of in shared.groupby(["kind", "note"], sort=True):
         rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": said})
-    return table(rows, {"kind": "kind", "factors": "factors", "note": "why it may"}) if rows else note("None.")
+    return html_table(rows, {"kind": "kind", "factors": "factors", "note": "why it may"}) if rows else note("None.")
 
 
 def _kind_of_factor(label: str) -> str:
@@ -248,9 +258,9 @@ def events(folder: ReportFolder) -> Markup:
     counts = Counter(str(e.get("event", "?")) for e in folder.events)
     rows = [{"event": k, "times": n} for k, n in sorted(counts.items())]
     lines = [_line(e) for e in folder.events if str(e.get("event")) not in ROUTINE]
-    parts: list[Any] = [table(rows, ["event", "times"]) if rows else note("None.")]
+    parts: list[Any] = [html_table(rows, ["event", "times"]) if rows else note("None.")]
     if lines:
-        listed = items(lines)
+        listed = item_list(lines)
         parts.append(listed if len(lines) <= 20 else folded(f"All {len(lines)} that are no routine", listed))
     else:
         parts.append(note("No event but routine ones."))
@@ -258,14 +268,14 @@ def events(folder: ReportFolder) -> Markup:
 
 
 def _line(event: Mapping[str, Any]) -> Markup:
-    facts = [f"{k} {figure_text(v)}" for k, v in event.items() if k != "event"]
-    return join([element("b", event.get("event", "?")), ": ", ", ".join(facts)])
+    facts = [f"{k} {value_text(v)}" for k, v in event.items() if k != "event"]
+    return join_parts([html_element("b", event.get("event", "?")), ": ", ", ".join(facts)])
 
 
 def problems(folder: ReportFolder) -> Markup:
     """What is not in the page, and why."""
-    lines = [join([element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
-    body = items(lines) if lines else note("Nothing that this kind of folder holds.")
+    lines = [join_parts([html_element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
+    body = item_list(lines) if lines else note("Nothing that this kind of folder holds.")
     return section("missing", "What is missing", body)
 
 

@@ -18,7 +18,7 @@ from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibr
 from graphslam.calibrate.estimate import NAMES, SURE, Calibration, in_words
 from graphslam.calibrate.sighted import FULL, QUICK, Effort, calibrate_sightings
 from graphslam.calibrate.windows import Seen
-from graphslam.core.config import merge
+from graphslam.core.config import merge_options
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
@@ -115,7 +115,7 @@ def calibrate_log(
     """
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
-    options = merge(recommended(log, name, preset), config or {})
+    options = merge_options(recommended(log, name, preset), config or {})
     front = make_front_end(name, options.get("frontend", {}))
     with one_blas_thread():
         return calibration(log, front, QUICK if quick else FULL, seed=seed)

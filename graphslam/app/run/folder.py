@@ -22,7 +22,7 @@ from graphslam.app.folders.lock import locked, make_folder
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
-from graphslam.core.reading import inside
+from graphslam.core.reading import resolve_inside
 from graphslam.io.submap_store import GridLoader, SubmapStore
 
 logger = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ class RunFolder:
 
     def settled(self) -> Settled | None:
         """Which draw the submaps are, where several were made and one was chosen."""
-        file = inside(self.path, DRAWS, str(self.path))
+        file = resolve_inside(self.path, DRAWS, str(self.path))
         if not file.exists():
             return None
         said = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})

@@ -9,7 +9,7 @@ from typing import Any
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.io.readers import readers
@@ -70,7 +70,7 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
             raise ConfigError(f"front end {name!r} is given as an object, which has its options; got also {options}")
         return front
     kind, config_type = _kind(front)
-    made = kind(config=build(config_type, options, "frontend"))
+    made = kind(config=build_config(config_type, options, "frontend"))
     if not isinstance(made, FrontEnd):
         raise ConfigError(
             f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam_frontends.base.FrontEnd"
@@ -100,7 +100,7 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
     if simulated and registered and "motion" in typing.get_type_hints(_kind(frontend)[1]):
         scale = float(noise.get("scale", 1.0))
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
-        values = merge({"frontend": {"motion": motion}}, values)
+        values = merge_options({"frontend": {"motion": motion}}, values)
     return values
 
 

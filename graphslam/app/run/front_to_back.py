@@ -12,10 +12,10 @@ from tqdm import tqdm
 
 from graphslam.app.run.folder import RunFolder
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.shelved import load_shelved, shelved
@@ -77,7 +77,7 @@ class FrontToBack:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: RecordSource,
         front: FrontEnd,
         back: BackEnd,
         seed: SeedTree,
@@ -127,7 +127,7 @@ class FrontToBack:
 
     def drawn_anew(self, back: BackEnd) -> FrontToBack:
         """The same log with the next draw of random numbers, for another back end."""
-        feed = Feed(self.feed.log)
+        feed = RecordSource(self.feed.log)
         return FrontToBack(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
 
     @property

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.maps.coarse import drawable
 from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
@@ -51,7 +51,7 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
     def save(ax: Any, file: Path) -> Path:
         out = saved(ax, file)
         gc.collect()  # what a picture holds refers to itself, and is as large as the picture
-        give_back()
+        trim_heap()
         return out
 
     grid = drawable(run_map.fused.grid)

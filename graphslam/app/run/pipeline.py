@@ -43,15 +43,15 @@ from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.refining import refine_run, refined_ledger
 from graphslam.backend.streams import FixPart, ImuPart, beacons_of, compasses_of, split, used_fixes
-from graphslam.core.config import as_dict, build, dump_toml, merge
+from graphslam.core.config import build_config, dump_toml, merge_options, options_dict
 from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import verdict_json
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.core.json_file import check_json
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import level
+from graphslam.core.poses import remove_roll_pitch
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.landmark_checks import sighting_findings
@@ -217,8 +217,8 @@ def _run(
 ) -> Run:
     begin = time.perf_counter() - loading
     seconds = {"load": loading}
-    options = merge(suggested if own and own_noise(config) else without_noise(suggested), config)
-    settings: cfg.RunConfig = build(cfg.RunConfig, options)
+    options = merge_options(suggested if own and own_noise(config) else without_noise(suggested), config)
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
@@ -228,11 +228,11 @@ def _run(
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(Noticed("", f) for f in said)]
     effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
-    back = back_end(Feed(log), settings, solver, [ProgressBar(log, progress), *observers])
+    back = back_end(RecordSource(log), settings, solver, [ProgressBar(log, progress), *observers])
 
     def finish(folder: RunFolder | None, undone: Sequence[int | Decision]) -> Run:
         tree = SeedTree(seed)
-        work = FrontToBack(Feed(log), front, back, tree, folder, with_grids(settings))
+        work = FrontToBack(RecordSource(log), front, back, tree, folder, with_grids(settings))
         work.step()
         return finished(log, work, settings, effective, seconds, begin, undone, noticed, progress=progress)
 
@@ -289,7 +289,7 @@ def finished(
     while best.denied and front.draws and work.settled is None and not undo and work.draw + 1 < settings.backend.draws:
         logger.warning("passes of the map still deny each other: submaps are made anew of other random numbers")
         bars = [ProgressBar(log, progress)]
-        work = work.drawn_anew(back_end(Feed(log), settings, effective["run"]["solver"], bars))
+        work = work.drawn_anew(back_end(RecordSource(log), settings, effective["run"]["solver"], bars))
         work.step()
         at_rest(work)
         best = solve()
@@ -301,7 +301,7 @@ def finished(
 def at_rest(work: FrontToBack) -> None:
     """Let go of what making the submaps took."""
     work.front.forget()
-    give_back()
+    trim_heap()
 
 
 def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
@@ -349,12 +349,12 @@ def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any]
     effective = read_options(root)
     wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
-    settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-    back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+    back = back_end(RecordSource(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
     return effective, settings, back, read_submaps(root, load_grid=load_shelved if with_grids(settings) else None)
 
 
-def back_end(feed: Feed, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
+def back_end(feed: RecordSource, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
     """A back end that has its IMUs, and the fixes that are to be used."""
     fixes = FixPart(feed, settings.gps)
     back = BackEnd(settings.backend, solver, imu=ImuPart(feed, settings.imu), observers=observers, fixes=fixes)
@@ -479,7 +479,7 @@ def _solved(
         return
     looking = replace(settings, backend=replace(settings.backend, loops=True))
     logger.warning("passes of the map deny each other: looking for loops between submaps")
-    other = back_end(Feed(taken.log), looking, effective["run"]["solver"], ())
+    other = back_end(RecordSource(taken.log), looking, effective["run"]["solver"], ())
     for s in submaps:
         other.add(s)
     attempts.add(made(other))
@@ -498,15 +498,15 @@ def effective_config(
     run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
     return {
         "run": run_part,
-        "frontend": as_dict(front_config),
-        "backend": as_dict(settings.backend),
-        "gps": as_dict(settings.gps),
-        "imu": as_dict(settings.imu),
-        "compass": as_dict(settings.compass),
-        "beacons": as_dict(settings.beacons),
-        "refine": as_dict(settings.refine),
-        "map": as_dict(settings.map),
-        "calibrate": as_dict(settings.calibrate),
+        "frontend": options_dict(front_config),
+        "backend": options_dict(settings.backend),
+        "gps": options_dict(settings.gps),
+        "imu": options_dict(settings.imu),
+        "compass": options_dict(settings.compass),
+        "beacons": options_dict(settings.beacons),
+        "refine": options_dict(settings.refine),
+        "map": options_dict(settings.map),
+        "calibrate": options_dict(settings.calibrate),
     }
 
 
@@ -533,7 +533,7 @@ def _judge(
     fixes = None if gps is None or solution.T_gps_world is None else (split(gps, settings.gps)[0], settings.gps)
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
     seconds_refine = time.perf_counter() - clock
-    give_back()
+    trim_heap()
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     ledger = back.graph.ledger
     if refined is not None:
@@ -578,7 +578,7 @@ def _judge(
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:
             truth, true_path = upright_truth(truth, true_path, np.array(base))
-            base = level(np.array(base)).tolist() if back.graph.dim == 3 else base
+            base = remove_roll_pitch(np.array(base)).tolist() if back.graph.dim == 3 else base
             refined_truth_metrics(out, global_map, refined.refinement, submaps, truth, path=true_path)
             if true_path is not None and len(true_path) >= 3:
                 out.add("path_rmse_aligned_graph", ate(graph_path, true_path).statistics.rmse, "m")
@@ -632,7 +632,7 @@ def _judge(
         report["map_coarser"] = fused.said()
     if fused is not None and len(fused.passes.pairs):
         report["map_passes"] = fused.passes.facts()
-    used = frozenset().union(*(s.uses | s.aids for s in submaps))
+    used = frozenset().union(*(s.uses | s.assisting_streams for s in submaps))
     streams = stream_use(log, back.graph, settings, {**log.dropped, **drops.counts}, used)
     report["streams"] = [s.as_row() for s in streams]
     metrics = out.table()

@@ -15,7 +15,7 @@ from graphslam.app.run.outputs import open_run, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_file, terrain_of_run, write_terrain
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.evidence.shelved import load_shelved
@@ -195,7 +195,7 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
         )
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
-    config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")
+    config: MapConfig = build_config(MapConfig, merge_options(values.get("map", {}), heights), "map")
     frames = map_of_frames(run.map) if refined else run.map
     made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
     if refined and {"map_entropy_open_chain", "map_known_volume_open_chain"} <= set(run.metrics["key"]):

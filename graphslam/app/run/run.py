@@ -15,7 +15,7 @@ from graphslam.core.findings import Finding, findings_of_json, headline_of_json
 from graphslam.core.geometry import se2_transform
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.markup import element, frame, join
+from graphslam.core.markup import html_element, html_frame, join_parts
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -240,7 +240,9 @@ class Run:
     def _repr_html_(self) -> str:
         where = f" in {self.folder.name}" if self.folder else ""
         said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
-        return join([element("b", f"Run of {self.name}"), said, frame(self.metrics[["key", "value", "unit"]])])
+        return join_parts(
+            [html_element("b", f"Run of {self.name}"), said, html_frame(self.metrics[["key", "value", "unit"]])]
+        )
 
 
 def metric_value(metrics: pd.DataFrame, key: str) -> float:

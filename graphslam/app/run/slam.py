@@ -21,7 +21,7 @@ from graphslam.app.run.outputs import write_outputs
 from graphslam.app.run.pipeline import back_end, effective_config, finished, run, with_digest, with_grids
 from graphslam.app.run.run import Run
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -103,8 +103,8 @@ class Slam:
         observers: Sequence[Observer] = (),
         records: str | Path | None = None,
     ) -> None:
-        options = merge(named_preset(frontend, preset), config or {})
-        settings: cfg.RunConfig = build(cfg.RunConfig, options)
+        options = merge_options(named_preset(frontend, preset), config or {})
+        settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
         front = make_front_end(frontend, settings.frontend)
         self.waits_for = _waits_for(front, settings)
         """What has to wait for the end of the log; empty where submaps are made while records come."""

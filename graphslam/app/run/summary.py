@@ -16,7 +16,7 @@ from graphslam.app.run.verdict import (
     of_the_start,
 )
 from graphslam.core.errors import DataError
-from graphslam.core.findings import LEVELS, Finding, Level, worst
+from graphslam.core.findings import LEVELS, Finding, Level, worst_level
 from graphslam.loops.ledger import ledger_of_events
 
 TRUST: dict[Level, str] = {
@@ -182,7 +182,7 @@ def headline(
         On the covariances, by what the log itself holds (:func:`graphslam.evaluate.trust.trust`).
     """
     found = list(findings)
-    level = worst(found) or "good"
+    level = worst_level(found) or "good"
     points = sum(f.level == level for f in found) if level in MARKED else 0
     marked = f" ({points} {'point' if points == 1 else 'points'} marked “{level}”)" if points else ""
     held = [consistency(j, found) for j in judged]
@@ -205,7 +205,7 @@ def consistency(j: Judged, findings: Sequence[Finding]) -> str:
 
 def _advice(findings: Sequence[Finding], over: set[str], known: bool, word: str) -> str:
     """The one thing most worth doing."""
-    level = worst(findings)
+    level = worst_level(findings)
     if level not in MARKED:
         return NOTHING if known else NOTHING_KNOWN
     _, first = min(((_rank(f.code, over), f) for f in findings if f.level == level), key=lambda r: r[0])

@@ -12,7 +12,7 @@ from graphslam.app.run.config import RunConfig
 from graphslam.backend.streams import split
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import frame
+from graphslam.core.markup import html_frame
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -108,7 +108,7 @@ class WithoutTruth:
         return out
 
     def _repr_html_(self) -> str:
-        return frame(self.table())
+        return html_frame(self.table())
 
 
 def check_without_truth(

@@ -14,7 +14,7 @@ from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.sessions import DenseSession, InnerTie, ties_of_graph, ties_of_network
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.submap import Submap
@@ -60,7 +60,7 @@ def _options(run: Run, part: str, kind: Any) -> Any:
         values = read_options(file.parent).get(part)
     if values is None:
         raise DataError(f"a run does not say its {part} options", where=run.name, wanted="a finished run")
-    return build(kind, {k: v for k, v in values.items() if v is not None}, part)
+    return build_config(kind, {k: v for k, v in values.items() if v is not None}, part)
 
 
 def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.inf) -> DenseSession:

@@ -21,7 +21,7 @@ from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.streams import split
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
@@ -145,7 +145,7 @@ class Judge:
         assert log.truth is not None
         self.meta: Mapping[str, Any] = log.meta
         self.truth = log.truth.trajectory
-        base = level(self.truth.interpolate(np.array([begin]))[0])
+        base = remove_roll_pitch(self.truth.interpolate(np.array([begin]))[0])
         base[2] -= lift
         self.base = base
         self.T_world_base = SE3.compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)

@@ -17,7 +17,7 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.studies.scoring import Judge, Watch, clock, timed, watch_snapshots
 from graphslam.app.worlds import simulate
-from graphslam.core.config import merge
+from graphslam.core.config import merge_options
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter
@@ -115,7 +115,9 @@ class _Trial:
     def _options(self, front_end: str, options: dict[str, Any]) -> dict[str, Any]:
         """The preset's options with those of the study on top: noise as the log states it, equal cuts."""
         own = {"association": "known", "stopping": {"scans": self.config.scans}}
-        merged: dict[str, Any] = merge(recommended(self.log, front_end), {"frontend": merge(own, options)})
+        merged: dict[str, Any] = merge_options(
+            recommended(self.log, front_end), {"frontend": merge_options(own, options)}
+        )
         return dict(merged["frontend"])
 
     def _submaps(self, front_end: str, options: dict[str, Any]) -> list[Submap]:

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, rotation2
-from graphslam.core.poses import upright
+from graphslam.core.poses import level_poses
 from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, se3_transform, skew, so3_exp
 from graphslam.graph.factors.attitude import constant_or_read, skew_of, turn_of, up_turn
 from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
@@ -248,7 +248,7 @@ def antenna_terms(
 
 def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
     """``T_gps_world`` ``(7,)`` of a datum ``[x, y, z, heading]`` and of the tilt of the first base."""
-    pose = upright(datum[:3], datum[3])
+    pose = level_poses(datum[:3], datum[3])
     if tilt is not None:
         pose[3:] = quat_normalize(quat_multiply(pose[3:], so3_exp(-np.append(tilt, 0.0))))
     return pose

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.charts import arc_terms
+from graphslam.core.charts import inverse_left_jacobian_terms
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_factor
 from graphslam.graph.variables import Layout, Values, gtsam_key
@@ -50,7 +50,7 @@ class SubmapRecord:
     chart : str
         In which the residual is taken (:mod:`graphslam.core.charts`).
     robot : int
-        Row of its constant errors (:mod:`graphslam.core.lasting`); -1: it has none.
+        Row of its constant errors (:mod:`graphslam.core.sensor_biases`); -1: it has none.
     """
 
     factor_id: int
@@ -293,7 +293,7 @@ def _terms(
         r[2] = math.pi - (math.pi - r[2]) % _TWO_PI
         Vi, bent = None, None
         if group:
-            a, b, slope = (float(v) for v in arc_terms(r[2]))
+            a, b, slope = (float(v) for v in inverse_left_jacobian_terms(r[2]))
             e = np.concatenate([r[:2], r[3:]]).reshape(-1, 2)
             Vi = np.array([[a, b], [-b, a]])
             bent = _rows(e @ np.array([[slope, -0.5], [0.5, slope]]))

@@ -1,4 +1,4 @@
-"""What is known of the constant errors of a robot's wheels and sensor (:mod:`graphslam.core.lasting`).
+"""What is known of the constant errors of a robot's wheels and sensor (:mod:`graphslam.core.sensor_biases`).
 
 Rows ``R g - d`` of unit variance over ``g = [wheels, sensor, mount]``: what is known of them beforehand, and what each
 submap's own motion and sightings say, exit and landmarks left free. How they move a submap stands in the submap's own
@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.lasting import CONSTANTS
+from graphslam.core.sensor_biases import CONSTANTS
 from graphslam.graph.factors.batch import Index, UniformBatch
 from graphslam.graph.factors.landmark_submap import CONSTANT
 from graphslam.graph.variables import Values
@@ -23,7 +23,7 @@ SIZE = len(CONSTANTS)
 
 
 def errors_at(values: Values, robot: int) -> Array:
-    """Constant errors ``(6,)`` of a robot, in the order of :data:`~graphslam.core.lasting.CONSTANTS`."""
+    """Constant errors ``(6,)`` of a robot, in the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`."""
     return np.concatenate([values[w][robot] for w in CONSTANT])
 
 

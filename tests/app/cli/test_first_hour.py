@@ -140,10 +140,10 @@ def test_a_front_end_is_given_by_name_as_a_class_or_as_an_object(log: SensorLog,
 
 def run_config(run: Run) -> RbpfEkfConfig:
     from graphslam.app.run.files import read_options
-    from graphslam.core.config import build
+    from graphslam.core.config import build_config
 
     assert run.folder is not None
-    made: RbpfEkfConfig = build(RbpfEkfConfig, read_options(run.folder)["frontend"])
+    made: RbpfEkfConfig = build_config(RbpfEkfConfig, read_options(run.folder)["frontend"])
     return made
 
 

@@ -21,10 +21,10 @@ from graphslam.app.run.pipeline import again
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import solve_choice
 from graphslam.backend.streams import ImuPart
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
-from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_store import load_log, save_log
 from tests.app.run.test_imu_run import made, solved
@@ -82,8 +82,8 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.undo()
     assert run.graph.imu.used
     remade(tmp_path / "run")
-    settings = build(cfg.RunConfig, {"imu": {"use": "auto"}})
-    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(Feed(short), settings.imu))
+    settings = build_config(cfg.RunConfig, {"imu": {"use": "auto"}})
+    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(RecordSource(short), settings.imu))
     back.finish()
     assert back.graph.objective().total == pytest.approx(run.metric("objective"), rel=1e-6)
 

@@ -20,7 +20,7 @@ from graphslam.app.run.files import loops_of_run
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.run import Run
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.submap import Submap
@@ -45,7 +45,7 @@ def go(log: SensorLog) -> Any:
     """Runs the log with the front end of clouds through the public verb."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "recommended", lambda *_: {})
-        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build(CloudConfig, o, "frontend")))
+        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build_config(CloudConfig, o, "frontend")))
 
         def run(out: Path | None = None, *, every: int = 2, loops: bool = True, **how: Any) -> Run:
             front = {k: how.pop(k) for k in ("origins", "grid") if k in how}

@@ -13,7 +13,7 @@ import pytest
 from graphslam.app.run import pipeline
 from graphslam.app.run.config import RunConfig
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog, Truth
@@ -173,7 +173,7 @@ def test_in_the_plane_it_is_left_out(monkeypatch):
 def test_its_options_are_checked():
     for bad in ({"longest": 0.0}, {"axes": "shrug"}, {"robust": "tukey"}, {"acceleration": -1.0}, {"wings": 2}):
         with pytest.raises(ConfigError, match="imu"):
-            build(RunConfig, {"imu": bad})
+            build_config(RunConfig, {"imu": bad})
 
 
 def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):

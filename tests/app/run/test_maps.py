@@ -20,9 +20,9 @@ from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import choices_of_matches, solve_choice
-from graphslam.core.config import build, read_toml
+from graphslam.core.config import build_config, read_toml
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
 from graphslam.io.log_store import save_log
@@ -72,8 +72,8 @@ def test_pieces_stand_at_the_nodes_of_the_graph(finished: Run) -> None:
     for s in finished.graph.submaps:
         for k, node in enumerate(s.nodes[:-1]):
             if (s.key, k) in divided.pieces:
-                np.testing.assert_allclose(wanted[s.key, k], level(poses[node]), atol=1e-9)
-                np.testing.assert_allclose(divided.local[s.key, k], level(s.T_base_node[k]), atol=1e-9)
+                np.testing.assert_allclose(wanted[s.key, k], remove_roll_pitch(poses[node]), atol=1e-9)
+                np.testing.assert_allclose(divided.local[s.key, k], remove_roll_pitch(s.T_base_node[k]), atol=1e-9)
                 seen += 1
     assert seen == len(divided.pieces)
 
@@ -83,7 +83,7 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     bare = [replace(s, matches=()) for s in finished.submaps]
     assert finished.folder is not None
     values = read_toml(finished.folder / "config.toml")
-    config = build(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
+    config = build_config(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
     from graphslam.maps.global_map import make_map
 
     m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
@@ -221,7 +221,7 @@ def test_what_does_not_belong_together_is_refused(finished: Run) -> None:
     with pytest.raises(MissingDataError, match=re.escape(f"{len(finished.submaps)} of {len(finished.submaps)}")):
         make_run_map([replace(s, grid=None) for s in finished.submaps], finished.map)
     with pytest.raises(ConfigError, match="low < high"):
-        build(cfg.RunConfig, {"map": {"low": 2.0}})
+        build_config(cfg.RunConfig, {"map": {"low": 2.0}})
 
 
 def test_floor_plans_of_storeys_and_reach() -> None:

@@ -28,7 +28,7 @@ from graphslam.app.run.summary import (
     summary,
 )
 from graphslam.app.run.verdict import Figures, observed, stated
-from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst
+from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst_level
 from graphslam.evaluate.trust import by_size, rows_as_json
 from tests.reference.page import Page
 
@@ -128,7 +128,7 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
         for more in extra:
             lines = [*stated(figs), *more]
             first = summary(figs, lines)
-            level = worst(lines) or "good"
+            level = worst_level(lines) or "good"
             assert first.level == level
             assert first.text.startswith(TRUST[level])
             assert not [t for other, t in TRUST.items() if other != level and t in first.text]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.poses import SE2, SE3, Group, level
+from graphslam.core.poses import SE2, SE3, Group, remove_roll_pitch
 from graphslam_frontends.grid.filter_drift import FilterDrift, Passed, between_knots
 
 MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
@@ -72,7 +72,7 @@ def test_how_many_particles_and_how_far() -> None:
 def test_frames_at_the_end_are_level_where_submaps_are() -> None:
     """On a ramp the error of the heading turns about the vertical, not about the body's own axis."""
     path = _bend(SE3, pitch=-0.3)
-    flat = np.array(level(path))
+    flat = np.array(remove_roll_pitch(path))
     leaning = MODEL.covariance(path, 20)
     np.testing.assert_allclose(leaning, MODEL.covariance(np.vstack([path[:-1], flat[-1:]]), 20), atol=1e-12)
     assert np.abs(MODEL.covariance(path, 20, gravity=False) - leaning).max() > 1e-4

@@ -12,7 +12,7 @@ from graphslam.app.run.front_ends import make_front_end
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.evidence.grid import EvidenceGrid
@@ -84,7 +84,7 @@ def test_the_map_is_of_the_place(run: tuple[Steps, RbpfResult]) -> None:
     steps, result = run
     group = group_of(result.final_pose)
     assert steps.truth is not None
-    start = level(steps.truth.poses[0])
+    start = remove_roll_pitch(steps.truth.poses[0])
     points = np.concatenate([group.transform(group.between(start, T), steps.scan(k)[0][steps.scan(k)[2]])
                              for k, T in enumerate(steps.truth.poses)])  # fmt: skip
     cloud = result.particles.grids[result.best].occupied_cloud()

@@ -11,7 +11,7 @@ import graphslam as gs
 from graphslam.core.charts import map_difference
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log, wrap_angle
-from graphslam.core.lasting import LastingErrors
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam_frontends.landmarks.config import LastingConfig
 from graphslam_frontends.landmarks.lasting import lasting_errors
 from graphslam_frontends.landmarks.summarise import Smoothed, smooth
@@ -173,14 +173,14 @@ def test_lasting_errors_refuse_what_does_not_fit():
         "response": np.zeros((5, 6)), "score": np.zeros(6), "information": np.eye(6), "path": np.zeros((3, 3, 6)),
         "points": np.zeros((0, 6)),
     }  # fmt: skip
-    LastingErrors(**good)
+    SensorBiases(**good)
     for name, bad in {
         "sigmas": np.zeros(6),
         "information": np.triu(np.ones((6, 6))),
         "score": np.full(6, np.nan),
     }.items():
         with pytest.raises(GraphSlamError):
-            LastingErrors(**{**good, name: bad})
+            SensorBiases(**{**good, name: bad})
 
 
 def test_a_pose_that_errs_moves_like_its_response():

@@ -237,7 +237,7 @@ def test_a_wrong_unit_is_a_line_of_the_report(logs):
     submaps = list(LidarFrontEnd().submaps(spoilt, seed=SeedTree(0)))
     said = [f["code"] for s in submaps for f in s.report.get("findings", ())]
     assert said.count("imu-left-aside") == len(submaps)
-    assert all(s.aids == frozenset() for s in submaps)
+    assert all(s.assisting_streams == frozenset() for s in submaps)
 
 
 def test_covariances_say_nothing_of_what_the_unit_tells(paths, plain):
@@ -258,17 +258,17 @@ def test_submaps_stand_upright_and_name_what_helped(logs, submaps):
     assert len(submaps) > 1
     for a in submaps:
         assert a.uses == {"clouds"}
-        assert a.aids == {"imu"}
+        assert a.assisting_streams == {"imu"}
         assert a.report["scans_aided"] > 0.9 * a.report["scans"]
         arrays = {name: np.asarray(value) for name, value in submap_arrays(a).items()}
-        assert submap_from_arrays(arrays, where="x").aids == {"imu"}
+        assert submap_from_arrays(arrays, where="x").assisting_streams == {"imu"}
     first = submaps[0]
     truth = log.truth.trajectory.interpolate(np.array([first.interval[0]]))[0]
     T_world_base = se3.se3_compose(truth, se3.se3_inverse(first.trajectory.poses[0]))
     assert np.arccos(se3.quat_rotate(T_world_base[3:], np.array([0.0, 0, 1]))[2]) < 0.015
-    assert abs(se3.roll_pitch(truth[None])[0]).max() > 0.03  # which the body does not
+    assert abs(se3.roll_pitch_jacobian(truth[None])[0]).max() > 0.03  # which the body does not
     plain = list(LidarFrontEnd(LidarFrontEndConfig(imu="none")).submaps(log, seed=SeedTree(0)))
-    assert plain[0].aids == frozenset()
+    assert plain[0].assisting_streams == frozenset()
     np.testing.assert_array_equal(plain[0].trajectory.poses[0], [0, 0, 0, 0, 0, 0, 1])
 
 
@@ -287,7 +287,7 @@ def test_gravity_along_the_path_is_as_sure_as_it_says(paths):
     for log, poses, odometry in paths:
         times = log["clouds"].times
         tilt = tilt_of(odometry.inertial, times, poses)
-        true, _ = se3.roll_pitch(log.truth.trajectory.interpolate(times))
+        true, _ = se3.roll_pitch_jacobian(log.truth.trajectory.interpolate(times))
         off = tilt.at(times, poses) - true
         z.append(np.mean((off / tilt.sigma) ** 2))
         assert np.abs(off).max() < 0.03

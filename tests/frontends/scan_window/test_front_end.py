@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.core.submap import Submap
@@ -183,7 +183,7 @@ def test_followed_steps_know_their_errors_over_any_interval() -> None:
     steps = ring(5, 3, length=16.0, step=0.3, beams=150, yaw_bias=0.0006)
     there = followed(steps, WINDOW)
     made, g = track(steps, WINDOW, [20]), group_of(steps.odometry.increments)
-    path = chained(there.odometry.increments[1:])
+    path = compose_increments(there.odometry.increments[1:])
     assert g.between(path[20], path[45]) == pytest.approx(g.between(made.poses[20], made.poses[45]), abs=1e-9)
     assert isinstance(there.errors, FollowedErrors)
     T, C = there.errors.between(20, 45)
@@ -238,4 +238,4 @@ def test_it_is_registered_and_its_presets_are_options_of_it() -> None:
     presets = sorted((root / "graphslam" / "app" / "presets").glob("*.scan-window.toml"))
     assert {p.name.partition(".")[0] for p in presets} >= {"garage", "mine", "building", "court"}
     for file in presets:
-        build(ScanWindowFrontEndConfig, tomllib.loads(file.read_text())["frontend"], "frontend")
+        build_config(ScanWindowFrontEndConfig, tomllib.loads(file.read_text())["frontend"], "frontend")

@@ -11,7 +11,7 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_between
-from graphslam.core.poses import SE2, SE3, chained, group_of
+from graphslam.core.poses import SE2, SE3, compose_increments, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import matrix_to_quat
 from graphslam.core.trajectory import Trajectory
@@ -190,7 +190,7 @@ def test_exits_are_as_far_off_as_they_say(dim: int, gravity: bool) -> None:
             values.append(float(e @ np.linalg.solve(C, e)))
         assert steps.truth is not None
         g, truth = group_of(made.poses), steps.truth.poses
-        reckoned = chained(steps.odometry.increments)[-1]
+        reckoned = compose_increments(steps.odometry.increments)[-1]
         wrong = [np.linalg.norm(g.between(p, g.between(truth[0], truth[-1]))[:dim])
                  for p in (g.between(made.poses[0], made.poses[-1]), reckoned)]  # fmt: skip
         better.append(wrong)

@@ -12,7 +12,7 @@ import pytest
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
@@ -29,13 +29,13 @@ PRESETS = (
 
 
 def settings(log: SensorLog) -> SegSlamFrontEndConfig:
-    built: SegSlamFrontEndConfig = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    built: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
     return built
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_valid(name: str) -> None:
-    c = build(SegSlamFrontEndConfig, cfg.preset(f"{name}.segslam")["frontend"])
+    c = build_config(SegSlamFrontEndConfig, cfg.preset(f"{name}.segslam")["frontend"])
     assert c.filter.particles == 20
     assert c.segslam.choice.margin == 0.1  # what no preset would leave at its default is there
 

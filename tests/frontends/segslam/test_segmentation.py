@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
@@ -225,7 +225,9 @@ def test_decisions_come_at_their_rate_and_copies_go_their_own_way() -> None:
 
 
 def test_configurations_are_checked_and_built_from_tables() -> None:
-    c = build(SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}})
+    c = build_config(
+        SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}}
+    )
     assert (c.segmentation.period, c.winnowing.gap, c.search.starts) == (20.0, 30.0, 3)
     assert c.winnowing.drift(100.0) == pytest.approx(4.5)
     assert c.search.yaw_width(1000.0) == 0.8
@@ -244,7 +246,7 @@ def test_configurations_are_checked_and_built_from_tables() -> None:
         {"lock_after": -1},
     ):
         with pytest.raises(ConfigError):
-            build(SegSlamConfig, bad)
+            build_config(SegSlamConfig, bad)
 
 
 def test_se3_windows_score_in_three_dimensions() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.core.poses import SE3, upright
+from graphslam.core.poses import SE3, level_poses
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -63,7 +63,7 @@ def levelled_chain(rng: np.random.Generator, m: int = 20) -> tuple[list[Submap],
     """
     heading = np.cumsum(rng.uniform(-0.8, 0.8, m + 1))
     places = np.cumsum(np.column_stack([8 * np.cos(heading), 8 * np.sin(heading), rng.uniform(-0.3, 0.3, m + 1)]), 0)
-    true = upright(places, heading)
+    true = level_poses(places, heading)
     error = np.zeros((m + 1, 6))
     error[:, :2] = SIGMA * rng.standard_normal((m + 1, 2))
     bases = SE3.compose(true, SE3.exp(error))  # where the bases really stand
@@ -76,7 +76,7 @@ def levelled_chain(rng: np.random.Generator, m: int = 20) -> tuple[list[Submap],
         T = SE3.compose(SE3.between(bases[k], bases[k + 1]), SE3.exp(rest))
         relative = SE3.between(true[k], true[k + 1])
         half = heading[k + 1] - heading[k] + rest[2]
-        exit_pose = upright(T[:3], half)
+        exit_pose = level_poses(T[:3], half)
         assert np.abs(SE3.log(SE3.between(relative, exit_pose))).max() < 1.0
         submaps.append(Submap(key=k, interval=(10.0 * k, 10.0 * k + 10.0), exit_pose=exit_pose, exit_covariance=P))
     return submaps, SE3.between(np.broadcast_to(bases[0], bases.shape), bases)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
@@ -53,7 +53,7 @@ class ImuConfig:
     acceleration: float = 0.3
     still: float = 0.05
     axes: Literal["refuse", "warn", "ignore"] = "refuse"
-    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
+    robust: Robust = flattened_field(Robust("none", 2.385), robust="kind", robust_width="k")
 
     def __post_init__(self) -> None:
         for name in ("longest", "pause", "window", "acceleration", "still"):

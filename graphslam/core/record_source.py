@@ -6,7 +6,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import Stream
 
 
-class Feed:
+class RecordSource:
     """The records of a log that is whole.
 
     One that grows is a :class:`graphslam.io.growing_log.GrowingLog`. What a front end makes of a feed depends on its
@@ -53,5 +53,5 @@ class Feed:
         whole: Stream = self._log[stream]
         return whole if first == 0 and last is None else whole.take(slice(first, last))
 
-    def let_go(self, stream: str, before: int) -> None:
+    def discard_before(self, stream: str, before: int) -> None:
         """Say that records before ``before`` will not be asked for again before the log has ended."""

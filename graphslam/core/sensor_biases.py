@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 CONSTANTS = ("turn", "distance", "range", "bearing", "ahead", "left")
 """Two of the wheels: their turns (by the second or by the metre), and the logarithm of their distances; and two of the
@@ -25,7 +25,7 @@ it stands on the robot, ahead and to the left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LastingErrors:
+class SensorBiases:
     """How a submap depends on constant errors, and what it says of them.
 
     Parameters
@@ -60,7 +60,7 @@ class LastingErrors:
         if self.path.shape[1:] != (3, c) or self.points.shape[1:] != (c,):
             raise GeometryError("lasting errors do not fit the path", got=self.path.shape, wanted=f"(T, 3, {c})")
         for part in (self.sigmas, self.response, self.score, self.information, self.path, self.points):
-            if not np.all(usable(part)):
+            if not np.all(finite_mask(part)):
                 raise GeometryError("lasting errors are not finite", wanted="finite numbers")
         if not np.all(self.sigmas > 0):
             raise CovarianceError("lasting errors need a positive σ beforehand", got=self.sigmas)
@@ -68,7 +68,7 @@ class LastingErrors:
         if np.abs(L - L.T).max() > 1e-6 * np.abs(L).max(initial=1e-300):
             raise CovarianceError("information of lasting errors is not symmetric")
 
-    def of_landmarks(self, keep: npt.NDArray[np.intp]) -> LastingErrors:
+    def of_landmarks(self, keep: npt.NDArray[np.intp]) -> SensorBiases:
         """The same beside fewer landmarks: ``keep`` are rows of the landmark map's vector."""
         return replace(self, response=self.response[keep])
 

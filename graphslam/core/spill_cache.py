@@ -1,8 +1,8 @@
 """Values that are not needed now lie in a file: what a run keeps of each submap takes a bounded part of the memory.
 
-A :class:`Shelf` holds values that do not change, each in a :class:`Slot`. As long as they fit, all of them are in
-memory. What is beyond is written to a file, the one that was used longest ago first, and read again where it is asked
-for. The file has no name: it is gone when the process ends, however that happens.
+A :class:`SpillCache` holds values that do not change, each in a :class:`CacheEntry`. As long as they fit, all of them
+are in memory. What is beyond is written to a file, the one that was used longest ago first, and read again where it is
+asked for. The file has no name: it is gone when the process ends, however that happens.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import IO, Any, Generic, TypeAlias, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ Arrays: TypeAlias = list[npt.NDArray[Any]]
 T = TypeVar("T")
 
 ROOM = 128_000_000
-"""Memory of :data:`SHELF` [bytes]."""
+"""Memory of :data:`SPILL_CACHE` [bytes]."""
 GIVE_BACK = 32_000_000
 """Freed heap is handed back to the system each time that so much has gone at least [bytes]."""
 _FINENESS = 8
@@ -60,8 +60,8 @@ class _Place:
         return a
 
 
-class Slot(Generic[T]):
-    """One value of a shelf; :meth:`Shelf.put` makes it. It is forgotten with the last who holds it.
+class CacheEntry(Generic[T]):
+    """One value of a shelf; :meth:`SpillCache.put` makes it. It is forgotten with the last who holds it.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Slot(Generic[T]):
     __slots__ = ("__weakref__", "_key", "_pack", "_place", "_shelf", "_unpack", "_value", "_weak", "nbytes")
 
     def __init__(
-        self, shelf: Shelf, key: int, nbytes: int, pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]
+        self, shelf: SpillCache, key: int, nbytes: int, pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]
     ) -> None:
         self._shelf, self._key, self.nbytes, self._pack, self._unpack = shelf, key, nbytes, pack, unpack
         self._value: T | None = None
@@ -98,7 +98,7 @@ class Slot(Generic[T]):
             shelf._dead.append((self._key, self._place))  # atomic; the shelf takes it from there
 
 
-class Shelf:
+class SpillCache:
     """Values of which so many bytes at most are in memory.
 
     What others hold of them meanwhile counts for those. Of any number of threads.
@@ -112,7 +112,7 @@ class Shelf:
     def __init__(self, room: int = ROOM) -> None:
         self.room = room
         self._lock = threading.RLock()
-        self._used: OrderedDict[int, weakref.ref[Slot[Any]]] = OrderedDict()  # in memory, used longest ago first
+        self._used: OrderedDict[int, weakref.ref[CacheEntry[Any]]] = OrderedDict()  # in memory, used longest ago first
         self._sizes: dict[int, int] = {}
         self._bytes = 0
         self._next = 0
@@ -136,7 +136,7 @@ class Shelf:
         """Length of the file [bytes]."""
         return self._end
 
-    def put(self, value: T, nbytes: int, pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> Slot[T]:
+    def put(self, value: T, nbytes: int, pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> CacheEntry[T]:
         """Take a value that will not change.
 
         Parameters
@@ -149,13 +149,13 @@ class Shelf:
         """
         with self._lock:
             self._next += 1
-            slot = Slot(self, self._next, nbytes, pack, unpack)
+            slot = CacheEntry(self, self._next, nbytes, pack, unpack)
             self._keep(slot, value)
             return slot
 
     # --- inside ----------------------------------------------------------------------------------------------
 
-    def _get(self, slot: Slot[T]) -> T:
+    def _get(self, slot: CacheEntry[T]) -> T:
         with self._lock:
             value = slot._value
             if value is not None:
@@ -168,14 +168,14 @@ class Shelf:
             self._keep(slot, value)
             return value
 
-    def _rows(self, slot: Slot[Any], first: int, last: int) -> npt.NDArray[Any]:
+    def _rows(self, slot: CacheEntry[Any], first: int, last: int) -> npt.NDArray[Any]:
         with self._lock:
             if slot._value is not None:
                 return cast("npt.NDArray[Any]", slot._value[first:last])
             assert slot._place is not None
             return slot._place.rows(first, last)
 
-    def _keep(self, slot: Slot[Any], value: Any) -> None:
+    def _keep(self, slot: CacheEntry[Any], value: Any) -> None:
         """Hold it in memory, and let go of others for it."""
         self._collect()
         slot._value = value
@@ -191,9 +191,9 @@ class Shelf:
             self._drop(key)
         if self._left > max(self.room // 2, GIVE_BACK):  # arrays of a few MB leave holes in the heap when they go
             self._left = 0
-            give_back()
+            trim_heap()
 
-    def _file_away(self, slot: Slot[Any]) -> bool:
+    def _file_away(self, slot: CacheEntry[Any]) -> bool:
         if slot._place is None:
             try:
                 slot._place = self._write(slot._pack(slot._value))
@@ -256,15 +256,15 @@ def _read(file: IO[bytes], into: npt.NDArray[Any], at: int) -> None:
         left, at = left[n:], at + n
 
 
-def as_it_is(a: npt.NDArray[Any]) -> Arrays:
+def pack_array(a: npt.NDArray[Any]) -> Arrays:
     """How one array is packed."""
     return [a]
 
 
-def the_only(arrays: Arrays) -> npt.NDArray[Any]:
+def unpack_array(arrays: Arrays) -> npt.NDArray[Any]:
     """… and unpacked."""
     return arrays[0]
 
 
-SHELF = Shelf()
+SPILL_CACHE = SpillCache()
 """The one that submaps, pieces of maps and clouds of this process share."""
