@@ -1,6 +1,6 @@
 """What a submap knows densely: an evidence grid, a cloud, or both, and the one view that everybody asks.
 
-Registration, loops and fused maps ask a :class:`DenseMapView` and nothing else; `graphslam.evidence.views.view_of`
+Registration, loops and fused maps ask a :class:`DenseMapView` and nothing else; `graphslam.evidence.views.dense_view`
 makes that of a submap.
 """
 

@@ -15,7 +15,7 @@ from graphslam.core.points import voxel_downsample
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 
 
 class GridView:
@@ -98,7 +98,7 @@ class CloudView:
         c, grid = self._cloud, EvidenceGrid(self._cloud.cell, dim=self._cloud.dim)
         if c.origins is None or c.scan is None:
             _mark(grid, c.points)
-            return shelved(grid)
+            return spill_grid(grid)
         scan, points = c.scan, c.points
         order = np.argsort(scan, kind="stable")
         bounds = np.searchsorted(scan[order], np.arange(len(c.origins) + 1))
@@ -106,10 +106,10 @@ class CloudView:
             rows = order[bounds[k] : bounds[k + 1]]
             if len(rows):
                 grid.insert_scan(points[rows], origin)
-        return shelved(grid)
+        return spill_grid(grid)
 
 
-def view_of(submap: Submap) -> DenseMapView:
+def dense_view(submap: Submap) -> DenseMapView:
     """The dense map of a submap."""
     grid = submap.grid
     if submap.cloud is not None and (grid is None or isinstance(grid, EvidenceGrid)):
@@ -121,7 +121,7 @@ def view_of(submap: Submap) -> DenseMapView:
     return GridView(grid)
 
 
-def has_view(submap: Submap) -> bool:
+def has_dense_view(submap: Submap) -> bool:
     """Whether a submap has a dense map."""
     return submap.cloud is not None or isinstance(submap.grid, EvidenceGrid)
 

@@ -67,7 +67,7 @@ class SpaceMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedMap:
     """A map, and which unknowns of a problem it speaks of.
 
     Parameters
@@ -173,14 +173,14 @@ class _Blocks:
         return sp.csr_matrix((np.concatenate(self.values), at), shape=(rows, columns))
 
 
-def moved(poses: Array, points: Array, step: Array) -> tuple[Array, Array]:
+def step_values(poses: Array, points: Array, step: Array) -> tuple[Array, Array]:
     """Values after a step ``(6 M + 3 N,)``."""
     d = step[: 6 * len(poses)].reshape(-1, 6)
     q = quat_normalize(quat_multiply(so3_exp(d[:, :3]), poses[:, 3:])) if len(poses) else poses[:, 3:]
     return np.hstack([poses[:, :3] + d[:, 3:], q]), points + step[6 * len(poses) :].reshape(-1, 3)
 
 
-def objective(maps: Sequence[Placed], poses: Array, points: Array) -> float:
+def space_objective(maps: Sequence[PlacedMap], poses: Array, points: Array) -> float:
     """``Σ uᵀ I u``."""
     total = 0.0
     for one in maps:
@@ -189,7 +189,7 @@ def objective(maps: Sequence[Placed], poses: Array, points: Array) -> float:
     return total
 
 
-def normal_equations(maps: Sequence[Placed], poses: Array, points: Array) -> tuple[float, Array, sp.csc_matrix]:
+def normal_equations(maps: Sequence[PlacedMap], poses: Array, points: Array) -> tuple[float, Array, sp.csc_matrix]:
     """Objective, half its gradient ``Jᵀ I u`` and the Gauss–Newton matrix ``Jᵀ I J``."""
     jacobians, weights, residuals = [], [], []
     for one in maps:
@@ -204,7 +204,7 @@ def normal_equations(maps: Sequence[Placed], poses: Array, points: Array) -> tup
 
 @dataclass(frozen=True)
 class SpaceMinimum:
-    """What :func:`minimise` found: values, objective there, Gauss–Newton matrix there, and how it ended."""
+    """What :func:`minimise_space_maps` found: values, objective there, Gauss–Newton matrix there, and how it ended."""
 
     poses: Array
     points: Array
@@ -214,8 +214,8 @@ class SpaceMinimum:
     converged: bool
 
 
-def minimise(
-    maps: Sequence[Placed], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
+def minimise_space_maps(
+    maps: Sequence[PlacedMap], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
 ) -> SpaceMinimum:
     """Damped Gauss–Newton; it ends when the decrease that the linear model promises is below ``rtol · max(f, 1)``."""
     from graphslam.linear.symmetric_factor import SymmetricFactor
@@ -232,8 +232,8 @@ def minimise(
         small = promised <= rtol * max(f, 1.0)
         share = 1.0
         while True:
-            trial = moved(poses, points, share * step)
-            found = objective(maps, *trial)
+            trial = step_values(poses, points, share * step)
+            found = space_objective(maps, *trial)
             if (np.isfinite(found) and found <= f) or small or share <= _SHORTEST:
                 break
             share *= 0.5

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
-from graphslam.evidence.views import view_of
+from graphslam.evidence.views import dense_view
 from graphslam.loops.candidates import FRONT_END, TIE, Candidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
@@ -83,7 +83,7 @@ class LoopMeasurer:
     def prepared(self, k: int) -> PreparedMap:
         """The map of submap ``k`` of the chain."""
         found = self._maps.pop(k, None)
-        self._maps[k] = found = PreparedMap(view_of(self.submaps[k]), self.config) if found is None else found
+        self._maps[k] = found = PreparedMap(dense_view(self.submaps[k]), self.config) if found is None else found
         return found
 
     def _let_go(self) -> None:

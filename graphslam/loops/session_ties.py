@@ -25,7 +25,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
-from graphslam.evidence.views import has_view, view_of
+from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import Candidate, thinned
@@ -90,7 +90,7 @@ class SessionMap:
         nodes, which, poses, way, times, steps, covariances = [], [], [], [], [], [], []
         node, begin = 0, 0.0
         for k, s in enumerate(self.submaps):
-            if s.landmarks is not None or not has_view(s) or s.trajectory is None or not len(s.trajectory):
+            if s.landmarks is not None or not has_dense_view(s) or s.trajectory is None or not len(s.trajectory):
                 raise DataError(f"submap {s.key} cannot be placed", wanted="a dense submap with a path and a map")
             cut = cut_submap(s, spacing)
             n = len(cut.increments)
@@ -121,7 +121,7 @@ class SessionMap:
         config, out = DescriptorConfig(), []
         for k, s in enumerate(self.submaps):
             T = self.places.T_base_node[self.places.of_submap(k)]
-            out.append(describe(view_of(s), T, config))
+            out.append(describe(dense_view(s), T, config))
         return join(out)
 
 

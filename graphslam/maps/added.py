@@ -19,8 +19,8 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.batch import write_packed
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
-from graphslam.evidence.shelved import shelved
-from graphslam.evidence.views import view_of
+from graphslam.evidence.spilled_grid import spill_grid
+from graphslam.evidence.views import dense_view
 from graphslam.maps.added_kernels import subtract_bricks
 
 COPIED = 0.9
@@ -124,12 +124,12 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
             found = added(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
             share = found.shared / max(whole[target].voxel_counts().known, 1)
             if share >= best:
-                best, grids[s.key], entered[s.key] = share, shelved(found.grid), target
+                best, grids[s.key], entered[s.key] = share, spill_grid(found.grid), target
         before = s
     return grids, entered
 
 
 def grid_of(submap: Submap) -> EvidenceGrid:
     """The evidence of a submap's dense map."""
-    grid: EvidenceGrid = view_of(submap).evidence()
+    grid: EvidenceGrid = dense_view(submap).evidence()
     return grid

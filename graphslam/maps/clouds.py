@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.points import voxel_downsample
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
-from graphslam.evidence.views import has_view, view_of
+from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.maps.pieces import DivisionConfig, owning_places
 from graphslam.maps.submaps import local_nodes
 
@@ -35,7 +35,7 @@ def fused_points(
     """
     made, cells = [], []
     for s in submaps:
-        cloud = view_of(s).cloud if has_view(s) else None
+        cloud = dense_view(s).cloud if has_dense_view(s) else None
         if cloud is None:
             continue
         times, T_world = nodes[s.key]

@@ -25,7 +25,7 @@ from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.batch import write_packed
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.contents import entropy_of_counts
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, MAX_LEVELS, half_edge
@@ -358,7 +358,7 @@ class FusedMap:
         """Now and then drop the bricks in which nothing is known any more, and what was noted of changes twice."""
         self._empty += empty
         if self._empty > 1000 and 2 * self._empty > len(self._grid.brick_coordinates()):
-            compact(self._grid)
+            compact_grids(self._grid)
             self._empty = 0
         if sum(map(len, self._uncounted[1:])) > 2 * len(self._uncounted[0]) + 100_000:
             self._uncounted = [np.unique(np.concatenate(self._uncounted))]

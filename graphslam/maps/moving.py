@@ -28,7 +28,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 
 Mask = npt.NDArray[np.bool_]
 
@@ -179,7 +179,7 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
             points = cloud.points[(cloud.scan == k) & ~gone]
             if len(points):
                 drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
-        out.append(replace(s, cloud=left, grid=shelved(drawn), report={**s.report, "points_moved": int(gone.sum())}))
+        out.append(replace(s, cloud=left, grid=spill_grid(drawn), report={**s.report, "points_moved": int(gone.sum())}))
     return out
 
 

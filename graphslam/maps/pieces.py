@@ -37,8 +37,8 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
-from graphslam.evidence.shelved import packed_values, unpacked_values
-from graphslam.evidence.views import view_of
+from graphslam.evidence.spilled_grid import packed_values, unpacked_values
+from graphslam.evidence.views import dense_view
 from graphslam.maps.piece_kernels import count_owned, deal_out, known_extents, own_voxels
 
 Ints = npt.NDArray[np.int64]
@@ -349,7 +349,7 @@ def pieces_of_submap(
     names : sequence, optional
         Default ``(key, 0)``, ``(key, 1)`` …
     """
-    grid = view_of(submap).evidence()
+    grid = dense_view(submap).evidence()
     if node_times is None:
         pieces = [whole(grid)]
     elif submap.trajectory is None:

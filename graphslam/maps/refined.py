@@ -17,7 +17,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.refine import Refinement
 from graphslam.refine.scans import Scans
@@ -162,7 +162,7 @@ def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> Evid
         points, origins, returns = scans.scan(k)
         if len(points):
             drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
-    return shelved(drawn)
+    return spill_grid(drawn)
 
 
 def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap | None:

@@ -16,7 +16,7 @@ from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import MAX_LEVELS, half_edge
-from graphslam.evidence.views import has_view, view_of
+from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.maps.clouds import fused_points
 from graphslam.maps.coarse import coarse_piece
 from graphslam.maps.contradictions import NOTHING, Contradictions, contradictions
@@ -145,7 +145,7 @@ class RunMap:
 
 def has_maps(submaps: Sequence[Submap]) -> bool:
     """Has every submap a dense map, an evidence grid or a cloud?"""
-    return bool(submaps) and all(has_view(s) for s in submaps)
+    return bool(submaps) and all(has_dense_view(s) for s in submaps)
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
@@ -196,7 +196,7 @@ def make_run_map(
     """
     config = MapConfig() if config is None else config
     if not has_maps(submaps):
-        bare = [s.key for s in submaps if not has_view(s)]
+        bare = [s.key for s in submaps if not has_dense_view(s)]
         raise MissingDataError(
             "submaps have no evidence grids or clouds to make a map of",
             got=f"{len(bare)} of {len(submaps)} without",
@@ -226,7 +226,7 @@ def make_run_map(
     fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
-    knows_space = all(view_of(s).knows_space for s in submaps)
+    knows_space = all(dense_view(s).knows_space for s in submaps)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
     return RunMap(
         fused,

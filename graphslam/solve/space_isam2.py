@@ -12,17 +12,17 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import se3_compose, se3_transform
 from graphslam.graph.factors.space_map import gtsam_pose, pose_of, space_factor
-from graphslam.linear.space_maps import Placed
+from graphslam.linear.space_maps import PlacedMap
 
 
 def incremental(
-    placed: Sequence[Placed], poses: Array, points: Array, *, progress: bool = False
+    placed: Sequence[PlacedMap], poses: Array, points: Array, *, progress: bool = False
 ) -> tuple[Array, Array, int]:
     """Values of iSAM2 after the last submap, and the number of its updates.
 
     Parameters
     ----------
-    placed : sequence of Placed
+    placed : sequence of PlacedMap
         Submap k speaks of pose k, seen from pose k - 1.
     poses, points : (m, 7), (n, 3)
         Give the shapes; a new variable begins where its submap puts it from where iSAM2 has its base.

@@ -27,7 +27,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
-from graphslam.evidence.views import view_of
+from graphslam.evidence.views import dense_view
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
@@ -138,7 +138,7 @@ def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: ra
 def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> None:
     """Recall of descriptors at 1, 5, 10, 20, and precision of candidates."""
     begin = time.perf_counter()
-    D = join([describe(view_of(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)])
+    D = join([describe(dense_view(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)])
     apart = np.linalg.norm(truth[:, None, :3] - truth[None, :, :3], axis=2)
     hits, visits = np.zeros(4), 0
     for j in range(len(places)):

@@ -35,7 +35,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.evidence.compact import pieces_of
+from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load
 from graphslam.maps.fuse import FusedMap, fuse
@@ -134,7 +134,7 @@ def seconds(work: Callable[[], Any]) -> tuple[float, Any]:
 
 def same(a: FusedMap, b: FusedMap) -> bool:
     """Whether two maps are the same to the last bit."""
-    x, y = pieces_of(a.grid), pieces_of(b.grid)
+    x, y = grid_pieces(a.grid), grid_pieces(b.grid)
     return all(np.array_equal(getattr(x, n), getattr(y, n)) for n in ("bricks", "values", "cubes", "cube_values"))
 
 

@@ -18,7 +18,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.shelved import load_shelved, shelved
+from graphslam.evidence.spilled_grid import load_spilled, spill_grid
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
 from graphslam_frontends.base import FrontEnd
@@ -93,7 +93,7 @@ class FrontToBack:
         settled = 0 if self.settled is None else self.settled.draw
         self.draw = settled if draw is None else draw
         of = None if self.draw == settled else self.draw
-        self.store = None if folder is None else folder.submaps_with(load_shelved if with_grids else None, draw=of)
+        self.store = None if folder is None else folder.submaps_with(load_spilled if with_grids else None, draw=of)
         self.submaps: list[Submap] = self.store.complete_prefix() if self.store is not None else []
         if self.store is not None:
             self.store.truncate(len(self.submaps))
@@ -117,7 +117,7 @@ class FrontToBack:
                 return
             if isinstance(submap.grid, EvidenceGrid):
                 submap.grid.pool.release_scratch()
-                submap = replace(submap, grid=shelved(submap.grid))
+                submap = replace(submap, grid=spill_grid(submap.grid))
             if self.store is not None:
                 self.store.append(submap)
             self.back.add(submap)

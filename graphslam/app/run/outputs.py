@@ -45,7 +45,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import FigureTable, is_time
 from graphslam.evaluate.without_truth import ClassConsistency
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
@@ -313,7 +313,8 @@ def _open(home: Path, root: Path) -> Run:
 
 
 def refined_submaps_of(run: Run) -> list[Submap]:
-    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the result."""
+    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the
+    result."""
     if run.refined is not None:
         return run.refined.submaps
     if run.folder is None:
@@ -324,7 +325,7 @@ def refined_submaps_of(run: Run) -> list[Submap]:
 def _refined_of(run: Run, store: Path) -> list[Submap]:
     if not store.is_dir():
         return []
-    submaps, where = read_submaps(store, load_grid=load_shelved), str(store)
+    submaps, where = read_submaps(store, load_grid=load_spilled), str(store)
     have, wanted = [s.key for s in submaps], [s.key for s in run.submaps]
     if have != wanted:
         raise FormatError("refined submaps are not those of the run", where=where, got=have[:9], wanted=wanted[:9])

@@ -82,7 +82,7 @@ from graphslam.evaluate.stream_checks import Noticed, check_streams
 from graphslam.evaluate.systematic import systematic_findings
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evaluate.trust import pooled_nonlinearity, rows_as_json
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
@@ -351,7 +351,7 @@ def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any]
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
     settings: cfg.RunConfig = build_config(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
     back = back_end(RecordSource(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
-    return effective, settings, back, read_submaps(root, load_grid=load_shelved if with_grids(settings) else None)
+    return effective, settings, back, read_submaps(root, load_grid=load_spilled if with_grids(settings) else None)
 
 
 def back_end(feed: RecordSource, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:

@@ -18,7 +18,7 @@ from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_fil
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
@@ -186,7 +186,7 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     run = open_run(path)
     root = Path(path)
     refined = refined_submaps_of(run)
-    submaps = refined or read_submaps(root, load_grid=load_shelved)
+    submaps = refined or read_submaps(root, load_grid=load_spilled)
     if not has_maps(submaps):
         raise MissingDataError(
             f"{root}: the run has no evidence grids or clouds to make a map of",

@@ -26,7 +26,7 @@ from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.moving import MovedThings, moving_points
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
@@ -268,7 +268,7 @@ def _moved(run: Run) -> dict[int, Array]:
     """Points of things that moved, in the world, by node of a run whose submaps have grids and clouds."""
     if run.folder is None or not any(s.cloud is not None for s in run.submaps):
         return {}
-    submaps = read_submaps(run.folder, load_grid=load_shelved)
+    submaps = read_submaps(run.folder, load_grid=load_spilled)
     bases = np.asarray(run.map.node_poses)[: len(submaps)]
     return {
         k: np.asarray(se3.se3_transform(bases[k], s.cloud.points[mask]))

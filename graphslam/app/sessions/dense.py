@@ -19,8 +19,8 @@ from graphslam.core.errors import DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.shelved import load_shelved
-from graphslam.evidence.views import has_view
+from graphslam.evidence.spilled_grid import load_spilled
+from graphslam.evidence.views import has_dense_view
 from graphslam.graph.noise import NO_KERNEL, Robust
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
@@ -39,8 +39,8 @@ def with_maps(run: Run) -> list[Submap]:
     """The submaps of a run with their dense maps, along its refined path where it has one."""
     submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
-        submaps = read_submaps(run.folder, load_grid=load_shelved)
-    without = [s.key for s in submaps if not has_view(s)]
+        submaps = read_submaps(run.folder, load_grid=load_spilled)
+    without = [s.key for s in submaps if not has_dense_view(s)]
     if without:
         raise DataError(f"submaps {without} have no map", where=run.name, wanted="evidence grids or clouds")
     return submaps

@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
 from graphslam.graph.factors.batch import safe_factor
-from graphslam.linear.space_maps import ORIGIN, Placed
+from graphslam.linear.space_maps import ORIGIN, PlacedMap
 
 
 def pose_of(pose: gtsam.Pose3) -> Array:
@@ -23,7 +23,7 @@ def gtsam_pose(pose: Array) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(quat_to_matrix(pose[3:])), pose[:3])
 
 
-def space_factor(one: Placed) -> gtsam.CustomFactor:
+def space_factor(one: PlacedMap) -> gtsam.CustomFactor:
     """A factor on the poses ``x{k}`` and points ``l{j}`` of a placed map, whitened, with its analytic Jacobian.
 
     Pose ``k`` of the problem is the variable ``x{k + 1}``, as in the graphs of submaps: ``x0`` is the fixed first base.

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import GeometryError
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
@@ -74,7 +74,7 @@ def test_particles_without_noise_are_one_and_cost_one_map() -> None:
     result = run_rbpf(steps, quiet, SeedTree(0))
     alone = run_rbpf(steps, replace(quiet, particles=1), SeedTree(0))
     assert result.poses == pytest.approx(np.tile(dead_reckoned(steps)[-1], (8, 1)), abs=1e-12)
-    together, one = memory(result.particles.grids), memory(alone.particles.grids[0])
+    together, one = measure_memory(result.particles.grids), measure_memory(alone.particles.grids[0])
     assert together.bricks == one.bricks
     assert result.tally.rays == alone.tally.rays
 
@@ -107,8 +107,8 @@ def test_children_of_one_particle_share_their_map_and_are_updated_once() -> None
             assert np.array_equal(grid.brick_values(), values)
             first = int(np.flatnonzero(ancestors == ancestors[i])[0])
             assert grid.same_as(p.grids[first])
-        total = memory(p.grids).bricks
-        assert total < 0.7 * sum(memory(g).bricks for g in p.grids)
+        total = measure_memory(p.grids).bricks
+        assert total < 0.7 * sum(measure_memory(g).bricks for g in p.grids)
         return
     pytest.fail("never resampled")
 

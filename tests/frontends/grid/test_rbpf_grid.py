@@ -16,7 +16,7 @@ from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_drift import Passed
@@ -74,8 +74,8 @@ def test_result_holds_what_happened(run: tuple[Steps, RbpfResult]) -> None:
     assert np.array_equal(result.ancestry.paths()[-1], result.poses)
     assert result.seconds > 0.0
     assert set(result.tally.seconds) == {"predict", "weigh", "record", "resample", "update"}
-    assert result.used_bytes == memory(result.particles.grids).total
-    assert result.used_bytes < 0.6 * sum(memory(g).total for g in result.particles.grids)
+    assert result.used_bytes == measure_memory(result.particles.grids).total
+    assert result.used_bytes < 0.6 * sum(measure_memory(g).total for g in result.particles.grids)
     assert result.particles.weights[result.best] == result.particles.weights.max()
     json.dumps(result.report())
 

@@ -1,7 +1,7 @@
 """Evidence grids that are finished: in memory while they are used, else in the file of a shelf.
 
-A run holds the grid of every submap to its end, and uses a few at a time. :func:`shelved` makes a grid that is the same
-to everybody who asks it something; whoever writes to it has it in memory from then on.
+A run holds the grid of every submap to its end, and uses a few at a time. :func:`spill_grid` makes a grid that is the
+same to everybody who asks it something; whoever writes to it has it in memory from then on.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.spill_cache import SPILL_CACHE, Arrays, CacheEntry, SpillCache
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import Pieces, grid_of, pieces_of
+from graphslam.evidence.compact import GridPieces, fill_grid, grid_pieces
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
@@ -24,7 +24,7 @@ from graphslam.evidence.pool import GridPool, RootBox
 _Kind: TypeAlias = tuple[float, BeamModel, int]
 
 
-class ShelvedGrid(EvidenceGrid):
+class SpilledGrid(EvidenceGrid):
     """A grid whose tree is in a pool of its own, which a shelf holds.
 
     Both are asked for when they are needed. They stay the same for as long as somebody holds the pool, so that whoever
@@ -67,7 +67,7 @@ class ShelvedGrid(EvidenceGrid):
         self._own, self._slot = (self.pool, box), None
 
 
-def shelved(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceGrid:
+def spill_grid(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceGrid:
     """The same map on a shelf, in a pool of its own; the memory of ``grid`` goes with its last owner.
 
     Parameters
@@ -75,12 +75,14 @@ def shelved(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceGrid
     shelf : SpillCache, optional
         By default that of the process.
     """
-    if isinstance(grid, ShelvedGrid) and grid.on_shelf:
+    if isinstance(grid, SpilledGrid) and grid.on_shelf:
         return grid
-    return _put(grid, _pool_of(_kind(grid, grid.pool.levels), pieces_of(grid)), SPILL_CACHE if shelf is None else shelf)
+    return _put(
+        grid, _pool_of(_kind(grid, grid.pool.levels), grid_pieces(grid)), SPILL_CACHE if shelf is None else shelf
+    )
 
 
-def load_shelved(path: str | os.PathLike[str]) -> EvidenceGrid:
+def load_spilled(path: str | os.PathLike[str]) -> EvidenceGrid:
     """Read what `EvidenceGrid.save` wrote, onto the shelf of the process; errors are those of `formats.load_npz`."""
     grid = load_npz(path)
     return _put(grid, _with(grid.pool, grid._box), SPILL_CACHE)
@@ -88,7 +90,7 @@ def load_shelved(path: str | os.PathLike[str]) -> EvidenceGrid:
 
 def _put(grid: EvidenceGrid, pool: GridPool, shelf: SpillCache) -> EvidenceGrid:
     kind = (grid.voxel_size, grid.model, grid.dim)
-    return ShelvedGrid(
+    return SpilledGrid(
         grid, shelf.put(pool, pool.nbytes, partial(_packed, kind), partial(_unpacked, kind, pool.levels))
     )
 
@@ -97,9 +99,9 @@ def _kind(grid: EvidenceGrid, levels: int) -> EvidenceGrid:
     return EvidenceGrid(grid.voxel_size, model=grid.model, pool=GridPool(levels), dim=grid.dim)
 
 
-def _pool_of(kind: EvidenceGrid, pieces: Pieces) -> GridPool:
+def _pool_of(kind: EvidenceGrid, pieces: GridPieces) -> GridPool:
     """The pool of an empty grid, with a tree of some pieces."""
-    grid_of(kind, pieces)
+    fill_grid(kind, pieces)
     return _with(kind.pool, kind._box)
 
 
@@ -121,7 +123,7 @@ def _packed(kind: _Kind, pool: GridPool) -> Arrays:
     voxel_size, model, dim = kind
     grid = EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim)
     grid._box = _tree_of(pool)
-    p = pieces_of(grid)
+    p = grid_pieces(grid)
     return [p.bricks.astype(np.int32), *packed_values(p.values), p.cubes.astype(np.int32), p.log_edges, p.cube_values]
 
 
@@ -130,7 +132,7 @@ def _unpacked(kind: _Kind, levels: int, arrays: Arrays) -> GridPool:
     voxel_size, model, dim = kind
     empty = EvidenceGrid(voxel_size, model=model, pool=GridPool(levels), dim=dim)
     values = unpacked_values(where, known)
-    return _pool_of(empty, Pieces(bricks.astype(np.int64), values, cubes.astype(np.int64), log_edges, cube_values))
+    return _pool_of(empty, GridPieces(bricks.astype(np.int64), values, cubes.astype(np.int64), log_edges, cube_values))
 
 
 def packed_values(values: npt.NDArray[np.int16]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int16]]:
