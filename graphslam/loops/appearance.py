@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level_poses
 from graphslam.loops.candidates import APPEARANCE, Candidate
 from graphslam.loops.places import Places
-from graphslam.registration.place_descriptor import Descriptors, similarity
+from graphslam.registration.place_descriptor import PlaceDescriptors, descriptor_similarity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class AppearanceConfig:
 
 def appearance_candidates(
     places: Places,
-    descriptors: Descriptors,
+    descriptors: PlaceDescriptors,
     config: AppearanceConfig | None = None,
     *,
     exclude: Collection[tuple[int, int]] = (),
@@ -56,7 +56,7 @@ def appearance_candidates(
 
     Parameters
     ----------
-    descriptors : Descriptors
+    descriptors : PlaceDescriptors
         Of these places.
     exclude : collection of (int, int)
         Pairs of submaps, either way round, that are not tried.
@@ -86,7 +86,7 @@ def appearance_candidates(
         rows = rows[usable]
         if not len(rows):
             continue
-        correlation, turn = similarity(descriptors, j, descriptors, rows)
+        correlation, turn = descriptor_similarity(descriptors, j, descriptors, rows)
         best = _stretches(places.way[rows], correlation, c.stretch, c.top + 1)
         # the best as a group must stand out from the next stretch, else this place looks like many
         beaten = float(correlation[best[c.top]]) if len(best) > c.top else -1.0

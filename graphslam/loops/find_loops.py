@@ -25,7 +25,7 @@ from graphslam.loops.measure import LoopMeasurer
 from graphslam.loops.places import Places
 from graphslam.loops.ties import Entry, TieConfig, tie_candidates, ties_entries
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.place_descriptor import DescriptorConfig, describe, join
+from graphslam.registration.place_descriptor import DescriptorConfig, concatenate_descriptors, describe_places
 
 logger = logging.getLogger(__name__)
 
@@ -175,11 +175,11 @@ class LoopSearch:
         if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
             return
         parts = [
-            describe(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
+            describe_places(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
             for k in range(len(measurer.submaps))
         ]
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
-        alike = appearance_candidates(p, join(parts), c.appearance, exclude=shared)
+        alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
 
 

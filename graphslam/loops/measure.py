@@ -16,7 +16,7 @@ from graphslam.evidence.views import dense_view
 from graphslam.loops.candidates import FRONT_END, TIE, Candidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import PreparedMap, contradiction, match_pair
+from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +127,6 @@ class LoopMeasurer:
         for x, T in zip(loops, T_ij):
             source, target = self.prepared(int(p.submap[x.j])), self.prepared(int(p.submap[x.i]))
             at_j, at_i = p.T_base_node[x.j], p.T_base_node[x.i]
-            out.append(contradiction(source, at_j, target, g.compose(at_i, T), source.around(at_j)))
+            out.append(contradiction_share(source, at_j, target, g.compose(at_i, T), source.around(at_j)))
             self._let_go()
         return np.array(out)

@@ -32,7 +32,12 @@ from graphslam.loops.candidates import Candidate, thinned
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import Ints, Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.place_descriptor import DescriptorConfig, Descriptors, describe, join
+from graphslam.registration.place_descriptor import (
+    DescriptorConfig,
+    PlaceDescriptors,
+    concatenate_descriptors,
+    describe_places,
+)
 
 Mask = npt.NDArray[np.bool_]
 _APART = 1000.0  # sessions lie so far apart along the common way [m]: no two of their places are one stretch
@@ -116,13 +121,13 @@ class SessionMap:
         """Of the way [m]."""
 
     @cached_property
-    def descriptors(self) -> Descriptors:
+    def descriptors(self) -> PlaceDescriptors:
         """Of the places; made when they are first asked for."""
         config, out = DescriptorConfig(), []
         for k, s in enumerate(self.submaps):
             T = self.places.T_base_node[self.places.of_submap(k)]
-            out.append(describe(dense_view(s), T, config))
-        return join(out)
+            out.append(describe_places(dense_view(s), T, config))
+        return concatenate_descriptors(out)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,7 +222,7 @@ class TwoSessions:
     def candidates(self, config: TieConfig) -> list[Candidate]:
         """Places of the new session that look like places of the map."""
         appearance = AppearanceConfig(top=config.top, least=config.alike, lead=0.0, stretch=config.stretch)
-        both = join([self.known.descriptors, self.new.descriptors])
+        both = concatenate_descriptors([self.known.descriptors, self.new.descriptors])
         return appearance_candidates(self.places, both, appearance, exclude=self.within)[: config.keep]
 
     def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:

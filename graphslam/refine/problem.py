@@ -15,10 +15,10 @@ from graphslam.refine.fixes import FixModel
 from graphslam.refine.motion import MotionModel, States, Terms
 from graphslam.refine.surfaces import Association, Cloud, Surfaces, blocks
 from graphslam.registration.plane_kernels import (
-    Held,
-    Pairs,
+    GroupInformation,
+    PlanePairs,
     group_information,
-    nothing_feigned,
+    no_noise_correction,
     plane_blocks,
     plane_residuals,
 )
@@ -199,7 +199,7 @@ def alike(found: Association, cloud: Cloud, residuals: Array, noise: Array) -> f
     return out
 
 
-def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> Array:
+def residuals(pairs: PlanePairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> Array:
     """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
     out = np.empty(len(pairs.source))
     t = np.ascontiguousarray(poses[:, : cloud.points.shape[1]])
@@ -211,7 +211,7 @@ FEIGNED = 1.5
 """Of what noise of the normals feigns so many times as much is taken off: groups scatter about the average."""
 
 
-def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, information: Array) -> Held:
+def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, information: Array) -> GroupInformation:
     """What each two chunks hold of each other, without what the noise of normals feigns.
 
     Normals of a smooth wall are tilted along it at random. Squared and added up over thousands of pairs they look as if
@@ -224,7 +224,7 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     pairs, group = found.pairs, found.whose
     d = cloud.points.shape[1]
     if not len(group):
-        return nothing_feigned(d)
+        return no_noise_correction(d)
     w, G = (6 if d == 3 else 3), int(group.max()) + 1
     R, t = rotations(poses), np.ascontiguousarray(poses[:, :d])
     centre = np.zeros((G, d))
@@ -240,7 +240,7 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     values, U = np.linalg.eigh(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, H), 1, 2)))
     share = np.maximum(1.0 - FEIGNED / np.maximum(values, 1e-12), 0.0)
     back = np.swapaxes(np.linalg.solve(np.swapaxes(L, 1, 2), U), 1, 2)  # Uᵀ L⁻¹
-    return Held(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
+    return GroupInformation(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
 
 
 class Problem:
@@ -258,7 +258,7 @@ class Problem:
         self._key: object = None
         self._pattern: Pattern | None = None
 
-    def _pattern_of(self, pairs: Pairs, extra: list[Terms]) -> Pattern:
+    def _pattern_of(self, pairs: PlanePairs, extra: list[Terms]) -> Pattern:
         key = (id(pairs.source), *(id(t.nodes) for t in extra))
         if self._key != key:
             n = self.motion.steps_count
@@ -286,11 +286,11 @@ class Problem:
         self,
         poses: Array,
         states: States,
-        pairs: Pairs,
+        pairs: PlanePairs,
         surfaces: Surfaces,
         information: Array,
         extra: list[Terms] | None = None,
-        holds: Held | None = None,
+        holds: GroupInformation | None = None,
     ) -> tuple[Solved, Array]:
         """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``; None: pairs hold all they say."""
         more = [*(extra or []), *([] if self.fixes is None else self.fixes.terms(poses, states))]
@@ -304,7 +304,7 @@ class Problem:
             "scans": plane_blocks(
                 pairs, (R, t), (self.cloud.points, surfaces.normals), information,
                 (pattern.at(own, own), pattern.at(pairs.i, pairs.j), pattern.rank),
-                holds or nothing_feigned(motion.group.dim), H, gp,
+                holds or no_noise_correction(motion.group.dim), H, gp,
             )
         }  # fmt: skip
         g[: n * w] = gp.ravel()

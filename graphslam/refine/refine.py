@@ -30,7 +30,7 @@ from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at, 
 from graphslam.refine.problem import Problem, Solved, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
-from graphslam.registration.plane_kernels import Pairs
+from graphslam.registration.plane_kernels import PlanePairs
 from graphslam_frontends.odometry.recorded import chain
 
 log = logging.getLogger(__name__)
@@ -277,7 +277,9 @@ def _reach(steps: Scans) -> float:
     return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
 
 
-NOTHING = Association(Pairs(*np.zeros((4, 0), np.int64)), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+NOTHING = Association(
+    PlanePairs(*np.zeros((4, 0), np.int64)), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+)
 """No pairs."""
 
 

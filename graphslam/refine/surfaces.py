@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from graphslam.core.geometry import Array
 from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
 from graphslam.refine.scans import Scans
-from graphslam.registration.plane_kernels import Pairs
-from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations, thin_places
+from graphslam.registration.plane_kernels import PlanePairs
+from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, rotations, thin_places
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -162,7 +162,7 @@ class Surfaces:
         return SPILL_CACHE.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
 
 
-def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:
+def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceFitConfig) -> Surfaces:
     """Surfaces of all places among those of their own and the two neighbouring chunks, at a path.
 
     Neighbours in time only: points of other passes lie beside these ones before the passes agree, and would turn the
@@ -268,7 +268,7 @@ class Association:
         spent twice.
     """
 
-    pairs: Pairs
+    pairs: PlanePairs
     whose: Index
     once: Array
     spent: Array
@@ -325,7 +325,7 @@ def associate(
             v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
             once[s, 2] += v
             spent[s, 2] += v * np.maximum(times, alike_steps[k])
-    return Association(Pairs(p, q, i, j), w, once, spent)
+    return Association(PlanePairs(p, q, i, j), w, once, spent)
 
 
 def _nearest_surfaces(

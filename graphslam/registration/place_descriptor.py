@@ -61,7 +61,7 @@ class DescriptorConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Descriptors:
+class PlaceDescriptors:
     """Of many places.
 
     Parameters
@@ -86,7 +86,9 @@ class Descriptors:
         return np.asarray(self.values.sum(axis=2) / np.maximum(some, 1e-9) * np.sqrt(some / self.known.shape[2]))
 
 
-def describe(view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
+def describe_places(
+    view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None
+) -> PlaceDescriptors:
     """Descriptors of places of one map.
 
     Parameters
@@ -126,17 +128,19 @@ def describe(view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConf
             values = gaussian_filter1d(values, c.blur, axis=axis, mode=mode)
             known = gaussian_filter1d(known, c.blur, axis=axis, mode=mode)
     known = np.where(known > 0.5, 1.0, 0.0)
-    return Descriptors(values * known, known, c)
+    return PlaceDescriptors(values * known, known, c)
 
 
-def join(parts: list[Descriptors]) -> Descriptors:
+def concatenate_descriptors(parts: list[PlaceDescriptors]) -> PlaceDescriptors:
     """Descriptors of several maps, one after the other."""
-    return Descriptors(
+    return PlaceDescriptors(
         np.concatenate([d.values for d in parts]), np.concatenate([d.known for d in parts]), parts[0].config
     )
 
 
-def similarity(query: Descriptors, which: int, others: Descriptors, rows: Ints) -> tuple[Array, Array]:
+def descriptor_similarity(
+    query: PlaceDescriptors, which: int, others: PlaceDescriptors, rows: Ints
+) -> tuple[Array, Array]:
     """Correlation of one place with others at the turn that suits each best, −1 … 1, and that turn [rad].
 
     Parameters

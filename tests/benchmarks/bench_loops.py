@@ -36,7 +36,7 @@ from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import ChainRelative, Places, places_of
 from graphslam.loops.witness import Witness
-from graphslam.registration.place_descriptor import describe, join, similarity
+from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
 from graphslam_frontends.grid.filter_drift import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
@@ -138,7 +138,9 @@ def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: ra
 def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> None:
     """Recall of descriptors at 1, 5, 10, 20, and precision of candidates."""
     begin = time.perf_counter()
-    D = join([describe(dense_view(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)])
+    D = concatenate_descriptors(
+        [describe_places(dense_view(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)]
+    )
     apart = np.linalg.norm(truth[:, None, :3] - truth[None, :, :3], axis=2)
     hits, visits = np.zeros(4), 0
     for j in range(len(places)):
@@ -146,7 +148,7 @@ def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> Non
         if not len(rows) or not np.any(apart[j, rows] < 3.0):
             continue
         visits += 1
-        order = rows[np.argsort(-similarity(D, j, D, rows)[0])]
+        order = rows[np.argsort(-descriptor_similarity(D, j, D, rows)[0])]
         hits += [np.any(apart[j, order[:k]] < 4.0) for k in (1, 5, 10, 20)]
     seconds = time.perf_counter() - begin
     recall = ", ".join(f"{h / max(visits, 1):.2f}" for h in hits)

@@ -14,7 +14,7 @@ from graphslam.refine.motion import MotionModel
 from graphslam.refine.problem import FEIGNED, Problem, alike, held, pair_noise, point_information, residuals
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import Association, Cloud, Surfaces
-from graphslam.registration.plane_kernels import Pairs
+from graphslam.registration.plane_kernels import PlanePairs
 from graphslam_frontends.odometry.lasting import LEAST
 
 EPS = 1e-6
@@ -67,7 +67,7 @@ def some_problem(rng, dim, pairs=40):
     poses = path_of(scans, rng)
     problem = Problem(motion, cloud, poses[0].copy())
     states = (0.01 * rng.standard_normal(len(motion.knots)), 0.01 * rng.standard_normal(motion.constants))
-    return problem, surfaces, Pairs(p, q, cloud.step[p], cloud.step[q]), poses, states
+    return problem, surfaces, PlanePairs(p, q, cloud.step[p], cloud.step[q]), poses, states
 
 
 def moved(problem, poses, states, column, by):
@@ -236,7 +236,7 @@ def drawn_pairs(rng, points, count):
     once = np.column_stack([c[p] ** 2 + c[q] ** 2, np.ones(count), none])
     spent = np.column_stack([mp * c[p] ** 2 + mq * c[q] ** 2, 0.5 * (mp + mq), none])
     steps = np.zeros(count, np.int64)
-    return Association(Pairs(p, q, steps, steps), steps, once, spent), c
+    return Association(PlanePairs(p, q, steps, steps), steps, once, spent), c
 
 
 def test_pairs_promise_no_more_than_their_shared_points_allow(rng):
@@ -284,7 +284,7 @@ def test_errors_that_points_of_a_scan_share_are_seen_in_sums_of_residuals(rng, s
     blocks = step[p] * 3 + (p % n) // 80
     r += shared * rng.standard_normal(3 * steps)[blocks]
     once = np.tile([0.0, 1.0, 0.0], (len(p), 1))
-    found = Association(Pairs(p, target, step[p], step[target]), np.zeros(len(p), np.int64), once, once)
+    found = Association(PlanePairs(p, target, step[p], step[target]), np.zeros(len(p), np.int64), once, once)
     variance = sigma**2 + shared**2
     size = np.bincount(blocks)
     wanted = 1.0 + np.sum(shared**2 * size * (size - 1.0)) / np.sum(variance * size) if shared else 1.0

@@ -24,8 +24,8 @@ import numpy as np
 from graphslam.core.findings import Finding, Level
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.registration.config import Gates, RegistrationConfig
-from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
+from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.target import Target
 from graphslam_frontends.odometry.recorded import chain
 from graphslam_frontends.odometry.steps import Steps
@@ -36,7 +36,7 @@ POINTS = 900
 """Points of a cloud that is matched, at most."""
 MATCHING = RegistrationConfig(
     radii=(1.0, 0.5), near=0.25, floor_sigma=0.01, floor_turn=0.003, max_shift=6.0, max_turn=1.6,
-    gates=Gates(
+    gates=RegistrationGates(
         fitness=0.55, fitness_alone=0.7, fitness_upright=0.45, degeneracy=1e-3, degeneracy_planar=1e-3, tilt=np.pi
     ),
 )  # fmt: skip
@@ -240,13 +240,13 @@ def _match(source: Target, target: Target, T: Array, matching: RegistrationConfi
                 y = xi.copy()
                 y[0 if group.dim == 2 else 3] = metres
                 ways.append(group.exp(y))
-            found = distinct([*found, *register_starts(source, target, ways, matching)])
+            found = distinct_registrations([*found, *register_starts(source, target, ways, matching)])
     else:
         found = register_starts(source, target, [T, scaled(0.0, 0.0)], matching, apart=(0.2, 0.05))
         if len(found) != 1:
             more = [scaled(*v) for v in ((1.0, 0.0), (1.0, -1.0), (-1.0, 1.0), (0.4, 1.0), (2.0, 1.0))]
             again = register_starts(source, target, more, matching, apart=(0.2, 0.05))
-            found = distinct([*found, *again], (0.2, 0.05))
+            found = distinct_registrations([*found, *again], (0.2, 0.05))
     return found[0] if found and found[0].accepted else None
 
 

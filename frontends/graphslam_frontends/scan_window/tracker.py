@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.registration.plane_kernels import Pairs, nothing_feigned, plane_blocks, plane_residuals
+from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import fit_places, rotations, thin_places
 from graphslam_frontends.grid.motion import tilted
 from graphslam_frontends.grid.weights import spread
@@ -259,7 +259,7 @@ class Tracker:
             if len(near) < c.least_points or overlap < c.least_overlap:
                 return Found(len(near), overlap, np.nan, 0.0, "overlap")
             n = len(near)
-            pairs = Pairs(source[near], q, np.full(n, self.NOW), slot)
+            pairs = PlanePairs(source[near], q, np.full(n, self.NOW), slot)
             r = np.empty(n)
             plane_residuals(pairs, self.R, self.t, self.points, self.normals, r)
             scatter = 1.4826 * float(np.median(np.abs(r)))
@@ -293,7 +293,7 @@ class Tracker:
         A = self.group.adjoint(self.group.between(self._seen_at, pose))
         return np.asarray(A.T @ self._lately @ A)
 
-    def _blocks(self, pairs: Pairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
+    def _blocks(self, pairs: PlanePairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
         """Information of the pose of now ``(w, w)``, with the slots ``(w, w·s)``, and ``Jᵀ Λ r`` ``(w,)``."""
         w, m = self.w, self.slots + 2
         H, g = np.zeros(2 * m * w * w), np.zeros((m, w))
@@ -302,7 +302,7 @@ class Tracker:
         begin = np.arange(m, dtype=np.int64) * w * w
         plane_blocks(
             pairs, (self.R, self.t), (self.points, self.normals), information,
-            (begin, m * w * w + begin[pairs.j], rank), nothing_feigned(self.group.dim), H, g,
+            (begin, m * w * w + begin[pairs.j], rank), no_noise_correction(self.group.dim), H, g,
         )  # fmt: skip
         blocks = H.reshape(2, m, w, w)
         return blocks[0, self.NOW], np.concatenate(list(blocks[1, slots]), axis=1), g[self.NOW]

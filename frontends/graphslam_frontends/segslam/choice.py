@@ -19,7 +19,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.registration import gates
 from graphslam.registration.config import RegistrationConfig
-from graphslam.registration.gates import height_between, match_fails, shift_between, tilt_between
+from graphslam.registration.gates import failed_match_gates, height_between, shift_between, tilt_between
 from graphslam.registration.register import Registration
 from graphslam_frontends.segslam.config import ChoiceConfig
 from graphslam_frontends.segslam.localisation import Localisation
@@ -169,8 +169,8 @@ def judge(
 
 def second_modes(proposals: Sequence[Proposal], apart: float) -> Array:
     """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``; see
-    :func:`graphslam.registration.gates.second_modes`."""
-    return gates.second_modes([p.registration for p in proposals], [p.segment for p in proposals], apart)
+    :func:`graphslam.registration.gates.match_margins`."""
+    return gates.match_margins([p.registration for p in proposals], [p.segment for p in proposals], apart)
 
 
 def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
@@ -183,7 +183,7 @@ def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
 
 
 def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
-    fails = match_fails(
+    fails = failed_match_gates(
         p.registration, p.T_prior, c, rules, sigma=p.sigma, margin=margin, rise=p.rise, T=p.T,
         ask_vague=p.localisation is None,
     )  # fmt: skip

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
-from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
@@ -265,7 +265,7 @@ class Matcher:
                     top = found[0].best_fitness if found else 0.0
                     near = [r.T_target_source for r in found if r.best_fitness >= top - self.config.choice.rivals]
                     alike.append((T, radius, near))
-                results[m] = distinct(results.get(m, []) + found)
+                results[m] = distinct_registrations(results.get(m, []) + found)
         return results, searches, registrations
 
     def _begin(self, segment: int) -> int:

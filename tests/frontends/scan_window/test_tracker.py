@@ -15,7 +15,7 @@ from graphslam.core.poses import SE2, SE3, compose_increments, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import matrix_to_quat
 from graphslam.core.trajectory import Trajectory
-from graphslam.registration.plane_kernels import Pairs, plane_residuals
+from graphslam.registration.plane_kernels import PlanePairs, plane_residuals
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 from graphslam_frontends.scan_window.exits import relative_covariance
@@ -120,7 +120,7 @@ def test_what_a_scan_says_of_two_poses(dim: int) -> None:
     t.points[source] = rng.normal(size=(40, dim))
     t._place(t.NOW, t.pose)
     slot = q // t.rows
-    pairs = Pairs(source, q, np.full(40, t.NOW), slot)
+    pairs = PlanePairs(source, q, np.full(40, t.NOW), slot)
     information, slots = rng.uniform(1.0, 2.0, size=40), np.unique(slot)
     poses = {t.NOW: t.pose} | {int(s): pose_of(t, int(s)) for s in slots}
 

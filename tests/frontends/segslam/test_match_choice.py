@@ -14,7 +14,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.poses import pose_mean, pose_scatter
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
-from graphslam.registration.config import Gates, RegistrationConfig
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.register import Registration
 from graphslam_frontends.segslam.choice import NULL, Proposal, judge, match_covariance, second_modes
 from graphslam_frontends.segslam.config import ChoiceConfig, LocalisationConfig
@@ -23,7 +23,7 @@ from graphslam_frontends.segslam.segmap import MATCH
 from graphslam_frontends.segslam.segmentation import Window
 
 C = ChoiceConfig()
-RULES = RegistrationConfig(gates=Gates(fitness=0.85, degeneracy=0.006, tilt=math.radians(4.0)))
+RULES = RegistrationConfig(gates=RegistrationGates(fitness=0.85, degeneracy=0.006, tilt=math.radians(4.0)))
 
 
 def result(x: float = 0.0, z: float = 0.0, fitness: float = 0.9, **rest: object) -> Registration:
@@ -115,7 +115,9 @@ def test_what_stands_upright_must_fit_too() -> None:
     j = judge(seen, C, RULES)
     assert j.accepted.tolist() == [0, 3]
     assert all("upright" in j.why[k] and j.why[k].count("upright") == 1 for k in (1, 2))
-    low = judge([proposal(fitness=0.8, fitness_upright=0.9)], C, RegistrationConfig(gates=Gates(fitness=0.5)))
+    low = judge(
+        [proposal(fitness=0.8, fitness_upright=0.9)], C, RegistrationConfig(gates=RegistrationGates(fitness=0.5))
+    )
     assert low.why == ("fitness 0.800 < 0.83",)
 
 
