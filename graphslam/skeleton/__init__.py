@@ -3,7 +3,7 @@
 from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
-    "preconditioner": "Levels",
+    "preconditioner": "PreconditionerLevels",
     "relax": "RelaxConfig",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -39,7 +39,7 @@ def count_blocks(landmark, first, ptr, pose, step, mark):
 
 
 @njit(nogil=True, error_model="numpy")
-def eliminate(sightings, poses, landmarks, order, table):
+def eliminate_landmarks(sightings, poses, landmarks, order, table):
     """Integrate every landmark out: ``Σ Jᵀ W J`` on the diagonal, less the pairs of its sightings, into ``table``.
 
     Parameters

@@ -8,12 +8,12 @@ import numpy as np
 import scipy.sparse.linalg as spla
 
 from graphslam.core.geometry import Array
-from graphslam.skeleton.preconditioner import KeyframeNetwork, levels_for
+from graphslam.skeleton.preconditioner import KeyframeNetwork, preconditioner_levels
 from graphslam.skeleton.schur import Network
 
 
 @dataclass(frozen=True)
-class SoftMode:
+class WeakMode:
     """How far one mode moves the poses when the objective rises by one unit of χ².
 
     Parameters
@@ -29,7 +29,7 @@ class SoftMode:
     pose: int
 
 
-def softest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork | None = None) -> list[SoftMode]:
+def weakest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork | None = None) -> list[WeakMode]:
     """The modes with the largest variance of position, softest first, by Lanczos on the factored keyframe network.
 
     The keyframes bend the path only as rigid motion between them allows, so the true modes are at least as soft: the
@@ -42,7 +42,7 @@ def softest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork |
     """
     if keyframes is None:
         poses = network.layout.problem.poses
-        k = levels_for(poses).factored or max(1, poses // 40)
+        k = preconditioner_levels(poses).factored or max(1, poses // 40)
         keyframes = KeyframeNetwork(network, k)
     n = keyframes.frames
 
@@ -60,5 +60,5 @@ def softest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork |
         move = np.linalg.norm(vector[:, i].reshape(n, 3), axis=1) * np.sqrt(value[i])
         at = int(np.argmax(move))
         pose = min(at * keyframes.k, len(network.poses.position) - 1)
-        modes.append(SoftMode(float(np.sqrt(np.mean(move**2))), float(move[at]), pose))
+        modes.append(WeakMode(float(np.sqrt(np.mean(move**2))), float(move[at]), pose))
     return modes

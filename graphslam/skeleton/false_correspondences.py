@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.stats import chi2
 
 from graphslam.core.geometry import Array
-from graphslam.skeleton import landmark_kernels, union_kernels
+from graphslam.skeleton import correspondence_kernels, landmark_kernels
 from graphslam.skeleton.collapse import number_by_first_sighting
 from graphslam.skeleton.schur import Network
 
@@ -23,7 +23,7 @@ def landmark_chi2(network: Network) -> Array:
     parts = [np.zeros(r) for r in layout.reach]
     counts = [np.zeros(r, np.int32) for r in layout.reach]
     layout.workers.over(
-        lambda k: landmark_kernels.landmark_chi2(
+        lambda k: landmark_kernels.landmark_chi2_kernel(
             layout.problem.sightings, network.poses, network.landmarks, *layout.ranges[k], parts[k], counts[k]
         ),
         [(k,) for k in range(len(parts))],
@@ -34,7 +34,7 @@ def landmark_chi2(network: Network) -> Array:
     return out
 
 
-def split_wrong_unions(network: Network, false_alarm: float = 1e-10, gap: int = 20) -> tuple[Labels, int]:
+def split_false_correspondences(network: Network, false_alarm: float = 1e-10, gap: int = 20) -> tuple[Labels, int]:
     """Give every pass of a landmark whose χ² is impossible a landmark of its own; two, if it sees two things at once.
 
     The poses may still be wrong, which raises the χ² of all: it is compared in units of the median over the landmarks
@@ -59,7 +59,7 @@ def split_wrong_unions(network: Network, false_alarm: float = 1e-10, gap: int = 
     problem, counts = network.layout.problem, network.layout.counts
     L = problem.landmarks
     passes = np.zeros(L, np.int32)
-    union_kernels.count_passes(problem.landmark, problem.first, gap, np.full(L, -1, np.int32), passes)
+    correspondence_kernels.count_passes(problem.landmark, problem.first, gap, np.full(L, -1, np.int32), passes)
     several = np.flatnonzero(passes > 1)
     if not len(several):
         return problem.landmark, 0
@@ -72,10 +72,10 @@ def split_wrong_unions(network: Network, false_alarm: float = 1e-10, gap: int = 
     ratio[ratio < 1.0] = 0.0
     if not ratio.any():
         return problem.landmark, 0
-    union_kernels.worst_in_view(problem.landmark, problem.first, ratio, worst)
+    correspondence_kernels.worst_in_view(problem.landmark, problem.first, ratio, worst)
     wrong = np.flatnonzero((ratio > _AMONG * worst) & (ratio > _OF_ALL * ratio.max()))
     bad = np.zeros(L, np.bool_)
     bad[wrong] = True
     landmark = problem.landmark.copy()
-    union_kernels.split_labels(problem.sightings, network.poses, bad, (gap, 16.27), landmark, L)
+    correspondence_kernels.split_labels(problem.sightings, network.poses, bad, (gap, 16.27), landmark, L)
     return number_by_first_sighting(landmark)[0], len(wrong)

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton import coarse_kernels
-from graphslam.skeleton import thinning_kernels as kernels
+from graphslam.skeleton import reduction_kernels as kernels
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.schur import Network
 
@@ -31,7 +31,7 @@ def blocks_per_pose(problem: SkeletonProblem, samples: int = 2_000, order: _ORDE
     return float(count) / len(range(0, problem.poses, step))
 
 
-class ThinnedNetwork:
+class ReducedNetwork:
     """Schur complement of all landmarks as blocks.
 
     Parameters
@@ -51,9 +51,11 @@ class ThinnedNetwork:
                 f"the thinned network of {N} poses has {per_pose:.0f} blocks a pose: about {bytes_ / 1e9:.1f} GB; "
                 f"wanted at most {limit / 1e9:.1f} GB. The method 'gn' applies the same matrix without forming it"
             )
-        table = coarse_kernels.make_table(int(1.3 * N * (per_pose + 2)) + 64)
-        kernels.eliminate(problem.sightings, network.poses, (network.landmarks, network.inverse), order, table)
-        keys = coarse_kernels.keys_of(table)
+        table = coarse_kernels.make_block_table(int(1.3 * N * (per_pose + 2)) + 64)
+        kernels.eliminate_landmarks(
+            problem.sightings, network.poses, (network.landmarks, network.inverse), order, table
+        )
+        keys = coarse_kernels.sorted_block_keys(table)
         blocks = table.block[: len(keys)]
         diagonal, upper = network.chain_blocks()
         i = np.arange(N, dtype=np.int64)
