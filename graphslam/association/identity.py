@@ -25,7 +25,7 @@ from graphslam.graph.submap_model import submap_jacobians, submap_residual
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class AssociationOutlier:
     """A sighting whose identity contradicts the map.
 
     Parameters
@@ -88,7 +88,7 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
     return out
 
 
-def doubtful_identities(graph: GraphRecord, gate: float) -> list[Doubt]:
+def find_association_outliers(graph: GraphRecord, gate: float) -> list[AssociationOutlier]:
     """Sightings beyond ``gate``, the worst first.
 
     One wrong sighting makes others look wrong, too: split off the worst alone, solve again, and ask again.
@@ -98,5 +98,7 @@ def doubtful_identities(graph: GraphRecord, gate: float) -> list[Doubt]:
         if isinstance(record, SubmapRecord):
             T = identity_statistics(graph, record)
             beyond = np.flatnonzero(np.nan_to_num(T) > gate)
-            found += [Doubt(record.factor_id, int(k), int(record.landmark_ids[k]), float(T[k])) for k in beyond]
+            found += [
+                AssociationOutlier(record.factor_id, int(k), int(record.landmark_ids[k]), float(T[k])) for k in beyond
+            ]
     return sorted(found, key=lambda d: -d.statistic)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.association.identity import doubtful_identities
-from graphslam.association.landmarks import AssociationConfig, associate
+from graphslam.association.identity import find_association_outliers
+from graphslam.association.landmarks import AssociationConfig, associate_landmarks
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
@@ -157,7 +157,7 @@ class BackEnd:
         c = self.config
         ids = None
         if c.associate and submap.landmarks is not None:
-            ids = associate(self.graph, self.graph.as_known(submap), self._association)
+            ids = associate_landmarks(self.graph, self.graph.as_known(submap), self._association)
         associated = time.perf_counter()
         dense = submap.landmarks is None
         self.graph.add_submap(
@@ -317,7 +317,7 @@ class BackEnd:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""
         split = 0
         while self.config.identity_gate > 0 and split < 10 * len(self.graph.submaps):
-            doubts = doubtful_identities(self.graph, self.config.identity_gate)
+            doubts = find_association_outliers(self.graph, self.config.identity_gate)
             if not doubts:
                 break
             self.graph.split_landmark(doubts[0].factor_id, doubts[0].entry)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.association.consistent_set import Chain
+from graphslam.association.consistent_set import OdometryChain
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.gaussian import information_matrices
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
@@ -138,7 +138,7 @@ class TucLog:
         length = np.append(np.diff(self.times), np.median(np.diff(self.times)))[record]
         Q = np.zeros((len(dt), 3, 3))
         Q[:, [0, 1, 2], [0, 1, 2]] = self.variances[record] * (dt * length)[:, None]
-        fine = Chain.of(se2_exp(self.velocities[record] * dt[:, None]), Q)
+        fine = OdometryChain.of(se2_exp(self.velocities[record] * dt[:, None]), Q)
         at = np.searchsorted(t, stamps)
         poses, spread = fine.poses[at], fine.spread[at]
         home = se2_adjoint(se2_inverse(poses[1:]))

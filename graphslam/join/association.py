@@ -16,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from graphslam.association.compatibility import distance2, joint_limits, most_pairings, nearest, search
+from graphslam.association.compatibility import (
+    joint_limits,
+    mahalanobis2,
+    most_pairings,
+    nearest_neighbour_pairs,
+    search_compatible_sets,
+)
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
@@ -198,11 +204,11 @@ class CandidatePairs:
 
     def mahalanobis2(self) -> Array:
         """Squared distance of every pair by itself ``(p,)``."""
-        return distance2(self.innovation, self.covariances())
+        return mahalanobis2(self.innovation, self.covariances())
 
     def nearest(self) -> Index:
         """Exclusive nearest neighbours: the smallest Mahalanobis distance of all is taken first, and so on."""
-        return nearest(self.mahalanobis2(), self.i, self.j)
+        return nearest_neighbour_pairs(self.mahalanobis2(), self.i, self.j)
 
     def joint(self, confidence: float, starts: int) -> Index:
         """Largest jointly compatible set that a search from ``starts`` pairs finds.
@@ -226,7 +232,7 @@ class CandidatePairs:
             few = self.subset(np.sort(best_first[:_MOST_PAIRS]))
             return np.sort(best_first[:_MOST_PAIRS])[few.joint(confidence, starts)]
         limits = joint_limits(confidence, most_pairings(self.i, self.j))
-        found = search(
+        found = search_compatible_sets(
             self.i, self.j, self.innovation, self.joint_covariance(), best_first[:starts], limits[1], limits,
             persistent=True,
         )  # fmt: skip

@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from graphslam.association.consistent_set import Chain, ConsistentSet, LoopArrays, chain_chi2, consistent_loops
+from graphslam.association.consistent_set import ConsistentSet, LoopArrays, OdometryChain, chain_chi2, consistent_loops
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
@@ -445,7 +445,7 @@ class LoopCloser:
         return ends, np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
 
     def _against_chain(self, numbers: list[int]) -> list[float]:
-        chain = Chain.of(self.increments, self.covariances)
+        chain = OdometryChain.of(self.increments, self.covariances)
         return [float(v) for v in chain_chi2(chain, LoopArrays.of(chain, *self._arrays(numbers)))]
 
     def _consistent(self, numbers: list[int]) -> ConsistentSet:

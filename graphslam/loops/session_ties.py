@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from graphslam.association.consistent_set import Chain, LoopArrays, largest_consistent_set, pair_chi2
+from graphslam.association.consistent_set import LoopArrays, OdometryChain, largest_consistent_set, pair_chi2
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
@@ -206,7 +206,7 @@ class TwoSessions:
         bridge, d = group_of(a.T_base_node).identity[None], known.covariances.shape[1]
         joined = np.ones(self.offset + len(new.increments), dtype=np.bool_)
         joined[self.offset - 1] = False  # what lies between the sessions is not known
-        self.chain = Chain.of(
+        self.chain = OdometryChain.of(
             np.concatenate([known.increments, bridge, new.increments]),
             np.concatenate([known.covariances, np.eye(d)[None], new.covariances]),
             joined,

@@ -21,7 +21,7 @@ from graphslam.app.sessions.merge_align import By, align_runs, of_session
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
 from graphslam.app.sessions.merge_metrics import merge_metrics
 from graphslam.app.sessions.merged_map import MergedMap, Session
-from graphslam.association.identity import doubtful_identities
+from graphslam.association.identity import find_association_outliers
 from graphslam.association.merging import mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
@@ -174,7 +174,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
             fused += len(pairs)
             solver.solve_to_optimum()
     split = 0
-    while gate > 0 and split < 10 * next_key and (doubts := doubtful_identities(graph, gate)):
+    while gate > 0 and split < 10 * next_key and (doubts := find_association_outliers(graph, gate)):
         graph.split_landmark(doubts[0].factor_id, doubts[0].entry)
         solver.solve_to_optimum()
         split += 1
