@@ -17,8 +17,8 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
 from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
-from graphslam.join.association import Association
-from graphslam.join.registry import Material, association_of, identify, methods_for, prepared
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.registry import Material, association_of, identify_landmarks, methods_for, prepare_submaps
 from graphslam.join.submap_solver import SubmapEstimate
 
 logger = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ def compare(
     *,
     truth: MapTruth | None = None,
     polish: bool = True,
-    associate: str | Association = "given",
+    associate: str | MapAssociationConfig = "given",
     covariance_scale: float = 1.0,
     memory: bool = True,
     progress: bool = False,
@@ -156,13 +156,13 @@ def compare(
         time, polish included; ``nnz`` the stored entries of the information matrix (of the dense covariance for an
         unpolished EKF).
     """
-    submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
+    submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     way = methods_for(submaps)
     for m in methods:
         way.check(m)
     association = association_of(associate)
     if association is not None and isinstance(submaps, Sequence):
-        submaps = identify(submaps, association, progress=progress)
+        submaps = identify_landmarks(submaps, association, progress=progress)
         # Recognised landmarks have names of their own; only the poses can be held against the truth.
         truth = None if truth is None else _poses_only(truth)
     keys = keys_of(submaps)

@@ -22,7 +22,7 @@ from graphslam.io.catalog import load
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import read_truth
 from graphslam.join.pose_problem import PoseProblem
-from graphslam.join.registry import Material, is_dense
+from graphslam.join.registry import Material, are_dense
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def submap_source(
         return source
     if isinstance(source, PoseProblem):
         return SubmapSource([], problem=source)
-    if isinstance(source, Run) and is_dense(source.submaps):
+    if isinstance(source, Run) and are_dense(source.submaps):
         if source.holds("graph"):
             return SubmapSource(list(source.submaps), poses_only(source.truth), problem=problem_of_run(source))
         if source.folder is not None:
@@ -101,7 +101,7 @@ def submap_source(
 
         def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap], PoseProblem | None]:
             submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
-            tied = is_dense(submaps) and (files / "graph.g2o").is_file()
+            tied = are_dense(submaps) and (files / "graph.g2o").is_file()
             problem = problem_of_folder(root, files, submaps) if tied else None
             return *_run_facts(root), read_truth(files), submaps, problem
 

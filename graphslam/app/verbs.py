@@ -296,7 +296,7 @@ def join_submaps(
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
     **options
-        See :func:`graphslam.join.registry.join`.
+        See :func:`graphslam.join.registry.join_by_method`.
 
     Returns
     -------
@@ -322,7 +322,7 @@ def join_submaps(
     s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
-        return joining.join(s.material, method, polish=polish, **options)
+        return joining.join_by_method(s.material, method, polish=polish, **options)
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:

@@ -26,7 +26,7 @@ from graphslam.association.compatibility import (
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
-from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
+from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scalars
 
 logger = logging.getLogger(__name__)
 Index = npt.NDArray[np.intp]
@@ -37,7 +37,7 @@ _MOST_PAIRS = 2_000
 
 
 @dataclass(frozen=True)
-class Association:
+class MapAssociationConfig:
     """How landmarks are recognised.
 
     Parameters
@@ -73,7 +73,7 @@ class Association:
             raise ConfigError(f"association confidence is {self.confidence}; wanted 0 < p < 1")
 
 
-def associate(a: MapView, b: MapView, options: Association) -> Index:
+def match_landmarks(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> Index:
     """Match the landmarks of B, which starts where A ends, to those of A.
 
     Returns
@@ -100,7 +100,7 @@ def associate(a: MapView, b: MapView, options: Association) -> Index:
     return match
 
 
-def _candidate_pairs(a: MapView, b: MapView, options: Association) -> tuple[Index, Index]:
+def _candidate_pairs(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> tuple[Index, Index]:
     """Pairs (landmark of B, landmark of A) that geometry allows: Algorithm 1, TH1 and TH2."""
     none = np.zeros(0, dtype=np.intp)
     if len(a.landmark_at) == 0 or len(b.landmark_at) == 0:

@@ -50,7 +50,8 @@ def join_blocks(
     rounding : float
         Innovations smaller than this, relative to 1 + the value, are arithmetic and count as zero.
     pull : (n_b,)
-        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`pulled_back`), less its sign.
+        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`relinearise_in_chart`), less its
+        sign.
 
     Returns
     -------
@@ -236,7 +237,7 @@ def join_blocks(
 
 
 @njit
-def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
+def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
     """``H(X)``: the nodes of map B ``(n_b,)`` as seen from node ``start`` of the joined map at its ``values`` ``(n,)``.
 
     Values end where those of A do on the first call; what is new is then where B has it.
@@ -270,7 +271,7 @@ def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: 
 
 
 @njit
-def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
+def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
     """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
 
     With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
@@ -425,7 +426,9 @@ def cut_into_blocks(A: Array, width: Index) -> Array:
 
 
 @njit
-def both_ways(width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array) -> tuple[Index, Array]:
+def symmetrise_blocks(
+    width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array
+) -> tuple[Index, Array]:
     """Blocks that are stored once for each pair (``flip`` = 1: with the neighbour's rows) as blocks stored both ways.
 
     Returns

@@ -68,12 +68,12 @@ class PoseEstimate(JoinResult):
         return self.width * (k - 1) + np.arange(self.width)
 
 
-def tilt_of(up: Array | None) -> Array | None:
+def up_direction(up: Array | None) -> Array | None:
     """Where up is in the frame of the base, of a level frame seen from there."""
     return None if up is None else level_step(SE3.identity, up)
 
 
-def estimate(
+def evaluate_map(
     problem: PoseProblem,
     poses: Array,
     tilt: Array | None,
@@ -108,13 +108,13 @@ def estimate(
 
 def estimate_of_map(problem: PoseProblem, found: PoseMap, *, method: str, times: JoinTimes) -> PoseEstimate:
     """A joined map in information form."""
-    return estimate(
-        problem, found.poses, tilt_of(found.up), method=method, seconds=times.wall, times=times,
+    return evaluate_map(
+        problem, found.poses, up_direction(found.up), method=method, seconds=times.wall, times=times,
         information=found.matrix(),
     )  # fmt: skip
 
 
-def polish_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
+def optimise_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
     """Linearise all measurements afresh at the joined map, again and again, until the objective is at its minimum.
 
     Returns

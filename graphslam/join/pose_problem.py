@@ -55,7 +55,7 @@ PROBLEM = {
 
 
 @dataclass(frozen=True, eq=False)
-class Ties:
+class RelativePoseFactors:
     """Measurements between nodes, and of gravity at nodes.
 
     Parameters
@@ -83,10 +83,10 @@ class Ties:
     def __len__(self) -> int:
         return len(self.ends) + len(self.level_nodes)
 
-    def take(self, edges: npt.ArrayLike, levels: npt.ArrayLike, first: int = 0) -> Ties:
+    def take(self, edges: npt.ArrayLike, levels: npt.ArrayLike, first: int = 0) -> RelativePoseFactors:
         """Some of them, with nodes counted from ``first``."""
         e, k = np.asarray(edges), np.asarray(levels)
-        return Ties(
+        return RelativePoseFactors(
             self.ends[e] - first, self.measured[e], self.whiteners[e],
             self.level_nodes[k] - first, self.directions[k], self.level_whiteners[k],
         )  # fmt: skip
@@ -118,7 +118,7 @@ class Ties:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseProblem(Ties):
+class PoseProblem(RelativePoseFactors):
     """Submaps in a chain, as nodes and ties between them; node 0 is the base of the first and is held.
 
     Parameters

@@ -369,7 +369,7 @@ def join_space_ekf(submaps: Sequence[Submap], *, progress: bool = False) -> Spac
     )  # fmt: skip
 
 
-def polish_space(submaps: Sequence[Submap], joined: SpaceEstimate) -> SpaceEstimate:
+def optimise_space(submaps: Sequence[Submap], joined: SpaceEstimate) -> SpaceEstimate:
     """Go on from a joined map to the least-squares optimum of its submaps; ``objective`` stays that of the joiner."""
     start, cpu = time.perf_counter(), time.process_time()
     problem = SpaceProblem.of(submaps)

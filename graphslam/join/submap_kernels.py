@@ -130,7 +130,9 @@ def entry_slots(
 
 
 @njit
-def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array) -> None:
+def predict_submaps(
+    poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array
+) -> None:
     """Residual ``H(X) - z`` of all submaps, one after the other in the order of their means (eq. 15)."""
     at = 0
     for k in range(m):
@@ -154,7 +156,7 @@ def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: I
 
 
 @njit
-def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
+def chart_residuals(row_ptr: Index, group: Flags, r: Array) -> None:
     """Differences ``H(X) - z`` of all submaps, in the group chart where ``group`` ``(m,)``; in place."""
     for k in range(len(row_ptr) - 1):
         if not group[k]:
@@ -168,7 +170,7 @@ def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
 
 
 @njit
-def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
+def submap_chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
     """``rᵀ Ω r`` of every submap."""
     for k in range(len(row_ptr) - 1):
         n, a = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
@@ -182,7 +184,7 @@ def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -
         out[k] = total
 
 
-class SubmapArrays(NamedTuple):
+class SubmapChainArrays(NamedTuple):
     """Submaps one after the other."""
 
     entry_ptr: Index
@@ -199,7 +201,7 @@ class SubmapArrays(NamedTuple):
     """(m,): in the group chart."""
 
 
-class Slots(NamedTuple):
+class SystemSlots(NamedTuple):
     """Where nodes and pairs stand in the system."""
 
     node_at: Index
@@ -210,7 +212,9 @@ class Slots(NamedTuple):
 
 
 @njit
-def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Array, value: Array) -> float:
+def linearise_submaps(
+    poses: Array, submaps: SubmapChainArrays, where: SystemSlots, r: Array, g: Array, value: Array
+) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
     A position is measured through ``V(d)⁻¹ Rᵀ``, d being the residual of the end heading (V = I in a Cartesian chart),

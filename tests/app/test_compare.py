@@ -22,8 +22,8 @@ from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.map_truth import MapTruth
-from graphslam.join.association import Association
-from graphslam.join.registry import join
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.registry import join_by_method
 from graphslam.plots.comparison import AFTER, BEFORE, comparison_figure
 from tests.reference.submap_chain import submap_chain
 
@@ -54,7 +54,7 @@ def test_json_is_what_the_command_line_promises(rng: np.random.Generator) -> Non
     assert rows[0]["objective_polished"] is None
     assert rows[1]["objective_polished"] == rows[1]["objective"]
     assert rows[0]["nees"] is rows[0]["nees_dof"] is rows[0]["ci"] is rows[0]["peak_mb"] is None
-    one = join_json(submaps, "ekf", join(submaps, "ekf"), truth=truth)["methods"][0]
+    one = join_json(submaps, "ekf", join_by_method(submaps, "ekf"), truth=truth)["methods"][0]
     assert tuple(one) == (*JSON_COLUMNS, "before", "after")
     assert isinstance(one["nees_dof"], int)
 
@@ -88,7 +88,7 @@ def test_figures_before_and_after_refinement_stand_side_by_side(rng: np.random.G
 
 def test_nees_is_eq_18(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng)
-    best = join(submaps, "batch")
+    best = join_by_method(submaps, "batch")
     at = {int(j): p for j, p in zip(truth.landmark_ids, truth.landmarks)}
     e = best.poses[1:] - truth.exit_poses
     e[:, 2] = wrap_angle(e[:, 2])
@@ -116,20 +116,20 @@ def test_nees_is_eq_18(rng: np.random.Generator) -> None:
 def test_association_gives_all_methods_the_same_landmarks(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng, submaps=14, landmarks=50)
     lost = [s.with_ids(np.full(len(s.landmarks), -1)) for s in submaps]
-    options = Association(rule="joint", sensor_range=14.0)
+    options = MapAssociationConfig(rule="joint", sensor_range=14.0)
     table = compare(lost, ["batch", "eif-tree"], truth=truth, associate=options, memory=False)
     assert table["landmarks"].nunique() == 1
     np.testing.assert_allclose(table["objective_polished"], table["objective_polished"][0], rtol=1e-8)
     assert (table["nees_dof"] == 3 * 14).all()  # recognised landmarks have no names the truth knows
     assert 0.2 < table["nees"][0] / 42 < 3.0
     with pytest.raises(DataError, match="identity"):
-        join(lost, "eif-tree")
+        join_by_method(lost, "eif-tree")
 
 
 def test_covariance_scale_reaches_every_method(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=6)
     for method in DEFAULT_METHODS:
-        plain, wide = join(submaps, method), join(submaps, method, covariance_scale=4.0)
+        plain, wide = join_by_method(submaps, method), join_by_method(submaps, method, covariance_scale=4.0)
         if method in ("batch", "ekf"):
             assert wide.objective == pytest.approx(plain.objective / 4.0, rel=1e-2)
         P, Q = plain.pose_covariance(6), wide.pose_covariance(6)
@@ -139,11 +139,11 @@ def test_covariance_scale_reaches_every_method(rng: np.random.Generator) -> None
 def test_unknown_names_are_refused_with_those_known(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=2)
     with pytest.raises(UnknownNameError, match=r"'eif'.*eif-sequential"):
-        join(submaps, "eif")
+        join_by_method(submaps, "eif")
     with pytest.raises(UnknownNameError, match="'magic'"):
         compare(submaps, ["batch", "magic"])
     with pytest.raises(ConfigError, match="association"):
-        join(submaps, "eif-tree", associate="guess")
+        join_by_method(submaps, "eif-tree", associate="guess")
     with pytest.raises(DataError, match="no submaps"):
         compare([], ["batch"], memory=False)
 
@@ -151,7 +151,7 @@ def test_unknown_names_are_refused_with_those_known(rng: np.random.Generator) ->
 def test_peak_memory_grows_with_what_is_joined(rng: np.random.Generator) -> None:
     """The dense filter's covariance must show: at 1,500 scalars it is 18 MB, and its work space as much again."""
     submaps, _ = submap_chain(rng, submaps=40, landmarks=700, radius=100.0, reach=14.0)
-    states = join(submaps, "eif-tree").states
+    states = join_by_method(submaps, "eif-tree").states
     assert states > 1400
     with MemoryProbe(submaps) as probe:
         (dense,) = probe.measure(["ekf"], polish=False)

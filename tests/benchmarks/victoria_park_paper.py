@@ -34,11 +34,11 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.gps import gps_residuals
 from graphslam.evaluate.reckoning import dead_reckoning
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
 from graphslam.plots.save import save
@@ -243,7 +243,7 @@ def _join(
     *,
     polished: bool,
 ) -> None:
-    association = Association(rule=rule)
+    association = MapAssociationConfig(rule=rule)
     clock = Clock()
     if join is join_tree:  # all at once: what the tree of the first k costs, built afresh
         joined = join(submaps, association=association)
@@ -262,7 +262,7 @@ def _join(
     out.add(f"{name}, with local maps", {}, (along[0], along[1] + spent[along[0]]))
     out.keep(name, path, joined.landmarks)
     if polished:
-        best = polish(submaps, joined)
+        best = optimise_from_join(submaps, joined)
         assert best.objective_polished is not None
         seconds = {"seconds_join": sum(best.times.values()), "seconds_local": spent[-1]}
         fit = best.objective_polished / dof if best.converged else np.nan
@@ -323,7 +323,7 @@ def levels(log: SensorLog, judge: Judge) -> None:
         blocks = [submaps[k : k + size] for k in range(0, len(submaps), size)]
         mixed = {}
         for rule in ("nearest", "joint"):
-            joined = [join_tree(b, association=Association(rule=rule)) for b in blocks]  # type: ignore[arg-type]
+            joined = [join_tree(b, association=MapAssociationConfig(rule=rule)) for b in blocks]  # type: ignore[arg-type]
             found = [
                 pair_agreement(judge.labels(b, j.submap_ids), judge.reference).mixed for b, j in zip(blocks, joined)
             ]

@@ -51,12 +51,12 @@ def join(
     from graphslam.app.submap_sources import submap_source
     from graphslam.core.trajectory import Trajectory
     from graphslam.io.joined_map import write_joined
-    from graphslam.join.registry import join as join_by
-    from graphslam.join.registry import methods_for, prepared
+    from graphslam.join.registry import join_by_method as join_by
+    from graphslam.join.registry import methods_for, prepare_submaps
 
     s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
-    material = prepared(s.material, associate=associate, covariance_scale=factor)
+    material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
     way = methods_for(material)
     filters = method in way.joiners
     estimate = own = join_by(

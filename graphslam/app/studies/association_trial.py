@@ -26,10 +26,10 @@ from graphslam.evaluate.association import AssociationErrors, association_errors
 from graphslam.evaluate.consistency import nees, vector_pose_error
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential
-from graphslam.join.polish import polish
 
 Ints = npt.NDArray[np.int64]
 Options = Mapping[str, Any]
@@ -137,8 +137,8 @@ class Trial:
 
     def join(self, submaps: list[Submap], *, known: bool = False) -> JoinResult:
         """Joined in sequence by joint compatibility (or by the ids they bear), and polished."""
-        rule = None if known else Association(rule="joint", sensor_range=float(self.observations.max_range))
-        return polish(submaps, join_sequential(submaps, association=rule))
+        rule = None if known else MapAssociationConfig(rule="joint", sensor_range=float(self.observations.max_range))
+        return optimise_from_join(submaps, join_sequential(submaps, association=rule))
 
     # ---------------------------------------------------------------- figures
 

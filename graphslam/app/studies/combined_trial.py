@@ -27,8 +27,8 @@ from graphslam.evaluate.montecarlo import Measurement
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.solve.network.full_batch import full_batch
@@ -177,7 +177,7 @@ class _Trial:
         if {"ekf", classical} <= set(done):
             difference = np.abs(done["ekf"].vector - done[classical].vector)
             yield Measurement(f"{family}-ekf", "difference_to_eif", float(difference.max()))
-        polished = polish(submaps, done["eif-tree"])
+        polished = optimise_from_join(submaps, done["eif-tree"])
         name = f"{family}-eif+polish"
         yield from self.judge.estimate(name, polished)
         yield from timed(name, {"polish": polished.times["polish"]})
@@ -190,7 +190,7 @@ class _Trial:
         yield Measurement("default-batch", "objective_optimum", best.objective)
         yield Measurement("default-batch", "objective_dof", float(_degrees_of_freedom(submaps, best)))
         for kind, join in (("sequence", join_sequential), ("ekf", join_ekf)):
-            polished = polish(submaps, join(submaps))
+            polished = optimise_from_join(submaps, join(submaps))
             yield Measurement(f"default-{kind}+polish", "objective_optimum", _optimum(polished))
             yield Measurement(f"default-{kind}+polish", "polish_iterations", float(polished.iterations))
         isam = solve_submaps_isam2(submaps)

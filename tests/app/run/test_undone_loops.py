@@ -18,7 +18,7 @@ from graphslam.app.run.run import Run
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -59,7 +59,7 @@ def check_that_joiners_find_the_graph(whole: Run, folder: Path) -> None:
     problem = sources["folder"].problem
     assert problem.levelled
     assert problem.dof == whole.graph.objective().dof
-    found = join(problem, "eif-tree", polish=True)
+    found = join_by_method(problem, "eif-tree", polish=True)
     np.testing.assert_allclose(found.poses, whole.map.node_poses, atol=1e-5)
     P = np.stack([found.pose_covariance(int(k)) for k in problem.bases[1:]])
     np.testing.assert_allclose(P, whole.map.node_covariances[problem.bases[1:]], atol=1e-4 * np.abs(P).max())
