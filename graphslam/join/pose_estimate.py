@@ -16,7 +16,7 @@ from graphslam.graph.variables import Values
 from graphslam.join.joined_map import JoinResult, JoinTimes
 from graphslam.join.pose_map import PoseMap, level_step
 from graphslam.join.pose_problem import PoseProblem
-from graphslam.solve.batch import LevenbergConfig, optimise
+from graphslam.solve.batch import LevenbergConfig, optimise_problem
 from graphslam.solve.sparse import SparseProblem
 
 Index = npt.NDArray[np.int64]
@@ -123,7 +123,7 @@ def optimise_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
         Poses and information of the optimum; ``objective`` stays that of the joined map.
     """
     start, cpu = time.perf_counter(), time.process_time()
-    best = optimise(SparseProblem(problem.flat), problem.values(joined.poses, joined.tilt), POLISH)
+    best = optimise_problem(SparseProblem(problem.flat), problem.values(joined.poses, joined.tilt), POLISH)
     values: Values = best.values
     system = problem.flat.evaluate(values, dense=False)
     cpu = time.process_time() - cpu

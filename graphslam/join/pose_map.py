@@ -31,7 +31,7 @@ from graphslam.join.joined_map import JoinTimes
 from graphslam.join.pose_problem import PoseProblem, RelativePoseFactors
 from graphslam.linear.block_cholesky import BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
-from graphslam.solve.batch import optimise
+from graphslam.solve.batch import optimise_problem
 from graphslam.solve.sparse import SparseProblem
 
 Index = npt.NDArray[np.int64]
@@ -135,7 +135,7 @@ class PoseMap:
         """One submap, at its own optimum."""
         poses, up = part.start, None
         if part.levelled or len(part.ends) >= len(part.times):
-            best = optimise(SparseProblem(part.flat), part.values(poses, _first_tilt(part))).values
+            best = optimise_problem(SparseProblem(part.flat), part.values(poses, _first_tilt(part))).values
             poses = best.poses
             up = None if best.tilt is None else _frame(so3_exp(np.append(best.tilt, 0.0)))
         d = part.group.dof

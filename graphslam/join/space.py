@@ -395,11 +395,11 @@ def solve_space(submaps: Sequence[Submap], *, polish: bool = True, progress: boo
 
 def solve_space_isam2(submaps: Sequence[Submap], *, polish: bool = True, progress: bool = False) -> SpaceEstimate:
     """Landmark submaps in space through iSAM2, one by one, then to the optimum where it is asked for."""
-    from graphslam.solve.space_isam2 import incremental
+    from graphslam.solve.space_isam2 import run_space_isam2
 
     start = time.perf_counter()
     problem = SpaceProblem.of(submaps)
-    poses, points, updates = incremental(problem.placed, *problem.chain(), progress=progress)
+    poses, points, updates = run_space_isam2(problem.placed, *problem.chain(), progress=progress)
     own = space_objective(problem.placed, poses, points)
     best = minimise_space_maps(problem.placed, poses, points, max_iterations=60 if polish else 0)
     found = problem.result(

@@ -15,7 +15,7 @@ from graphslam.graph.factors.space_map import gtsam_pose, pose_of, space_factor
 from graphslam.linear.space_maps import PlacedMap
 
 
-def incremental(
+def run_space_isam2(
     placed: Sequence[PlacedMap], poses: Array, points: Array, *, progress: bool = False
 ) -> tuple[Array, Array, int]:
     """Values of iSAM2 after the last submap, and the number of its updates.

@@ -36,7 +36,7 @@ DENSE_SOLVE_LIMIT = 600
 SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
-def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
+def factorise_sparse(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
     """Sparse symmetric factorisation; ``ordered``: rows and columns are in a good order of elimination already."""
     return spla.splu(
         sp.csc_matrix(H),
@@ -134,7 +134,7 @@ class SparseProblem:
         if self._dense:
             return _dense_solve(H, b)
         try:
-            lu = self._blocks(H) if self._by_block else factor(H, ordered=self.flat.layout.ordered)
+            lu = self._blocks(H) if self._by_block else factorise_sparse(H, ordered=self.flat.layout.ordered)
         except RuntimeError:
             raise IndeterminateError(SINGULAR) from None
         x = lu.solve(b)
@@ -266,13 +266,15 @@ class PcgProblem(SparseProblem):
         """``H⁻¹ b`` by preconditioned conjugate gradients."""
         entries = H.tocoo()
         inside = self._owner[entries.row] == self._owner[entries.col]
-        fine = factor(sp.csc_matrix((entries.data[inside], (entries.row[inside], entries.col[inside])), shape=H.shape))
+        fine = factorise_sparse(
+            sp.csc_matrix((entries.data[inside], (entries.row[inside], entries.col[inside])), shape=H.shape)
+        )
         Z = self._rigid_motions(values)
         HZ = sp.csc_matrix(H @ Z)
         E = sp.csc_matrix(Z.T @ HZ)
         # a group that holds only an anchor moves nothing: give it a unit of its own
         diagonal = E.diagonal()
-        coarse = factor(E + sp.diags(np.where(diagonal > 0.0, 1e-13 * diagonal, 1.0), format="csc"))
+        coarse = factorise_sparse(E + sp.diags(np.where(diagonal > 0.0, 1e-13 * diagonal, 1.0), format="csc"))
 
         def precondition(r: Array) -> Array:
             z = Z @ coarse.solve(Z.T @ r)

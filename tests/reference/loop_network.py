@@ -21,7 +21,7 @@ from graphslam.graph.noise import Robust
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.solve.sparse import factor
+from graphslam.solve.sparse import factorise_sparse
 from tests.reference.plain_network import Layout, edge_costs, linearise
 
 ITERATIONS = 50
@@ -169,6 +169,6 @@ class LoopNetwork:
 
     def _factor(self, J: sp.csr_matrix) -> spla.SuperLU:
         try:
-            return factor(sp.csc_matrix(J.T @ J))
+            return factorise_sparse(sp.csc_matrix(J.T @ J))
         except (RuntimeError, np.linalg.LinAlgError):
             raise IndeterminateError("the chain with its loops does not determine its poses") from None

@@ -48,7 +48,7 @@ DISAGREEMENT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Consensus:
+class LoopConsensus:
     """What the loops of a network say about each other.
 
     Parameters
@@ -87,7 +87,7 @@ def odometry_edges(network: PoseNetwork) -> Mask:
     return step
 
 
-def chain_of(network: PoseNetwork, odometry: Mask) -> OdometryChain:
+def odometry_chain(network: PoseNetwork, odometry: Mask) -> OdometryChain:
     """The odometry of a network as a chain, cut where an increment is missing or its information singular."""
     n, d = len(network), network.tangent_dim
     rows = np.flatnonzero(odometry)
@@ -118,21 +118,21 @@ def _blank(network: PoseNetwork) -> OdometryChain:
     return OdometryChain(_identities(network, n), np.zeros((n, d, d)), np.zeros(n, dtype=np.int64))
 
 
-def loop_consensus(network: PoseNetwork) -> Consensus:
+def loop_consensus(network: PoseNetwork) -> LoopConsensus:
     """Votes of neighbouring loops for each other, the noise scale, and the loops that are likely right.
 
     Landmark observations take no part.
     """
     m, d = len(network.edges), network.tangent_dim
     odometry = odometry_edges(network)
-    nothing = Consensus(
+    nothing = LoopConsensus(
         odometry, bool(odometry.any()), np.zeros(m, np.bool_), np.zeros(m, np.bool_), np.zeros(m, np.int64), 1.0
     )
     w = np.linalg.eigvalsh(network.information)
     rows = np.flatnonzero(~odometry & (w[:, 0] > 1e-12 * w[:, -1]))
     if not nothing.ordered or len(rows) < 2:
         return nothing
-    chain = chain_of(network, odometry)
+    chain = odometry_chain(network, odometry)
     loops = LoopArrays.of(
         chain, network.edges[rows], network.measurements[rows], np.linalg.inv(network.information[rows])
     )
@@ -168,7 +168,7 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
     keep &= _agreeing_clusters(chain, loops, np.where(keep, label, -1), limit)
     likely, core, all_votes = np.zeros(m, np.bool_), np.zeros(m, np.bool_), np.zeros(m, np.int64)
     likely[rows[keep]], core[rows[_largest(label, keep)]], all_votes[rows] = True, True, votes
-    return Consensus(odometry, True, likely, core, all_votes, max(scale, np.finfo(float).tiny))
+    return LoopConsensus(odometry, True, likely, core, all_votes, max(scale, np.finfo(float).tiny))
 
 
 def _informative(chain: OdometryChain, loops: LoopArrays) -> Mask:

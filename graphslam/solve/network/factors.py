@@ -61,7 +61,7 @@ def to_graph(
     return graph
 
 
-def indeterminate(network: PoseNetwork, error: Exception) -> IndeterminateError:
+def translate_indeterminate(network: PoseNetwork, error: Exception) -> IndeterminateError:
     """Turn GTSAM's message about a key into one about the file's vertices."""
     found = re.search(r"Symbol: (x|l)(\d+)", str(error))
     names: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ from graphslam.graph.factors.sighting import SightingBatch
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.sparse import SparseProblem
 
 Ids = npt.NDArray[np.int64]
@@ -126,7 +126,7 @@ def full_batch(
     ]
     flat = FlatGraph((), layout, batches)
     problem = SparseProblem(flat)
-    best = polish(problem, values, max_iterations=max_iterations)
+    best = descend_to_minimum(problem, values, max_iterations=max_iterations)
     if not np.isfinite(best.objective):
         raise SolverError(f"full batch diverged: objective {best.objective}; wanted a finite one")
     return FullBatch(

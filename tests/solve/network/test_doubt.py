@@ -14,9 +14,9 @@ import graphslam.solve.sparse as sparse
 from graphslam.core.errors import CovarianceError
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.network import problem_of_network, values_of
-from graphslam.solve.descent import polish
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.multistart import doubt
+from graphslam.solve.network.multistart import suspicion_of_answer
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import (
     chordal_rotations,
@@ -77,10 +77,10 @@ def test_every_other_minimum_from_random_starts_is_doubted(rng: np.random.Genera
     assert best.details["doubt"] == ""
     found = 0
     for _ in range(12):
-        end = polish(problem, values_of(net, rotated(net, rng, 2.0)))
+        end = descend_to_minimum(problem, values_of(net, rotated(net, rng, 2.0)))
         worse = end.objective > 1.001 * best.objective
         found += worse
-        assert bool(doubt(net, problem, end)) == worse or end.status != "converged"
+        assert bool(suspicion_of_answer(net, problem, end)) == worse or end.status != "converged"
     assert found >= 3
 
 

@@ -21,12 +21,12 @@ from graphslam.core.network import PoseNetwork
 from graphslam.graph.network import problem_of_network, values_of
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.network_file import read_network
-from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.incremental import Isam2Options, insertion_order, run_isam2
 from graphslam.solve.network.multistart import best_of_starts, canonical_start
 from graphslam.solve.network.solve import SOLVERS, solve_network
-from graphslam.solve.sparse import PcgProblem, SparseProblem, factor, pcg
+from graphslam.solve.sparse import PcgProblem, SparseProblem, factorise_sparse, pcg
 from tests.reference.best_known import BEST_KNOWN, SMALL
 from tests.reference.plain_network import objective
 from tests.reference.slow_pose_network import SlowSolver
@@ -74,7 +74,7 @@ def test_chordal_start_wins_where_the_file_start_is_a_local_minimum(data_dir: Pa
     assert [r.status for r in optimum.reports] == ["converged", "rejected"]
     # the rejection is right: left alone for longer, that start is still nowhere near
     problem = BatchProblem(net)
-    alone = polish(problem, problem.pack(canonical_start(net)), max_iterations=20)
+    alone = descend_to_minimum(problem, problem.pack(canonical_start(net)), max_iterations=20)
     assert alone.objective > 2.0 * optimum.best.objective
 
 
@@ -176,7 +176,7 @@ def test_gnc_finds_planted_outliers_and_reports_what_they_cost(rng: np.random.Ge
 def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.random.Generator) -> None:
     net, poses, _ = random_network(rng, 3, noise=0.1)
     problem = BatchProblem(net)
-    end = polish(problem, problem.pack(values_of(net, poses)))
+    end = descend_to_minimum(problem, problem.pack(values_of(net, poses)))
     assert end.converged
     # a point that is off by a predicted 1e-6 of the objective is not converged; the prediction is right
     step = np.zeros(problem.flat.layout.size)
@@ -186,7 +186,7 @@ def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.ran
     assert problem.decrement(values) == pytest.approx(missing, rel=0.05)
     assert not limits_of(net.residuals).reached(problem.objective(values), problem.decrement(values))
     # out of iterations is said
-    short = polish(problem, values, max_iterations=1)
+    short = descend_to_minimum(problem, values, max_iterations=1)
     assert short.status != "converged" or short.decrement <= 1e-9 * short.objective
 
 
@@ -204,7 +204,7 @@ def test_pcg_error_estimate_is_honest_on_a_long_chain(rng: np.random.Generator) 
     values = values_of(net, poses)
     system = problem.flat.evaluate(values, dense=False)
     H, b = system.A, -system.g
-    exact = factor(H).solve(b)
+    exact = factorise_sparse(H).solve(b)
 
     def error(x: np.ndarray) -> float:
         return float(np.sqrt((x - exact) @ (H @ (x - exact)) / (exact @ (H @ exact))))

@@ -39,9 +39,9 @@ from graphslam.core.poses import group_of
 from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.flat import FlatGraph
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import Optimum, polish
+from graphslam.solve.descent import Optimum, descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.sparse import factor
+from graphslam.solve.sparse import factorise_sparse
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -69,7 +69,7 @@ HELD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Robust:
+class RobustResult:
     """Inliers and the solution of their least-squares problem.
 
     Parameters
@@ -197,7 +197,7 @@ def loop_evidence(
     order = np.argsort(label, kind="stable")
     H = sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A)
     H.eliminate_zeros()  # what is refused would fill the factor
-    lu = factor(H)
+    lu = factorise_sparse(H)
     ordered = BetweenBatch.of_arrays(
         edges.ends[at[order]], edges.measured[at[order]], edges.whiteners[at[order]], layout
     )
@@ -271,7 +271,7 @@ def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
     return out
 
 
-def settle(
+def leave_one_out_test(
     whole: BatchProblem,
     values: gtsam.Values,
     inliers: Mask,
@@ -279,7 +279,7 @@ def settle(
     *,
     probability: float = QUANTILE,
     own_tail: bool = True,
-) -> Robust:
+) -> RobustResult:
     """Rounds of accepting and refusing by ``D²`` until nothing changes.
 
     Parameters
@@ -308,7 +308,7 @@ def settle(
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
     for rounds in range(1, ROUNDS + 1):
         problem = BatchProblem(network, inliers, flat)
-        end = polish(problem, values, max_iterations=STEPS)
+        end = descend_to_minimum(problem, values, max_iterations=STEPS)
         values, here = end.values, problem.unpack(end.values)
         if back:
             break
@@ -351,4 +351,4 @@ def settle(
             break
         back = fresh.tobytes() in seen
         inliers = fresh
-    return Robust(inliers, problem, end, limit, scale=scale, rounds=rounds)
+    return RobustResult(inliers, problem, end, limit, scale=scale, rounds=rounds)
