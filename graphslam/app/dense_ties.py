@@ -12,7 +12,7 @@ from graphslam.backend.sessions import InnerTie, ties_of_network
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import read_g2o
 from graphslam.join.pose_problem import PoseProblem
@@ -54,7 +54,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
             got=f"{len(network)} poses",
             wanted=f"{graph.structure.count('x')}",
         )
-    match = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
+    match = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
     loop = LoopConfig().robust(graph.structure.group.dof)
     loops = _loops(files)
     for t in ties_of_network(network, match):
@@ -65,7 +65,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     return PoseProblem.of_graph(graph)
 
 
-def _tie(graph: PoseGraph, tie: InnerTie, kernel: Robust) -> None:
+def _tie(graph: PoseGraph, tie: InnerTie, kernel: RobustKernel) -> None:
     graph.add_between(
         tie.i, tie.j, tie.T_ij, tie.covariance, streams=["match"], interval=(0.0, 0.0), evidence="shared-scan",
         robust=kernel,

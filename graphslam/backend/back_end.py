@@ -22,7 +22,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
@@ -99,7 +99,7 @@ class BackEnd:
         self._loops: LoopSearch | None = None
         self._noted = 0  # decisions on loops that are among the events
         kind = self.config.match_robust
-        self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
+        self._match_kernel = NO_KERNEL if kind == "none" else RobustKernel(kind, self.config.match_width)
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
@@ -144,7 +144,7 @@ class BackEnd:
 
     def _look(self) -> None:
         """While the run goes on: what IMUs say of the submaps so far, and loops."""
-        if self.imu is not None and self.imu.tie(self.graph, more=True):
+        if self.imu is not None and self.imu.attach(self.graph, more=True):
             self.solver.update()
         if self.config.looks:
             self.find_loops(last=False)
@@ -192,7 +192,7 @@ class BackEnd:
             if m.support >= self.config.match_support:
                 self.graph.add_match(submap.key, m, robust=self._match_kernel)
             else:
-                self.graph.note(
+                self.graph.log_event(
                     "match-not-used", submap=submap.key, target=m.target, fitness=m.fitness, support=m.support
                 )
 
@@ -227,7 +227,7 @@ class BackEnd:
         self.graph.finish_gps()
         self.graph.finish_readings()
         if self.imu is not None:
-            self.imu.tie(self.graph)
+            self.imu.attach(self.graph)
         recentred(self.graph, self.solver)
         if self.graph.gps.config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
             self.solver.solve_to_optimum()
@@ -273,7 +273,7 @@ class BackEnd:
         self._noted = len(ledger.decisions)
         for decision in new:
             event = decision.event()
-            self.graph.note(event.pop("event"), **event)
+            self.graph.log_event(event.pop("event"), **event)
         for n in dict.fromkeys(d.loop for d in new):
             for o in self.observers:
                 o.loop_decided(ledger.of(n), self.graph)
@@ -297,7 +297,7 @@ class BackEnd:
             self.graph.remove(x.factor_id, reason="undone")
             if isinstance(matched, BetweenRecord) and matched.group != "match":  # of a match the removal says it
                 event = replace(x, verdict="undone", why=reason, weight=0.0, factor_id=-1).event()
-                self.graph.note(event.pop("event"), **event)
+                self.graph.log_event(event.pop("event"), **event)
         self.solver.solve_to_optimum()
 
     def _stay_undone(self, before: Decision) -> None:
@@ -311,7 +311,7 @@ class BackEnd:
         logger.warning("%s was undone before and was not found this time", what)
         number = 1 + max((x.loop for x in ledger.decisions), default=-1)
         event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next time
-        self.graph.note(event.pop("event"), **event)
+        self.graph.log_event(event.pop("event"), **event)
 
     def split_wrong_identities(self) -> int:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""

@@ -74,11 +74,11 @@ def fit_fix_errors(graph: PoseGraph) -> FixErrors | None:
     errors = replace(found or FixErrors(0.0, np.inf, 1.0, 0.0), wild=len(wild), fixes=len(fixes))
     for r in wild:
         del graph.records[r.factor_id]
-        graph.ledger.refund(r.factor_id)
+        graph.ledger.release(r.factor_id)
     graph.revision += 1
     _put(graph, kept, errors)
     gps.fitted = errors
-    graph.note(
+    graph.log_event(
         "gps-errors", fixes=len(fixes), wild=len(wild), bias_sigma=errors.bias_sigma, white=errors.white,
         bias_time=errors.bias_time if np.isfinite(errors.bias_time) else None, gain=errors.gain,
     )  # fmt: skip

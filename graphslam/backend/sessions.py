@@ -17,7 +17,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.graph_loops import GraphRelative
@@ -35,7 +35,7 @@ class InnerTie:
     j: int
     T_ij: Array
     covariance: Array
-    robust: Robust
+    robust: RobustKernel
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def ties_of_graph(graph: PoseGraph) -> list[InnerTie]:
     return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
 
 
-def ties_of_network(net: PoseNetwork, kernel: Robust) -> list[InnerTie]:
+def ties_of_network(net: PoseNetwork, kernel: RobustKernel) -> list[InnerTie]:
     """The same of the file of a graph, which holds no kernels."""
     out, chained = [], set()
     for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
@@ -271,7 +271,7 @@ def attach_by_gps(
 def _add(graph: PoseGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
     return graph.add_between(
         x.i, x.j, x.T_ij, x.covariance, streams=[f"{known.name}/scan", f"{new.name}/scan"], evidence="shared-scan",
-        robust=Robust("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
+        robust=RobustKernel("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
     )  # fmt: skip
 
 

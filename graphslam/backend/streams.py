@@ -147,7 +147,7 @@ class ImuPart:
                 self._looked.add(name)
                 graph.check_imu(imu, stream=name, axes=self.config.axes)
 
-    def tie(self, graph: PoseGraph, *, more: bool = False) -> int:
+    def attach(self, graph: PoseGraph, *, more: bool = False) -> int:
         """Give the graph the IMUs that are to be used; returns the number of new factors.
 
         Parameters
@@ -160,7 +160,7 @@ class ImuPart:
             if graph.dim != 3:
                 if more:
                     continue
-                graph.note("imu-not-used", stream=name, why="the graph is in the plane")
+                graph.log_event("imu-not-used", stream=name, why="the graph is in the plane")
                 logger.warning("%s is not used: the graph is in the plane", name)
                 continue
             imu = self.imus[name]

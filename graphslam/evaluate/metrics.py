@@ -351,7 +351,7 @@ def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
         for name, part, unit in (("gyro", slice(0, 3), "rad/s"), ("force", slice(3, 6), "m/s²")):
             out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
             out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
-        graph.note("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
+        graph.log_event("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
     _contradiction(graph)
 
 
@@ -362,7 +362,7 @@ def _contradiction(graph: PoseGraph) -> None:
         return
     high = two_sided(ways.ratio, ways.dof, 0.999)[1]
     if ways.ratio > high:
-        graph.note("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
+        graph.log_event("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
         logger.warning(
             "submaps and IMU contradict each other (χ²/dof %.1f, at most %.1f): one of them states too little noise",
             ways.ratio,

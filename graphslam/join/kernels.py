@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.jit import njit
-from graphslam.graph.normal_kernels import arc_terms
+from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -301,7 +301,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
         k, p = at[i], at[anchor[i]] + 2
         d = x[p] - mean[p]
         d -= 2.0 * np.pi * np.floor((d + np.pi) / (2.0 * np.pi))
-        a, b, slope = arc_terms(d)
+        a, b, slope = inverse_left_jacobian_kernel(d)
         ex, ey = x[k] - mean[k], x[k + 1] - mean[k + 1]
         arc[i] = a, b, slope * ex + 0.5 * ey, slope * ey - 0.5 * ex
         u[k], u[k + 1] = a * ex + b * ey, a * ey - b * ex

@@ -149,7 +149,7 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
     PoseEstimate
         As iSAM2 leaves it, above the optimum by its linearisation gap; ``iterations`` are the updates.
     """
-    from graphslam.graph.graph_record import BetweenBlock  # gtsam takes a second to load
+    from graphslam.graph.factor_graph_state import BetweenBlock  # gtsam takes a second to load
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.isam2 import Isam2Solver
 

@@ -28,13 +28,13 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.npz import floats, ints
 from graphslam.core.poses import SE2, SE3, Group, compose_increments
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, attitude_terms
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord, between_terms
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import robust_terms, whiteners
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.variables import KINDS, Layout, Values
+from graphslam.graph.variables import KINDS, Values, VariableLayout
 
 Index = npt.NDArray[np.int64]
 
@@ -211,13 +211,13 @@ class PoseProblem(RelativePoseFactors):
     # ---------------------------------------------------------------- as a least-squares problem
 
     @cached_property
-    def flat(self) -> FlatGraph:
+    def flat(self) -> FactorArrays:
         """Of all measurements; columns are the poses 1 … n - 1, then the tilt."""
         counts = {"x": len(self.times), "tilt": int(self.levelled)}
-        layout = Layout(self.dim, tuple(counts.get(word, 0) for word in KINDS), np.zeros(0, dtype=np.int64))
+        layout = VariableLayout(self.dim, tuple(counts.get(word, 0) for word in KINDS), np.zeros(0, dtype=np.int64))
         level = self.attitudes(np.arange(len(self.level_nodes)))
         between = BetweenBatch.of_arrays(self.ends, self.measured, self.whiteners, layout)
-        return FlatGraph(level, layout, [between])
+        return FactorArrays(level, layout, [between])
 
     def attitudes(self, rows: npt.ArrayLike, first_id: int = 0) -> list[AttitudeRecord]:
         """Factors of gravity ``rows``."""

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.jit import njit
-from graphslam.graph.normal_kernels import arc_terms
+from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -162,7 +162,7 @@ def chart_residuals(row_ptr: Index, group: Flags, r: Array) -> None:
         if not group[k]:
             continue
         first = row_ptr[k]
-        a, b, _ = arc_terms(r[first + 2])
+        a, b, _ = inverse_left_jacobian_kernel(r[first + 2])
         for i in range(row_ptr[k + 1] - first):
             if i == 0 or (i > 2 and i % 2 == 1):
                 x, y = r[first + i], r[first + i + 1]
@@ -246,7 +246,7 @@ def linearise_submaps(
         st = poses[k - 1, 2] if k else 0.0
         va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
         if group[k]:
-            va, vb, slope = arc_terms(r[a0 + 2])
+            va, vb, slope = inverse_left_jacobian_kernel(r[a0 + 2])
             half = 0.5
         # Rows: 0, 1 end position, 2 end heading, then landmarks. u is the residual, d the column of the start heading,
         # h that of the end heading.

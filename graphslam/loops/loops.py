@@ -34,7 +34,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.loops.disputes import AMBIGUOUS, CLASH, SETTLED, SHUTS_OUT, disputes, weigh
 from graphslam.loops.ledger import Decision, LoopLedger, Verdict
 from graphslam.loops.measure import Loop
@@ -453,7 +453,7 @@ class LoopCloser:
             self.increments, self.covariances, self._arrays(numbers), self.config.pairwise, against_chain=False
         )
 
-    def _kernel(self) -> Robust:
+    def _kernel(self) -> RobustKernel:
         return self.config.robust(self._dof)
 
 

@@ -19,7 +19,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.graph.gps import GpsConfig, arm_jacobian, spread, start_datum
+from graphslam.graph.gps import GpsConfig, arm_jacobian, greatest_distance, start_datum
 from graphslam.refine.motion import MotionModel, States, Terms
 
 Index = npt.NDArray[np.int64]
@@ -116,7 +116,7 @@ class FixModel:
         d = self.group.dim
         if len(self.times) < 3:
             return False
-        return min(spread(self.positions[:, :2]), spread(poses[self.k, :d][:, :2])) >= baseline
+        return min(greatest_distance(self.positions[:, :2]), greatest_distance(poses[self.k, :d][:, :2])) >= baseline
 
     def _biases(self, config: GpsConfig, uneven: bool) -> None:
         """Which bias each fix carries, and how each bias follows from the one before."""

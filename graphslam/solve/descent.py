@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from graphslam.core.errors import IndeterminateError
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values
 
 log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class DescentLimits:
 class LeastSquaresProblem(Protocol):
     """A least-squares problem with a way to make its steps; ``values`` are whatever that makes of them."""
 
-    flat: FlatGraph
+    flat: FactorArrays
     factorization: str
 
     def pack(self, values: Values) -> Any: ...

@@ -20,8 +20,8 @@ from scipy.stats import chi2
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.factors.batch import Record, batch_of
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.noise import NO_KERNEL
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise_problem
@@ -75,7 +75,7 @@ class GncSolver(BatchSolver):
         t0 = time.perf_counter()
         if self.graph.revision != self._searched:
             for record, d2, limit in find_outliers(self.graph, self.gnc, self.config):
-                self.graph.note(
+                self.graph.log_event(
                     "outlier", factor_id=record.factor_id, factor=record.label(), group=record.group,
                     chi2=d2, limit=limit,
                 )  # fmt: skip
@@ -97,7 +97,7 @@ class GncSolver(BatchSolver):
 
 def find_outliers(
     graph: PoseGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
-) -> list[tuple[Record, float, float]]:
+) -> list[tuple[FactorRecord, float, float]]:
     """Doubtful factors whose final weight is less than a half, with their χ² at the end and its limit.
 
     The graph is not changed.
@@ -108,7 +108,7 @@ def find_outliers(
     if not np.any(doubtful):
         return []
     plain = [replace(r, robust=NO_KERNEL) if d and hasattr(r, "robust") else r for r, d in zip(records, doubtful)]
-    flat, values = FlatGraph(plain, graph.values.layout()), graph.values
+    flat, values = FactorArrays(plain, graph.values.layout()), graph.values
     limit = chi2.ppf(cfg.confidence, [r.rows for r in records])
     w = np.ones(len(records))
     d2 = flat.evaluate(values, hessian=False).chi2

@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import skew
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import FAILED
 
@@ -101,7 +101,7 @@ class SparseProblem:
 
     factorization = "LU"
 
-    def __init__(self, flat: FlatGraph, weights: Array | None = None) -> None:
+    def __init__(self, flat: FactorArrays, weights: Array | None = None) -> None:
         self.flat, self.weights = flat, weights
         layout = flat.layout
         # many poses and nothing else: compiled block elimination, which begins with half a second of loading
@@ -240,7 +240,7 @@ class PcgProblem(SparseProblem):
     factorization = "PCG"
 
     def __init__(
-        self, flat: FlatGraph, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
+        self, flat: FactorArrays, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
     ) -> None:
         super().__init__(flat)
         self._dense = False

@@ -17,7 +17,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.loops.ledger import Decision, ledger_of_events
 from graphslam.maps.alternatives import Alternative, chi2_of, choose, noise_scale
 from graphslam.maps.minimum_entropy import Candidate
@@ -47,7 +47,7 @@ def alternative(name: str, back: BackEnd, divided: DividedSubmaps) -> Alternativ
     return Alternative(name, back.graph, solution, Candidate(divided.pieces, poses, name))
 
 
-def fold(back: BackEnd, robust: Robust) -> None:
+def fold(back: BackEnd, robust: RobustKernel) -> None:
     """Two ties that press the first stretch of the way together."""
     first, second = back.graph.submaps[:2]
     for j in (first.nodes[6], second.nodes[0]):
@@ -83,8 +83,8 @@ def test_a_match_undone_by_hand_is_not_as_the_run(run: tuple) -> None:
     assert key in choices["support ≥ 0.9"]
 
 
-@pytest.mark.parametrize("robust", [Robust(), Robust("cauchy", 2.385)])
-def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Robust, tmp_path: Path) -> None:
+@pytest.mark.parametrize("robust", [RobustKernel(), RobustKernel("cauchy", 2.385)])
+def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: RobustKernel, tmp_path: Path) -> None:
     """A kernel does not hide that: what is judged are the ties without it."""
     submaps, _, loops, divided = run
     choices = choices_of_matches(submaps, 0.5, loops=loops)
@@ -122,7 +122,7 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
     assert f"every graph contradicts itself, {both.best.alternative.name} least" in both.why()
 
 
-def _folded_more(submaps: list[Submap], robust: Robust) -> BackEnd:
+def _folded_more(submaps: list[Submap], robust: RobustKernel) -> BackEnd:
     back = solve_choice(submaps, frozenset(), OPTIONS)
     fold(back, robust)
     last = back.graph.submaps[-1].exit_node
@@ -136,7 +136,7 @@ def _folded_more(submaps: list[Submap], robust: Robust) -> BackEnd:
 def test_chi2_of_a_graph_without_kernels_is_its_objective(run: tuple) -> None:
     submaps = run[0]
     back = solve_choice(submaps, frozenset(), OPTIONS)
-    fold(back, Robust())
+    fold(back, RobustKernel())
     back.finish()
     assert chi2_of(back.graph) == pytest.approx(back.graph.objective().total, rel=1e-12)
 
@@ -158,7 +158,7 @@ def test_ties_of_one_pair_of_submaps_count_once(run: tuple) -> None:
     again = alternative("as the run", solve_choice(submaps, _all(loops), OPTIONS, loops=loops), divided)
     assert again.ties == len({(d.submap_i, d.submap_j) for d in loops})
     folded = solve_choice(submaps, _all(loops), OPTIONS, loops=loops)
-    fold(folded, Robust())  # within the first submap, and from it to the second
+    fold(folded, RobustKernel())  # within the first submap, and from it to the second
     assert alternative("folded", folded, divided).ties == again.ties + 2
     assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).ties == 0
 

@@ -14,13 +14,13 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 
 STEP = np.array([0.06, 0.04, np.deg2rad(0.15)])
 """σ of the odometry in a second."""
-CAUCHY = Robust("cauchy", 2.385)
+CAUCHY = RobustKernel("cauchy", 2.385)
 
 
 def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tuple[PoseGraph, np.ndarray, Gps]:
@@ -46,7 +46,7 @@ def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tu
     return graph, true, fixes
 
 
-def solved(graph: PoseGraph, fixes: Gps, robust: Robust = CAUCHY) -> PoseGraph:
+def solved(graph: PoseGraph, fixes: Gps, robust: RobustKernel = CAUCHY) -> PoseGraph:
     graph.add_gps(fixes, config=GpsConfig(robust=robust))
     graph.finish_gps()
     BatchSolver(graph).solve_to_optimum()
@@ -139,7 +139,7 @@ def test_the_likelihood_equals_the_dense_one(rng):
 def test_innovations_are_those_of_a_map_without_fixes(rng):
     """The slow twin: the fixes against a graph that holds them with no weight."""
     graph, _, fixes = drive(rng, 0.05 * rng.standard_normal((40, 2)))
-    solved(graph, fixes, Robust())
+    solved(graph, fixes, RobustKernel())
     seen = _Innovations.of(graph, sorted((r for r in graph.records.values() if isinstance(r, GpsRecord)),
                                          key=lambda r: r.time))  # fmt: skip
     D = graph.values.datum

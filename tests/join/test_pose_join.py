@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.evaluate.consistency import joint_nees, pose_error
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.network_file import read_network
 from graphslam.join.pose_ekf import MOST
@@ -191,7 +191,7 @@ def test_a_tie_counts_with_the_weight_that_its_kernel_gives_it() -> None:
     far = problem.group.exp(np.array([0, 0, 1.0, 3, 3, 0]))
     for i, j in ((0, 6), (1, 9)):
         graph.add_between(
-            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=Robust("cauchy", 1.0)
+            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=RobustKernel("cauchy", 1.0)
         )
     solver = BatchSolver(graph)
     solver.solve_to_optimum()

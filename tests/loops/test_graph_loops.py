@@ -11,7 +11,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
@@ -94,7 +94,7 @@ def test_undo_gives_the_evidence_back() -> None:
     closer.undo(d.loop)
     assert d.factor_id not in ours.graph.records
     np.testing.assert_allclose(ours.graph.values.poses, before, atol=1e-6)
-    ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), Robust("huber", 3.0))
+    ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), RobustKernel("huber", 3.0))
 
 
 def test_places_of_a_graph_are_those_of_its_submaps() -> None:

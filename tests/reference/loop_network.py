@@ -17,7 +17,7 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import compose_increments, group_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
@@ -55,7 +55,7 @@ class LoopNetwork:
         self._measured = [T.copy() for T in increments]
         self._information = [np.linalg.inv(P) for P in covariances]
         self._ids = list(range(n))
-        self._kernels: list[Robust | None] = [None] * n
+        self._kernels: list[RobustKernel | None] = [None] * n
         self._next = n
         self._factored: spla.SuperLU | None = None
 
@@ -66,7 +66,7 @@ class LoopNetwork:
         """Of all nodes in the frame of the first ``(n + 1, 7|3)``."""
         return self._poses
 
-    def add_loop(self, loop: Loop, robust: Robust) -> int:
+    def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
         """See :class:`~graphslam.loops.loops.LoopGraph`."""
         if not (min(loop.i, loop.j) >= 0 and max(loop.i, loop.j) < len(self._poses) and loop.i != loop.j):
             raise DataError("a loop joins nodes that are not there", got=(loop.i, loop.j), wanted=len(self._poses))

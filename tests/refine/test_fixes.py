@@ -11,7 +11,7 @@ from graphslam.backend.refining import findings_of
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.refine.fixes import FixModel
 from graphslam.refine.problem import Problem
 from graphslam.refine.refine import refine
@@ -45,7 +45,7 @@ def test_jacobians(rng, dim, lasting):
         lever=rng.standard_normal(dim),
         covariances=A @ np.swapaxes(A, 1, 2) + np.eye(dim),
     )
-    config = GpsConfig(segment_gap=0.2, robust=Robust("none"), **lasting)
+    config = GpsConfig(segment_gap=0.2, robust=RobustKernel("none"), **lasting)
     model = FixModel(gps, config, problem.motion, poses)
     problem = Problem(problem.motion, problem.cloud, poses[0].copy(), model)
     g = problem.motion.group

@@ -21,7 +21,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.evidence.views import has_dense_view
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.session_ties import SessionMap
@@ -105,7 +105,7 @@ def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
     net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
-    kernel = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
+    kernel = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
     return ties_of_network(net, kernel)
 
 

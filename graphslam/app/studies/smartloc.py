@@ -40,7 +40,7 @@ from graphslam.core.log import SensorLog
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.catalog import load
 from graphslam.sim.satellites import SatelliteConfig, simulate_satellites
@@ -112,7 +112,7 @@ def settings_of(grid: Mapping[str, tuple[float, ...]]) -> list[dict[str, float]]
 def config_of(settings: Settings) -> PseudorangeConfig:
     """How pseudoranges enter the graph by some settings."""
     rest = {k: v for k, v in settings.items() if k != CAUCHY}
-    robust = Robust("cauchy", settings[CAUCHY]) if CAUCHY in settings else Robust()
+    robust = RobustKernel("cauchy", settings[CAUCHY]) if CAUCHY in settings else RobustKernel()
     return PseudorangeConfig(**rest, robust=robust)
 
 

@@ -30,7 +30,7 @@ import scipy.sparse.linalg as spla
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import values_of
+from graphslam.graph.network import network_values
 from graphslam.solve.descent import SAME, descend_to_minimum
 from graphslam.solve.network.multistart import make_problem
 from graphslam.solve.sparse import factorise_sparse
@@ -113,7 +113,7 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
     problem = make_problem(network)
-    back = descend_to_minimum(problem, problem.pack(values_of(network, _poses_of(X, network)))).objective
+    back = descend_to_minimum(problem, problem.pack(network_values(network, _poses_of(X, network)))).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)
     word = "lower" if back < objective else "higher"

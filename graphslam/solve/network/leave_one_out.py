@@ -36,8 +36,8 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenBatch
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import Optimum, descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
@@ -164,13 +164,13 @@ def groups_of(ends: npt.ArrayLike, near: int = NEAR) -> Ints:
 
 
 def loop_evidence(
-    flat: FlatGraph, inliers: Mask, rows: npt.ArrayLike, values: Values, *, accepted: bool
+    flat: FactorArrays, inliers: Mask, rows: npt.ArrayLike, values: Values, *, accepted: bool
 ) -> tuple[Array, Array, Ints]:
     """``D²`` of loops and of their groups against the posterior of what is accepted, themselves left out.
 
     Parameters
     ----------
-    flat : FlatGraph
+    flat : FactorArrays
         Edges come first.
     inliers : (m + k,) bool
         What is accepted.

@@ -12,8 +12,8 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
@@ -79,7 +79,7 @@ def _incremental(network: PoseNetwork) -> Start:
     from graphslam.graph.gtsam_values import from_gtsam
     from graphslam.solve.network.incremental import run_isam2
 
-    found = from_gtsam(run_isam2(network), values_of(network, network.poses))
+    found = from_gtsam(run_isam2(network), network_values(network, network.poses))
     return found.poses, found.landmarks
 
 
@@ -107,17 +107,17 @@ def default_starts(network: PoseNetwork) -> tuple[str, ...]:
 
 def canonical_start(network: PoseNetwork) -> Values:
     """What the file says: its values where it has them all, else its odometry chain."""
-    return values_of(network, *(_file(network) or _odometry(network)))
+    return network_values(network, *(_file(network) or _odometry(network)))
 
 
-def network_arrays(network: PoseNetwork) -> FlatGraph:
+def network_arrays(network: PoseNetwork) -> FactorArrays:
     """The problem of a network, in an order of elimination unless it is dissected later or GTSAM orders it."""
     return problem_of_network(
         network, ordered=network.dim == 2 and (len(network) <= MANY or len(network.landmark_ids) > 0)
     )
 
 
-def make_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> LeastSquaresProblem:
+def make_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> LeastSquaresProblem:
     """Plain numpy in 2-D and for many poses, where it beats GTSAM's factors; these for the rest of 3-D."""
     if network.dim == 2 or len(network) > MANY:
         return SparseProblem(flat or network_arrays(network))
@@ -129,7 +129,7 @@ def has_native_factors(network: PoseNetwork) -> bool:
     return len(network.observations) == 0 or network.observation_kind == "bearing-range"
 
 
-def native_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> BatchProblem:
+def native_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> BatchProblem:
     """The network as a GTSAM graph."""
     from graphslam.solve.network.batch import BatchProblem  # gtsam, which most files do not need
 
@@ -190,7 +190,7 @@ def best_of_starts(
     names: Sequence[str] | None = None,
     *,
     given: dict[str, Values] | None = None,
-    flat: FlatGraph | None = None,
+    flat: FactorArrays | None = None,
     problem: LeastSquaresProblem | None = None,
     certified: Callable[[PoseNetwork, LeastSquaresProblem, Optimum], bool] | None = None,
     progress: bool = False,
@@ -204,7 +204,7 @@ def best_of_starts(
         :func:`default_starts`), and the others if there is :func:`suspicion_of_answer` that no certificate settles.
     given : dict of str to Values, optional
         Further starts, tried first.
-    flat : FlatGraph, optional
+    flat : FactorArrays, optional
         The network as a problem, where it was made already.
     problem : LeastSquaresProblem, optional
         How it is solved; :func:`make_problem` if not given.
@@ -235,7 +235,7 @@ def best_of_starts(
             continue
         if name not in given and made is None:
             continue
-        start = given[name] if made is None else values_of(network, *made)
+        start = given[name] if made is None else network_values(network, *made)
         initial = problem.flat.objective(start)
         twin = next((r for r in reports if abs(r.objective_initial - initial) <= TWIN * abs(initial)), None)
         if twin is not None:

@@ -24,8 +24,8 @@ from tqdm import tqdm
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.gnc import truncation_weights
@@ -61,7 +61,7 @@ CAUCHY, KERNEL_ROUNDS, KERNEL_STEPS = 2.385, 15, 2
 START_STEPS = 40
 
 
-def truncated_cost(flat: FlatGraph, values: Values, limit: Array) -> float:
+def truncated_cost(flat: FactorArrays, values: Values, limit: Array) -> float:
     """``Σ min(rᵀ Ω r, limit)`` over all factors."""
     return float(np.minimum(flat.squared(values), limit).sum())
 
@@ -176,7 +176,7 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
         else:
             poses = odometry_start(part)
             arrays = poses, landmarks_from(part, poses)
-        return descend_to_minimum(inner, inner.pack(values_of(part, *arrays)), max_iterations=START_STEPS).values
+        return descend_to_minimum(inner, inner.pack(network_values(part, *arrays)), max_iterations=START_STEPS).values
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None

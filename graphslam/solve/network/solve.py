@@ -14,8 +14,8 @@ from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum, limits_of
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
@@ -108,7 +108,7 @@ class NetworkSolution:
     @property
     def objective_g2o(self) -> float:
         """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the same answer."""
-        return g2o_objective(self.network, values_of(self.network, self.poses, self.landmarks))
+        return g2o_objective(self.network, network_values(self.network, self.poses, self.landmarks))
 
     @property
     def objective_g2o_initial(self) -> float:
@@ -157,7 +157,7 @@ class _Answer:
 
 class _Task(NamedTuple):
     network: PoseNetwork
-    flat: FlatGraph
+    flat: FactorArrays
     starts: Sequence[str] | None
     options: dict[str, Any]
     progress: bool
@@ -388,7 +388,7 @@ def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: RobustResu
     return StartsResult(problem, best, "inliers", (report,))
 
 
-def _native(network: PoseNetwork, flat: FlatGraph, solver: str) -> BatchProblem:
+def _native(network: PoseNetwork, flat: FactorArrays, solver: str) -> BatchProblem:
     if not has_native_factors(network):
         raise SolverError(
             f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "

@@ -16,7 +16,7 @@ from graphslam.core.config import build_config, dump_toml, merge_options, option
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam_frontends.landmarks.config import RbpfEkfConfig
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 
@@ -130,8 +130,8 @@ def test_every_option_of_gps_and_imu_can_be_set_and_comes_back_from_toml():
 
 
 def test_a_width_alone_leaves_the_kernel_as_it_was():
-    assert build_config(GpsOptions, parse_setting("robust_width=1.5")).robust == Robust("cauchy", 1.5)
-    assert build_config(ImuOptions, parse_setting("robust=huber")).robust == Robust("huber", 2.385)
+    assert build_config(GpsOptions, parse_setting("robust_width=1.5")).robust == RobustKernel("cauchy", 1.5)
+    assert build_config(ImuOptions, parse_setting("robust=huber")).robust == RobustKernel("huber", 2.385)
     with pytest.raises(ConfigError, match=r"gps.robust_width = 'wide'"):
         build_config(GpsOptions, {"robust_width": "wide"}, "gps")
     with pytest.raises(ConfigError, match="width must be positive"):

@@ -13,7 +13,7 @@ from graphslam.core.poses import SE3, level_poses
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.factors.attitude import DOWN, across, attitude_terms, turn_of, up_turn
+from graphslam.graph.factors.attitude import DOWN, attitude_terms, level_turn, tangent_basis, up_turn
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -26,10 +26,10 @@ NOISE = np.array([2 * SIGMA, 2 * SIGMA, 3e-3, 0.02, 0.02, 0.02])
 def test_across_is_an_orthonormal_basis(rng):
     d = rng.normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    B = across(d)
+    B = tangent_basis(d)
     np.testing.assert_allclose(np.swapaxes(B, 1, 2) @ B, np.broadcast_to(np.eye(2), (50, 2, 2)), atol=1e-12)
     np.testing.assert_allclose(np.einsum("kij,ki->kj", B, d), 0.0, atol=1e-12)
-    np.testing.assert_allclose(np.abs(across(DOWN)), [[1, 0], [0, 1], [0, 0]], atol=1e-15)
+    np.testing.assert_allclose(np.abs(tangent_basis(DOWN)), [[1, 0], [0, 1], [0, 0]], atol=1e-15)
 
 
 def test_the_residual_is_the_sine_of_the_angle(rng):
@@ -43,7 +43,7 @@ def test_the_residual_is_the_sine_of_the_angle(rng):
     turned[3:] = quat_multiply(so3_exp(0.7 * up), pose[3:])  # a turn about the vertical changes nothing
     np.testing.assert_allclose(attitude_terms(turned[None], tilt, seen[None])[0], 0.0, atol=1e-14)
     angle = 0.03
-    axis = across(seen)[:, 0]
+    axis = tangent_basis(seen)[:, 0]
     off = quat_rotate(so3_exp(angle * axis), seen)
     assert np.linalg.norm(attitude_terms(pose[None], tilt, off[None])[0]) == pytest.approx(np.sin(angle), rel=1e-9)
 
@@ -51,7 +51,7 @@ def test_the_residual_is_the_sine_of_the_angle(rng):
 @pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 9e-4, 1.1e-3, 0.03, 1.0])
 def test_the_lean_turn_is_the_plain_one(size):
     E, J = up_turn(size * np.array([0.6, -0.8]))
-    lean_E, lean_J = turn_of(size * 0.6, size * -0.8)
+    lean_E, lean_J = level_turn(size * 0.6, size * -0.8)
     np.testing.assert_allclose(lean_E, E, atol=1e-13)
     np.testing.assert_allclose(lean_J, J, atol=1e-11)
 

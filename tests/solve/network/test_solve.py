@@ -18,7 +18,7 @@ from graphslam.core.errors import (
     UnknownNameError,
 )
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.network_file import read_network
 from graphslam.solve.descent import descend_to_minimum, limits_of
@@ -176,7 +176,7 @@ def test_gnc_finds_planted_outliers_and_reports_what_they_cost(rng: np.random.Ge
 def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.random.Generator) -> None:
     net, poses, _ = random_network(rng, 3, noise=0.1)
     problem = BatchProblem(net)
-    end = descend_to_minimum(problem, problem.pack(values_of(net, poses)))
+    end = descend_to_minimum(problem, problem.pack(network_values(net, poses)))
     assert end.converged
     # a point that is off by a predicted 1e-6 of the objective is not converged; the prediction is right
     step = np.zeros(problem.flat.layout.size)
@@ -201,7 +201,7 @@ def test_pcg_error_estimate_is_honest_on_a_long_chain(rng: np.random.Generator) 
     z[-1] = [n - 1.0, 0.0, 0.0]
     net = PoseNetwork(2, np.arange(n), poses, np.ones(n, bool), edges, z, np.tile(np.eye(3), (n, 1, 1)))
     problem = PcgProblem(problem_of_network(net))
-    values = values_of(net, poses)
+    values = network_values(net, poses)
     system = problem.flat.evaluate(values, dense=False)
     H, b = system.A, -system.g
     exact = factorise_sparse(H).solve(b)
@@ -299,8 +299,8 @@ def test_solve_file_repairs_on_request_counts_and_writes(rng: np.random.Generato
 def test_sparse_and_gtsam_problems_take_the_same_step(rng: np.random.Generator) -> None:
     net, poses, points = random_network(rng, 2, noise=0.05, marks="bearing-range")
     ours, theirs = SparseProblem(problem_of_network(net)), BatchProblem(net)
-    a, fall, _ = ours.newton_step(values_of(net, poses, points))
-    values, predicted, _ = theirs.newton_step(theirs.pack(values_of(net, poses, points)))
+    a, fall, _ = ours.newton_step(network_values(net, poses, points))
+    values, predicted, _ = theirs.newton_step(theirs.pack(network_values(net, poses, points)))
     b = theirs.unpack(values)
     # GTSAM holds the gauge by a prior that is exact here (its mean is the start)
     assert fall == pytest.approx(predicted, rel=1e-8)

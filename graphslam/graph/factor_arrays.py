@@ -16,15 +16,15 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import FactorBatch, LazyRecords, Record, batch_of, factor_kinds, offsets
+from graphslam.graph.factors.batch import FactorBatch, FactorRecord, LazyRecords, batch_of, block_offsets, factor_kinds
 from graphslam.graph.noise import robust_terms
-from graphslam.graph.variables import Layout, Values
+from graphslam.graph.variables import Values, VariableLayout
 
 Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class System:
+class LinearSystem:
     """``A δ = -g`` at one point, with the objective there.
 
     Parameters
@@ -53,7 +53,7 @@ class FactorBlocks:
 
     Parameters
     ----------
-    records : tuple of Record
+    records : tuple of FactorRecord
         In the order of the blocks.
     columns : tuple of (k,) int
         Free and fixed columns of each factor; -1 = fixed.
@@ -62,51 +62,53 @@ class FactorBlocks:
     d2 : (f,)
         ``rᵀ Λ r``.
     weight : (f,)
-        Weight that the factor's kernel gives it in :attr:`System.A`; 1 without one.
+        Weight that the factor's kernel gives it in :attr:`LinearSystem.A`; 1 without one.
     """
 
-    records: tuple[Record, ...]
+    records: tuple[FactorRecord, ...]
     columns: tuple[Index, ...]
     H: tuple[Array, ...]
     d2: Array
     weight: Array
 
 
-class FlatGraph:
+class FactorArrays:
     """The least-squares problem: factor batches over the columns of a layout. Every solver takes it.
 
     Parameters
     ----------
-    records : sequence of Record
+    records : sequence of FactorRecord
         One batch is made for each kind.
     batches : sequence of FactorBatch, optional
         Factors that came as arrays; they count behind the records.
     """
 
-    def __init__(self, records: Sequence[Record], layout: Layout, batches: Sequence[FactorBatch] = ()) -> None:
+    def __init__(
+        self, records: Sequence[FactorRecord], layout: VariableLayout, batches: Sequence[FactorBatch] = ()
+    ) -> None:
         order: dict[type, list[int]] = {batch.record: [] for batch in factor_kinds()}
         for k, rec in enumerate(records):
             order[batch_of(type(rec)).record].append(k)
         made = [batch_of(t)([records[k] for k in ks], layout) for t, ks in order.items() if ks]
-        first = offsets([len(records), *(len(f) for f in batches)])
+        first = block_offsets([len(records), *(len(f) for f in batches)])
 
-        def record(k: int) -> Record:
+        def record(k: int) -> FactorRecord:
             b = int(np.searchsorted(first, k, side="right")) - 1
-            return cast(Record, (batches[b - 1].records if b else records)[k - int(first[b])])
+            return cast(FactorRecord, (batches[b - 1].records if b else records)[k - int(first[b])])
 
         self.batches, self.layout = [*made, *batches], layout
-        self.records: Sequence[Record] = LazyRecords(int(first[-1]), record) if batches else records
+        self.records: Sequence[FactorRecord] = LazyRecords(int(first[-1]), record) if batches else records
         ahead = np.array([k for ks in order.values() for k in ks], dtype=np.intp)
         self._position = np.concatenate([ahead, np.arange(first[1], first[-1])])
         empty = np.zeros(0, dtype=np.int64)
         arity, self._variable, width = (
             np.concatenate([empty, *(getattr(f, name) for f in self.batches)]) for name in ("arity", "first", "width")
         )
-        self._first = offsets([len(f) for f in self.batches])
+        self._first = block_offsets([len(f) for f in self.batches])
         self._arity, self._width = arity, width
-        self._local = offsets(width)
-        self._g_offset = self._local[offsets(arity)]
-        self._H_offset = offsets(np.diff(self._g_offset) ** 2)
+        self._local = block_offsets(width)
+        self._g_offset = self._local[block_offsets(arity)]
+        self._H_offset = block_offsets(np.diff(self._g_offset) ** 2)
 
     def __len__(self) -> int:
         return len(self._position)
@@ -157,7 +159,7 @@ class FlatGraph:
         for b in range(int(span.max(initial=0))):
             wide = span[head] > b
             lengths[columns[head][wide] + b] = tall[wide]
-        indptr = offsets(lengths)
+        indptr = block_offsets(lengths)
         indices = np.zeros(indptr[-1], dtype=np.int64)
         slot = np.full(self._H_offset[-1], indptr[-1], dtype=np.intp)
         stride = np.diff(self._g_offset)[of]
@@ -175,7 +177,7 @@ class FlatGraph:
 
     def _pairs(self) -> tuple[Index, Index]:
         """Factor ``(p,)`` and places ``(2, p)`` of every two free variables of every factor."""
-        begin = offsets(self._arity)
+        begin = block_offsets(self._arity)
         factors, places = [np.zeros(0, dtype=np.int64)], [np.zeros((2, 0), dtype=np.int64)]
         for a in np.unique(self._arity).tolist():
             f = np.flatnonzero(self._arity == a)
@@ -215,7 +217,7 @@ class FlatGraph:
 
     def evaluate(
         self, values: Values, *, hessian: bool = True, dense: bool | None = None, weights: Array | None = None
-    ) -> System:
+    ) -> LinearSystem:
         """Objective, gradient and Gauss-Newton matrix at ``values``.
 
         Parameters
@@ -231,7 +233,7 @@ class FlatGraph:
         out = np.empty_like(chi2)
         out[self._position] = chi2
         if not hessian:
-            return System(np.zeros((0, 0)), np.zeros(0), out)
+            return LinearSystem(np.zeros((0, 0)), np.zeros(0), out)
         n = self.layout.size
         free = self._columns >= 0
         gradient = np.bincount(self._columns[free], weights=g[free], minlength=n).astype(np.float64)
@@ -240,10 +242,10 @@ class FlatGraph:
 
             A = np.zeros((n, n))
             scatter_dense(self._columns, self._g_offset, H, self._H_offset, A)
-            return System(A, gradient, out)
+            return LinearSystem(A, gradient, out)
         slot, indices, indptr = self._pattern
         data = np.bincount(slot, weights=H, minlength=len(indices) + 1)[:-1]
-        return System(sp.csc_matrix((data, indices, indptr), shape=(n, n)), gradient, out)
+        return LinearSystem(sp.csc_matrix((data, indices, indptr), shape=(n, n)), gradient, out)
 
     def factor_blocks(self, values: Values) -> FactorBlocks:
         """Every factor by itself at ``values``: what leverages and class-wise dof are made of."""

@@ -14,20 +14,20 @@ from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import AttitudeRecord
-from graphslam.graph.factors.batch import Record, batch_of
+from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.pseudorange import PseudorangeRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsFixes
 from graphslam.graph.imu import ImuUnits
 from graphslam.graph.ledger import Ledger
-from graphslam.graph.readings import Readings
-from graphslam.graph.score import Score, score
+from graphslam.graph.pending_measurements import PendingMeasurements
+from graphslam.graph.score import GraphScore, score_graph
 from graphslam.graph.submap_node import SubmapNode
-from graphslam.graph.variables import Layout, Values
+from graphslam.graph.variables import Values, VariableLayout
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ class BetweenBlock:
     group: str
     kept: npt.NDArray[np.bool_]
 
-    def batch(self, layout: Layout) -> BetweenBatch:
+    def batch(self, layout: VariableLayout) -> BetweenBatch:
         """What is kept, as a batch."""
         k = np.flatnonzero(self.kept)
         rows = slice(None) if len(k) == len(self.kept) else k
@@ -63,7 +63,7 @@ class BetweenBlock:
         return BetweenRecord(factor_id, i, j, self.T_ij[k], self.whiteners[k], group=self.group)
 
 
-class Factors(MutableMapping[int, "Record"]):
+class FactorTable(MutableMapping[int, "Record"]):
     """Factors by number, with a journal of every change, so that a solver sees what is new without looking at the rest.
 
     Factors that came as arrays stay arrays; a record of one is made when somebody asks for it. A record of a kind that
@@ -71,7 +71,7 @@ class Factors(MutableMapping[int, "Record"]):
     """
 
     def __init__(self) -> None:
-        self.single: dict[int, Record] = {}
+        self.single: dict[int, FactorRecord] = {}
         self.blocks: list[BetweenBlock] = []
         self.journal: list[int] = []
 
@@ -87,18 +87,18 @@ class Factors(MutableMapping[int, "Record"]):
         self.blocks.append(block)
         self.journal.extend(range(block.first_id, block.first_id + len(block.kept)))
 
-    def flat(self, layout: Layout) -> FlatGraph:
+    def flat(self, layout: VariableLayout) -> FactorArrays:
         """All of them as a problem."""
-        return FlatGraph(list(self.single.values()), layout, [b.batch(layout) for b in self.blocks])
+        return FactorArrays(list(self.single.values()), layout, [b.batch(layout) for b in self.blocks])
 
-    def __getitem__(self, factor_id: int) -> Record:
+    def __getitem__(self, factor_id: int) -> FactorRecord:
         if factor_id not in self.single:
             block = self.block_of(factor_id)
             if block is not None:
                 return block.record(factor_id)
         return self.single[factor_id]
 
-    def __setitem__(self, factor_id: int, record: Record) -> None:
+    def __setitem__(self, factor_id: int, record: FactorRecord) -> None:
         batch_of(type(record))
         if self.block_of(factor_id) is not None:
             del self[factor_id]
@@ -124,16 +124,16 @@ class Factors(MutableMapping[int, "Record"]):
     def __len__(self) -> int:
         return len(self.single) + sum(int(b.kept.sum()) for b in self.blocks)
 
-    def values(self) -> ValuesView[Record]:
+    def values(self) -> ValuesView[FactorRecord]:
         """Records; those of arrays are made on the way."""
         return super().values() if self.blocks else self.single.values()
 
-    def items(self) -> ItemsView[int, Record]:
+    def items(self) -> ItemsView[int, FactorRecord]:
         """Numbers and records; those of arrays are made on the way."""
         return super().items() if self.blocks else self.single.items()
 
 
-class Source(Protocol):
+class ValueSource(Protocol):
     """An incremental solver that holds newer values than the graph."""
 
     def holds(self, name: str) -> bool:
@@ -149,7 +149,7 @@ class Source(Protocol):
         ...
 
 
-class GraphRecord:
+class FactorGraphState:
     """The passive part of a :class:`~graphslam.graph.pose_graph.PoseGraph`.
 
     Parameters
@@ -161,7 +161,7 @@ class GraphRecord:
     ----------
     structure : Values
         Variables with values that may be old: for what depends on which variables there are, and not on where.
-    records : dict of int to Record
+    records : dict of int to FactorRecord
         Every factor by id.
     ledger : Ledger
     events : list of dict
@@ -175,15 +175,15 @@ class GraphRecord:
             raise ConfigError(f"a graph is in two or in three dimensions, got dim={dim}")
         self.dim = dim
         self.structure = Values.empty(dim)
-        self._source: Source | None = None
+        self._source: ValueSource | None = None
         self.origin = self.structure.poses[0].copy()
-        self.records = Factors()
+        self.records = FactorTable()
         self.ledger = Ledger()
         self.events: list[dict[str, Any]] = []
         self.revision = 0
         self.submaps: list[SubmapNode] = []
         self._place: dict[int, int] = {}  # submap key -> place in submaps
-        self.gps, self.imu, self.readings = GpsFixes(self), ImuUnits(self), Readings(self)
+        self.gps, self.imu, self.readings = GpsFixes(self), ImuUnits(self), PendingMeasurements(self)
         self.gps_origin: Array | None = None
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
@@ -192,7 +192,7 @@ class GraphRecord:
         self._retired: set[int] = set()  # ids merged away or removed: never used again
         self._next_factor = 0
         self._next_landmark = 0
-        self._flat: tuple[int, FlatGraph] | None = None
+        self._flat: tuple[int, FactorArrays] | None = None
         self._covariance: tuple[int, Values, JointCovariance] | None = None
 
     # ---------------------------------------------------------------- values
@@ -209,7 +209,7 @@ class GraphRecord:
     def values(self, values: Values) -> None:
         self._source, self.structure = None, values
 
-    def expect(self, source: Source | None) -> None:
+    def expect(self, source: ValueSource | None) -> None:
         """From now on ``source`` knows the values; it is asked when they are needed (None: nobody does)."""
         self._source = source
 
@@ -238,20 +238,20 @@ class GraphRecord:
         removed = self.records[factor_id]
         owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
         if owner is not None:
-            self.readings.leave(owner)
-            self.imu.leave(owner)
+            self.readings.detach(owner)
+            self.imu.detach(owner)
         for fid in (factor_id,) if owner is None else owner.factor_ids:
             if fid in self.records:
                 self.take_out(fid, reason)
         if owner is not None:
-            self.gps.leave(owner)
+            self.gps.detach(owner)
             used = {n for r in self.records.values() for n in r.variables()}
             if owner.key == self.submaps[-1].key and not any(f"x{n}" in used for n in owner.nodes[1:]):
                 self.values.poses = self.values.poses[: owner.node + 1].copy()
                 self._place.pop(self.submaps.pop().key)
-        self.gps.tidy()
-        self.imu.tidy(removed)
-        self.readings.tidy()
+        self.gps.remove_unused()
+        self.imu.remove_unused(removed)
+        self.readings.remove_unused()
         if self.structure.count("tilt") and not any("tilt" in r.variables() for r in self.records.values()):
             self.values.tilt = None
             self.revision += 1
@@ -263,7 +263,7 @@ class GraphRecord:
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] -= 1
         if block is None or not block.kept.any():  # factors that came together spent their evidence together
-            self.ledger.refund(factor_id if block is None else block.first_id)
+            self.ledger.release(factor_id if block is None else block.first_id)
         self.revision += 1
         if isinstance(record, SubmapRecord):
             for i in set(record.landmark_ids.tolist()):
@@ -330,7 +330,7 @@ class GraphRecord:
             raise DataError("values are of other variables than the graph's", wanted="the same layout")
         self.values = values
 
-    def note(self, kind: str, **facts: Any) -> None:
+    def log_event(self, kind: str, **facts: Any) -> None:
         """Enter something that was decided about this graph in :attr:`events`; facts must be JSON-serialisable."""
         self._event(kind, **facts)
 
@@ -359,7 +359,7 @@ class GraphRecord:
         record = self.records.get(self.submap(submap_key).factor_id) if submap_key in self._place else None
         return record.landmark_ids.copy() if isinstance(record, SubmapRecord) else np.zeros(0, dtype=np.int64)
 
-    def flat(self) -> FlatGraph:
+    def flat(self) -> FactorArrays:
         """Flat arrays of the factors, made once per revision."""
         if self._flat is None or self._flat[0] != self.revision:
             self._flat = (self.revision, self.records.flat(self.structure.layout()))
@@ -378,10 +378,10 @@ class GraphRecord:
             self._covariance = c = (self.revision, self.values, cov)
         return c[2]
 
-    def objective(self, values: Values | None = None) -> Score:
+    def objective(self, values: Values | None = None) -> GraphScore:
         """χ² and dof per class of factor at ``values`` (default: the graph's)."""
         flat = self.flat()
-        return score(flat, flat.evaluate(values or self.values, hessian=False).chi2)
+        return score_graph(flat, flat.evaluate(values or self.values, hessian=False).chi2)
 
     def diagnose(self, values: Values | None = None) -> Diagnosis:
         """Unconstrained variables and what would fix them; ``.raise_if_bad()`` makes it an error."""
@@ -394,7 +394,7 @@ class GraphRecord:
 
     # ---------------------------------------------------------------- inside
 
-    def insert(self, record: Record) -> None:
+    def insert(self, record: FactorRecord) -> None:
         """Take a factor whose evidence is in the ledger already; one with the same id is replaced."""
         self.records[record.factor_id] = record
         self._next_factor = max(self._next_factor, record.factor_id + 1)

@@ -22,18 +22,18 @@ from graphslam.graph.variables import Values
 SIZE = len(CONSTANTS)
 
 
-def errors_at(values: Values, robot: int) -> Array:
+def sensor_biases_at(values: Values, robot: int) -> Array:
     """Constant errors ``(6,)`` of a robot, in the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`."""
     return np.concatenate([values[w][robot] for w in CONSTANT])
 
 
-def names_of(robot: int) -> list[str]:
+def bias_variable_names(robot: int) -> list[str]:
     """Names of the variables that hold them."""
     return [f"{w}{robot}" for w in CONSTANT]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LastingRecord:
+class SensorBiasRecord:
     """One word on the constant errors of a robot.
 
     Parameters
@@ -60,21 +60,21 @@ class LastingRecord:
 
     def variables(self) -> list[str]:
         """Names of the variables."""
-        return names_of(self.robot)
+        return bias_variable_names(self.robot)
 
     def label(self) -> str:
         """Name for messages."""
         return f"constant errors of wheels and sensor, {self.what} (factor {self.factor_id})"
 
 
-class LastingBatch(UniformBatch):
+class SensorBiasBatch(UniformBatch):
     """Words on constant errors."""
 
-    record = LastingRecord
+    record = SensorBiasRecord
     slots = CONSTANT
     prior = True
 
-    def __init__(self, records: Sequence[LastingRecord], layout: object) -> None:
+    def __init__(self, records: Sequence[SensorBiasRecord], layout: object) -> None:
         super().__init__(records, layout)  # type: ignore[arg-type]
         self._root = np.array([r.root for r in records]).reshape(-1, SIZE, SIZE)
         self._told = np.array([r.told for r in records]).reshape(-1, SIZE)
@@ -85,12 +85,12 @@ class LastingBatch(UniformBatch):
         return np.count_nonzero(np.any(self._root != 0.0, axis=2), axis=1).astype(np.int64)
 
     @staticmethod
-    def keys(record: LastingRecord) -> Sequence[int | None]:
+    def keys(record: SensorBiasRecord) -> Sequence[int | None]:
         """The robot's wheels, its sensor, and where that stands."""
         return (record.robot,) * len(CONSTANT)
 
     @staticmethod
-    def whitener(record: LastingRecord) -> Array:
+    def whitener(record: SensorBiasRecord) -> Array:
         """Rows are of unit variance."""
         return np.eye(SIZE)
 

@@ -23,11 +23,11 @@ from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, De
 from graphslam.graph.factors.range import BeaconRangeRecord
 from graphslam.graph.gps import lever_arm
 from graphslam.graph.ledger import EXCLUSIVE
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.submap_node import SubmapNode
 
 if TYPE_CHECKING:
-    from graphslam.graph.graph_record import GraphRecord
+    from graphslam.graph.factor_graph_state import FactorGraphState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +48,7 @@ class CompassConfig:
         [rad]
     hard_iron : float or None
         Standard deviation [rad] of the deviation by iron on the robot, which is then estimated; None: there is none.
-    robust : Robust
+    robust : RobustKernel
         Kernel on each reading.
     """
 
@@ -62,7 +62,7 @@ class CompassConfig:
     """Its standard deviation [rad]."""
     hard_iron: float | None = None
     """Standard deviation of the deviation by iron on the robot [rad], which is then estimated; none: there is none."""
-    robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each reading, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
@@ -91,7 +91,7 @@ class BeaconConfig:
     spread : float
         Places from which it was heard must not lie on one line: the smaller extent of them is at least this share of
         the larger one, or else the beacon waits.
-    robust : Robust
+    robust : RobustKernel
         Kernel on each distance.
     """
 
@@ -103,7 +103,7 @@ class BeaconConfig:
     """Distances to a beacon before it gets a place."""
     spread: float = 0.1
     """Least ratio of the smallest to the largest extent of the places from which a beacon was heard."""
-    robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each distance, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class BeaconConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reading:
+class PendingMeasurement:
     """One reading that waits."""
 
     time: float
@@ -134,17 +134,17 @@ class _Beacon:
     heard: list[BeaconRangeRecord] = field(default_factory=list)
 
 
-class Readings:
+class PendingMeasurements:
     """Compasses and beacons of a graph."""
 
-    def __init__(self, graph: GraphRecord) -> None:
+    def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph
         self.compasses: list[CompassConfig] = []
         self.ranging: list[tuple[BeaconConfig, Array]] = []
         self.zeros: dict[int, int] = {}  # compass -> row
         self.deviations: dict[int, int] = {}  # compass -> row
         self.beacons: dict[int, _Beacon] = {}
-        self.waiting: list[Reading] = []
+        self.waiting: list[PendingMeasurement] = []
 
     # ---------------------------------------------------------------- taking readings
 
@@ -182,7 +182,9 @@ class Readings:
         self.ranging.append((cfg, arm))
         return self._queue(readings, stream, len(times) - len(kept))
 
-    def _spend(self, what: str, stream: str, rows: list[tuple[float, float, float, int]], source: int) -> list[Reading]:
+    def _spend(
+        self, what: str, stream: str, rows: list[tuple[float, float, float, int]], source: int
+    ) -> list[PendingMeasurement]:
         """Enter all readings in the ledger, or none."""
         g = self.graph
         names = [f"{stream}/{b}" if b >= 0 else stream for *_, b in rows]
@@ -192,21 +194,21 @@ class Readings:
         for (t, value, sigma, beacon), name in zip(rows, names):
             fid = g.next_factor()
             g.ledger.spend(fid, f"{what} at {t:.3f} s", [name], (t, t))
-            out.append(Reading(t, fid, value, sigma, source, beacon, stream))
+            out.append(PendingMeasurement(t, fid, value, sigma, source, beacon, stream))
         return out
 
-    def _queue(self, readings: Iterable[Reading], stream: str, left_out: int) -> list[int]:
+    def _queue(self, readings: Iterable[PendingMeasurement], stream: str, left_out: int) -> list[int]:
         new = list(readings)
         self.waiting = sorted([*self.waiting, *new], key=lambda r: r.time)
         if left_out:
-            self.graph.note("readings-thinned", stream=stream, count=left_out)
+            self.graph.log_event("readings-thinned", stream=stream, count=left_out)
         for s in self.graph.submaps:
-            self.tie(s)
+            self.attach(s)
         return [r.factor_id for r in new]
 
     # ---------------------------------------------------------------- tying them to nodes
 
-    def tie(self, s: SubmapNode, *, closed: bool = False) -> None:
+    def attach(self, s: SubmapNode, *, closed: bool = False) -> None:
         """Give a submap its readings; one at an instant that two submaps share belongs to the later."""
         t0, t1 = s.interval
         first = bisect_left(self.waiting, t0, key=lambda r: r.time)
@@ -237,7 +239,7 @@ class Readings:
     def finish(self) -> None:
         """No more submaps will come: what still waits is dropped, and counted."""
         if self.graph.submaps:
-            self.tie(self.graph.submaps[-1], closed=True)
+            self.attach(self.graph.submaps[-1], closed=True)
         self._drop(self.waiting, "no submap covers it")
         self.waiting = []
         for k, cfg in enumerate(self.compasses):
@@ -247,21 +249,21 @@ class Readings:
                 self._place(number, b, last=True)
             if b.row is None and b.heard:
                 for r in b.heard:
-                    self.graph.ledger.refund(r.factor_id)
+                    self.graph.ledger.release(r.factor_id)
                 why = "heard too seldom, or from places on one line"
-                self.graph.note("beacon-not-placed", beacon=number, distances=len(b.heard), why=why)
+                self.graph.log_event("beacon-not-placed", beacon=number, distances=len(b.heard), why=why)
                 b.heard = []
 
     # ---------------------------------------------------------------- taking out
 
-    def leave(self, s: SubmapNode) -> None:
+    def detach(self, s: SubmapNode) -> None:
         """Take out what hangs on a submap that goes."""
         inside = set(s.nodes[:-1])
         for fid, r in list(self.graph.records.items()):
             if isinstance(r, (CompassRecord, BeaconRangeRecord)) and r.node in inside:
                 self._take_out(fid)
 
-    def tidy(self) -> None:
+    def remove_unused(self) -> None:
         """Variables that no reading holds any more go, and what was said of them; the others move up."""
         g = self.graph
         if not any(g.structure.count(word) for word in ("compass", "deviation", "beacon")):
@@ -301,18 +303,18 @@ class Readings:
     def _take_out(self, *factor_ids: int) -> None:
         for fid in list(factor_ids):
             del self.graph.records[fid]
-            self.graph.ledger.refund(fid)
+            self.graph.ledger.release(fid)
             self.graph.revision += 1
 
-    def _drop(self, readings: Iterable[Reading], why: str) -> None:
+    def _drop(self, readings: Iterable[PendingMeasurement], why: str) -> None:
         count: Counter[str] = Counter()
         for r in readings:
-            self.graph.ledger.refund(r.factor_id)
+            self.graph.ledger.release(r.factor_id)
             count["distance" if r.beacon >= 0 else "heading"] += 1
         for what, n in count.items():
-            self.graph.note("readings-dropped", what=what, count=n, why=why)
+            self.graph.log_event("readings-dropped", what=what, count=n, why=why)
 
-    def _tie_heading(self, r: Reading, node: int, T: Array, P: Array | None) -> None:
+    def _tie_heading(self, r: PendingMeasurement, node: int, T: Array, P: Array | None) -> None:
         g, cfg = self.graph, self.compasses[r.source]
         plane = g.dim == 2
         axis = g.structure.group.transform(T, np.eye(g.dim)[:1])[0] - T[0, : g.dim]
@@ -343,7 +345,7 @@ class Readings:
         g.ledger.spend(record.factor_id, record.label(), ["-"], (0.0, 0.0), "prior")
         g.insert(record)
 
-    def _tie_range(self, r: Reading, node: int, T: Array, P: Array | None) -> None:
+    def _tie_range(self, r: PendingMeasurement, node: int, T: Array, P: Array | None) -> None:
         cfg, lever = self.ranging[r.source]
         arm, C = lever_arm(T, P, lever)
         lost = float(np.trace(C[0])) / self.graph.dim
@@ -374,7 +376,7 @@ class Readings:
         g.revision += 1
         for r in b.heard:
             g.insert(replace(r, beacon=b.row))
-        g.note("beacon", beacon=number, variable=f"beacon{b.row}", distances=len(b.heard), position=place.tolist())
+        g.log_event("beacon", beacon=number, variable=f"beacon{b.row}", distances=len(b.heard), position=place.tolist())
         b.heard = []
 
 
