@@ -16,7 +16,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_node import SubmapNode
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 
 POINTS = 4000
@@ -59,7 +59,7 @@ class LiveView(Observer):
             self.stream.log(f"map/submap-{submap.key}/points", self.rr.Points3D(points))
         self._places(graph.submaps, np.asarray(graph.values.poses), np.asarray(graph.values.landmarks))
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         """A line from base to base, green where it was believed; and why."""
         nodes = {s.key: s.node for s in graph.submaps}
         ends = graph.values.poses[[nodes[decision.submap_i], nodes[decision.submap_j]], : graph.dim]

@@ -27,8 +27,8 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
-from graphslam.loops.ledger import DECIDED, Decision, LoopLedger, ledger_of_events, same_loop
-from graphslam.loops.ties import TieConfig, ties_entries
+from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_events, same_loop
+from graphslam.loops.overlap_constraints import OverlapConfig, overlap_entries
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
@@ -42,7 +42,7 @@ def find_config(c: BackEndConfig) -> FindConfig:
         candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
         appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
-        ties=TieConfig() if c.loop_ties else None,
+        ties=OverlapConfig() if c.loop_ties else None,
         rounds=FindConfig().rounds if c.looks else 0,
     )
 
@@ -59,7 +59,7 @@ class Observer:
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         """A submap is in the graph, and the graph is solved with it."""
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         """A loop was believed or not, and why."""
 
     def solved(self, solution: Solution) -> None:
@@ -214,12 +214,12 @@ class BackEnd:
         self.seconds["merge"] += time.perf_counter() - start
         return merged
 
-    def finish(self, undo: Sequence[int | Decision] = ()) -> Solution:
+    def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
         """Merge until nothing merges any more, go to the optimum, and return the solution.
 
         Parameters
         ----------
-        undo : sequence of int or Decision
+        undo : sequence of int or LoopDecision
             Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
@@ -238,7 +238,7 @@ class BackEnd:
         if self.config.looks:
             self.find_loops()
         for loop in undo:
-            if isinstance(loop, Decision):
+            if isinstance(loop, LoopDecision):
                 self._stay_undone(loop)
             else:
                 self.undo_loop(loop)
@@ -289,7 +289,7 @@ class BackEnd:
         why = {d.loop: "asked for"}
         if d.source == FRONT_END:
             entry = (d.submap_i, d.submap_j)
-            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in ties_entries(x.gates))
+            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in overlap_entries(x.gates))
             why |= {x.loop: f"by loop {loop}, which was undone" for x in ties}
         for number, reason in why.items():
             x = ledger.of(number)
@@ -300,7 +300,7 @@ class BackEnd:
                 self.graph.log_event(event.pop("event"), **event)
         self.solver.solve_to_optimum()
 
-    def _stay_undone(self, before: Decision) -> None:
+    def _stay_undone(self, before: LoopDecision) -> None:
         """Take out a loop that was undone in an earlier run of the same submaps."""
         ledger = ledger_of_events(self.graph.events)
         d = same_loop(before, ledger)

@@ -26,10 +26,10 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.loops.candidates import TIE
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.graph_loops import GraphLoops
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.loops.measure import Loop
+from graphslam.loops.overlap_constraints import overlap_entries
 from graphslam.loops.rules import LoopConfig
-from graphslam.loops.ties import ties_entries
 from graphslam.maps.alternatives import Alternative
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
@@ -89,7 +89,7 @@ def choices_of_matches(
     submaps: Sequence[Submap],
     support: float,
     *,
-    loops: Sequence[Decision] = (),
+    loops: Sequence[LoopDecision] = (),
     undone: frozenset[tuple[int, int]] = frozenset(),
 ) -> dict[str, Chosen]:
     """Choices by name: the run's own, every threshold of support, and the run's own less each match and loop.
@@ -98,7 +98,7 @@ def choices_of_matches(
     ----------
     support : float
         The run's own threshold (``backend.match_support``).
-    loops : sequence of Decision
+    loops : sequence of LoopDecision
         Loops of the run's ledger that are in its graph and no matches of the front end.
     undone : frozenset of (int, int)
         Matches that are not in the run's graph, refused or taken out by hand: keys of the submap and of the one it
@@ -118,7 +118,7 @@ def choices_of_matches(
     alone = [d for d in loops if d.source != TIE]
     for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
         found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
-    needs = {(LOOP, d.loop): ties_entries(d.gates) for d in loops}
+    needs = {(LOOP, d.loop): overlap_entries(d.gates) for d in loops}
     out: dict[str, Chosen] = {}
     for name, chosen in found.items():
         entries = {(every[k].target, k[0]) for k in chosen if k in every}
@@ -133,8 +133,8 @@ def solve_choice(
     chosen: Chosen,
     config: BackEndConfig,
     *,
-    loops: Sequence[Decision] = (),
-    decided: Sequence[Decision] = (),
+    loops: Sequence[LoopDecision] = (),
+    decided: Sequence[LoopDecision] = (),
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
     imu: ImuPart | None = None,
@@ -145,9 +145,9 @@ def solve_choice(
     ----------
     config : BackEndConfig
         The run's.
-    loops : sequence of Decision
+    loops : sequence of LoopDecision
         With their measurements; those that are chosen become factors as they were in the run.
-    decided : sequence of Decision
+    decided : sequence of LoopDecision
         Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
     fixes, gps, imu
         See :func:`built`.

@@ -87,7 +87,7 @@ def two_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> TwoMaps | 
         return None
 
     def made(side: int) -> Rival:
-        with closer.tried([n for pair in pairs for n in pair[side]]) as inside:
+        with closer.with_trial_loops([n for pair in pairs for n in pair[side]]) as inside:
             recentred(graph, solver)
             s = solver.solution(gap=False)
             return Rival(tuple(inside), s.trajectory(), s.node_times, s.poses.copy())

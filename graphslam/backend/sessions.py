@@ -20,10 +20,16 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.graph_loops import GraphRelative
+from graphslam.loops.graph_loops import GraphRelativePoses
+from graphslam.loops.inter_session_loops import (
+    InterSessionConfig,
+    InterSessionLoops,
+    SessionMap,
+    TwoSessions,
+    session_start,
+)
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions, start_of
 from graphslam.solve.registry import Solver
 
 
@@ -153,7 +159,7 @@ class Attached:
     ----------
     known : DenseSession
         What it was tied to.
-    ties : Ties or None
+    ties : InterSessionLoops or None
         By appearance; None where GPS said where the session lies.
     used : list of Loop
         Ties in the graph at the end, those by proximity included; nodes of the graph.
@@ -163,7 +169,7 @@ class Attached:
 
     first_node: int
     known: DenseSession
-    ties: Ties | None
+    ties: InterSessionLoops | None
     used: list[Loop]
     dropped: int
 
@@ -175,8 +181,8 @@ def attach(
     known_node: int,
     new: DenseSession,
     *,
-    config: TieConfig | None = None,
-    found: tuple[TwoSessions, Ties] | None = None,
+    config: InterSessionConfig | None = None,
+    found: tuple[TwoSessions, InterSessionLoops] | None = None,
     use_gps: bool = True,
     progress: bool = False,
 ) -> Attached:
@@ -198,14 +204,14 @@ def attach(
     use_gps : bool
         With the new session's fixes, if it has any.
     """
-    c = TieConfig() if config is None else config
+    c = InterSessionConfig() if config is None else config
     if found is None:
         two = TwoSessions(known.map, new.map)
         found = two, two.find(c, progress=progress)
     two, ties = found
     if ties.why:
         raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
-    start = start_of(ties.chosen, graph.values.poses[known_node:], new.chain)
+    start = session_start(ties.chosen, graph.values.poses[known_node:], new.chain)
     node = put(graph, new, start, use_gps=use_gps)
     apart = two.thinned(ties.chosen, CandidateConfig().stretch)
     here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
@@ -308,7 +314,7 @@ def _near(
     row: dict[int, int] = {int(n): k for k, n in enumerate(places.node)}
     before = [(row[x.i], row[x.j]) for x in tied if x.i in row and x.j in row]
     config = CandidateConfig(least_gain=0.0, keep=40)
-    found = proximity_candidates(places, GraphRelative(graph), config, exclude=two.within, tried=before)
+    found = proximity_candidates(places, GraphRelativePoses(graph), config, exclude=two.within, tried=before)
     measured = [x for x in two.measurer.measure(found, progress=progress) if not x.why]
     nodes: Ints = places.node
     return [replace(x, i=int(nodes[x.i]), j=int(nodes[x.j])) for x in measured], len(found)

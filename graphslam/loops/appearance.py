@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level_poses
-from graphslam.loops.candidates import APPEARANCE, Candidate
+from graphslam.loops.candidates import APPEARANCE, LoopCandidate
 from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import PlaceDescriptors, descriptor_similarity
 
@@ -51,7 +51,7 @@ def appearance_candidates(
     config: AppearanceConfig | None = None,
     *,
     exclude: Collection[tuple[int, int]] = (),
-) -> list[Candidate]:
+) -> list[LoopCandidate]:
     """Pairs of places in different submaps that look alike, most alike first; one place of a stretch, not all.
 
     Parameters
@@ -63,7 +63,7 @@ def appearance_candidates(
 
     Returns
     -------
-    list of Candidate
+    list of LoopCandidate
         ``T_ij`` has no translation but the heading at which the two look most alike; its covariance is the stated one.
         ``facts``: ``correlation`` and ``lead``, by how much it is better than what was not taken.
     """
@@ -75,7 +75,7 @@ def appearance_candidates(
     tree = cKDTree(keys)
     g = group_of(places.T_base_node)
     covariance = _covariance(c, g.dim)
-    found: list[Candidate] = []
+    found: list[LoopCandidate] = []
     for j in range(len(places)):
         if places.way[j] < c.least_way:
             continue
@@ -95,7 +95,7 @@ def appearance_candidates(
             if correlation[k] < c.least or lead < c.lead:
                 break
             found.append(
-                Candidate(
+                LoopCandidate(
                     i=int(rows[k]),
                     j=j,
                     source=APPEARANCE,
@@ -129,9 +129,9 @@ def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int
     return out
 
 
-def _thinned(places: Places, found: list[Candidate], stretch: float) -> list[Candidate]:
+def _thinned(places: Places, found: list[LoopCandidate], stretch: float) -> list[LoopCandidate]:
     """One pair of two stretches, the best."""
-    kept: list[Candidate] = []
+    kept: list[LoopCandidate] = []
     for x in found:
         if all(
             abs(places.way[x.i] - places.way[y.i]) >= stretch or abs(places.way[x.j] - places.way[y.j]) >= stretch

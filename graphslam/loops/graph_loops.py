@@ -116,8 +116,8 @@ class GraphLoops:
         return {r.factor_id: float(v) for r, v in zip(blocks.records, blocks.d2)}
 
 
-class GraphRelative:
-    """A :class:`~graphslam.loops.places.Relative` of a graph at its values, which must be its optimum."""
+class GraphRelativePoses:
+    """A :class:`~graphslam.loops.places.RelativePoses` of a graph at its values, which must be its optimum."""
 
     def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph

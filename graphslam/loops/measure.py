@@ -13,7 +13,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.evidence.views import dense_view
-from graphslam.loops.candidates import FRONT_END, TIE, Candidate
+from graphslam.loops.candidates import FRONT_END, TIE, LoopCandidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
@@ -72,7 +72,7 @@ class LoopMeasurer:
         self.config = PairConfig() if config is None else config
         self._maps: dict[int, PreparedMap] = {}
 
-    def go_on(self, submaps: Sequence[Submap], places: Places) -> None:
+    def extend_chain(self, submaps: Sequence[Submap], places: Places) -> None:
         """The chain has grown; maps that are prepared stay so."""
         self.submaps, self.places = submaps, places
 
@@ -94,11 +94,11 @@ class LoopMeasurer:
                 break
             held -= self._maps.pop(k).nbytes
 
-    def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
+    def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
         """Loops of candidates, in their order; a front end's match or a tie is one already."""
         return [self.one(c) for c in tqdm(candidates, "matching submaps", disable=not progress, leave=False)]
 
-    def one(self, c: Candidate) -> Loop:
+    def one(self, c: LoopCandidate) -> Loop:
         """The loop of one candidate, accepted by the gates or not."""
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])

@@ -19,7 +19,7 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.log import SensorLog
 from graphslam.io.log_store import save_log
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 
 PLANE: dict[str, Any] = {"calibrate": {"use": "none"}}
 SUBMAPS = {"length": 1.5, "points": 300, "reach": 15.0}
@@ -47,14 +47,14 @@ class Seen(Observer):
         self.paths: list[Array] = []
         self.landmarks: list[Array] = []
         self.bases: list[Array] = []
-        self.decisions: list[Decision] = []
+        self.decisions: list[LoopDecision] = []
 
     def submap_added(self, submap: Any, graph: Any) -> None:
         self.paths.append(graph.values.poses.copy())
         self.landmarks.append(graph.values.landmarks.copy())
         self.bases.append(graph.values.poses[[s.node for s in graph.submaps]])
 
-    def loop_decided(self, decision: Decision, graph: Any) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: Any) -> None:
         self.decisions.append(decision)
 
     def solved(self, solution: Any) -> None:

@@ -18,7 +18,7 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.noise import RobustKernel
-from graphslam.loops.ledger import Decision, ledger_of_events
+from graphslam.loops.ledger import LoopDecision, ledger_of_events
 from graphslam.maps.alternatives import Alternative, chi2_of, choose, noise_scale
 from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
@@ -29,7 +29,7 @@ OPTIONS = BackEndConfig()
 
 
 @pytest.fixture(scope="module")
-def run() -> tuple[list[Submap], BackEnd, list[Decision], DividedSubmaps]:
+def run() -> tuple[list[Submap], BackEnd, list[LoopDecision], DividedSubmaps]:
     """Along a hall and back, its back end with the loops that it found, and the pieces of its map."""
     submaps, _ = there_and_back()
     back = BackEnd(BackEndConfig(loops=True), "batch")
@@ -163,7 +163,7 @@ def test_ties_of_one_pair_of_submaps_count_once(run: tuple) -> None:
     assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).ties == 0
 
 
-def _all(loops: list[Decision]) -> frozenset[tuple[int, int]]:
+def _all(loops: list[LoopDecision]) -> frozenset[tuple[int, int]]:
     return frozenset((LOOP, d.loop) for d in loops)
 
 

@@ -14,7 +14,7 @@ from graphslam.backend.back_end import Observer
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 from tests.app.run.test_pipeline_space import Ring, ring
 
@@ -31,7 +31,7 @@ class Listener(Observer):
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         self.told.append(("submap", (submap.key, len(graph.submaps))))
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         self.told.append(("loop", decision.loop))
 
     def solved(self, solution: Solution) -> None:

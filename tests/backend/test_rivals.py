@@ -10,7 +10,7 @@ import pytest
 from graphslam.backend.rivals import two_maps
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.loops.disputes import AMBIGUOUS
+from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.graph_loops import GraphLoops, chain_of_graph
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop

@@ -31,11 +31,11 @@ from graphslam.evidence.views import dense_view
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.judge import settled_loops
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
+from graphslam.loops.map_overlap_test import Witness
 from graphslam.loops.measure import Loop, LoopMeasurer
-from graphslam.loops.places import ChainRelative, Places, places_of
-from graphslam.loops.witness import Witness
+from graphslam.loops.places import ChainRelativePoses, Places, loop_places
 from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
 from graphslam_frontends.grid.filter_drift import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
@@ -107,14 +107,18 @@ def nees(net: LoopNetwork, truth: Array) -> float:
     return float(np.mean(np.einsum("ki,kij,kj->k", e, np.linalg.inv(S), e)) / 6)
 
 
-def closed(chain: ChainRelative, loops: list[Loop], witness: Witness | None = None) -> tuple[LoopNetwork, LoopCloser]:
+def closed(
+    chain: ChainRelativePoses, loops: list[Loop], witness: Witness | None = None
+) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
-    closer = LoopCloser(net, chain.increments, chain.covariances, judge=settled_loops, witness=witness)
+    closer = LoopCloser(
+        net, chain.increments, chain.covariances, judge=truncated_least_squares_inliers, witness=witness
+    )
     closer.propose(loops)
     return net, closer
 
 
-def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
+def wrong_table(chain: ChainRelativePoses, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
     """Precision and recall of decisions, and the ATE against that of the clean run."""
     clean = ate(closed(chain, loops, witness)[0].poses[: len(truth)], truth)
     for kind in KINDS:
@@ -171,8 +175,8 @@ def main() -> None:
     for name in ["garage-A:3"] if args.quick else args.worlds:
         world, seed = name.split(":")
         submaps, times, path = submaps_of(world, int(seed), args.cache)
-        places = places_of(submaps)
-        truth, chain = true_places(submaps, places, times, path), ChainRelative(submaps, places)
+        places = loop_places(submaps)
+        truth, chain = true_places(submaps, places, times, path), ChainRelativePoses(submaps, places)
         begin = time.perf_counter()
         config = CandidateConfig(height=2.0 if world == "mine" else 1.0)
         candidates = proximity_candidates(places, chain, config)

@@ -253,9 +253,9 @@ def finished_run() -> Path:
         "lever": gps.lever, "fitted": np.int64(3), "outside": np.int64(0), "in_gap": np.int64(0),
     }  # fmt: skip
     write_npz(out / "gps_all.npz", {"format": "graphslam.gps-residuals/1", **residuals})
-    from graphslam.loops.ledger import Decision
+    from graphslam.loops.ledger import LoopDecision
 
-    loop = Decision(
+    loop = LoopDecision(
         loop=0, verdict="accepted", why="because", i=0, j=1, submap_i=0, submap_j=1, source="proximity", factor_id=9,
         T_ij=[1.0, 0.0, 0.0], covariance=np.eye(3).tolist(), gates={"fitness": 0.5, "entries": [[0, 1]]}, chi2=1.0,
         score=0.5, gain=1.0, effect=0.1, effect_predicted=0.1, effect_earlier=0.0,

@@ -16,7 +16,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
 from graphslam.loops.loops import LoopCloser
-from graphslam.loops.places import places_of
+from graphslam.loops.places import loop_places
 from graphslam.solve.batch import BatchSolver
 from tests.reference.loop_chain import STEP, chain_of, loop_of, right_loops, square_poses
 from tests.reference.loop_network import LoopNetwork
@@ -100,7 +100,7 @@ def test_undo_gives_the_evidence_back() -> None:
 def test_places_of_a_graph_are_those_of_its_submaps() -> None:
     poses = square_poses(3, nodes=73)
     submaps = submaps_of(poses, np.random.default_rng(2))
-    ours, plain = graph_of(submaps).places, places_of(submaps, 3.0)
+    ours, plain = graph_of(submaps).places, loop_places(submaps, 3.0)
     np.testing.assert_allclose(ours.T_base_node, plain.T_base_node, atol=1e-9)
     np.testing.assert_array_equal(ours.submap, plain.submap)
     np.testing.assert_allclose(ours.time, plain.time)

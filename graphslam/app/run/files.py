@@ -28,7 +28,7 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 from graphslam.evaluate.metrics import FigureTable
-from graphslam.loops.ledger import EVENT, Decision, LoopLedger, ledger_of_events
+from graphslam.loops.ledger import EVENT, LoopDecision, LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 
 GENERATION_EVENT = "generation"
@@ -366,7 +366,7 @@ def loops_of_run(folder: str | Path) -> LoopLedger:
     return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
 
 
-def undone_of_run(folder: str | Path) -> list[Decision]:
+def undone_of_run(folder: str | Path) -> list[LoopDecision]:
     """Loops that were taken out of a finished run by hand; none where a run was not finished."""
     if not (outputs(folder) / "events.jsonl").is_file():
         return []

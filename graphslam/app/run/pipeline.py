@@ -86,7 +86,7 @@ from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.maps.contradictions import Contradictions
 from graphslam.maps.global_map import GlobalMap, make_map
 from graphslam.maps.refined import map_of_frames
@@ -109,7 +109,7 @@ def run(
     config: Mapping[str, Any] | None = None,
     resume: bool = False,
     progress: bool = True,
-    undo: Sequence[int | Decision] | None = None,
+    undo: Sequence[int | LoopDecision] | None = None,
     observers: Sequence[Observer] = (),
     reader: str | None = None,
     reader_options: Mapping[str, Any] | None = None,
@@ -135,7 +135,7 @@ def run(
         Go on after the last finished submap of ``out``, to the same result.
     progress : bool
         Show a progress bar on stderr.
-    undo : sequence of int or Decision, optional
+    undo : sequence of int or LoopDecision, optional
         Loops that are taken out again at the end, by their numbers in the ledger of loops, or as an earlier ledger has
         them. By default those that were undone before where the run is resumed, none otherwise.
     observers : sequence of Observer
@@ -212,7 +212,7 @@ def _run(
     config: Mapping[str, Any],
     resume: bool,
     progress: bool,
-    undo: Sequence[int | Decision] | None,
+    undo: Sequence[int | LoopDecision] | None,
     observers: Sequence[Observer],
 ) -> Run:
     begin = time.perf_counter() - loading
@@ -230,7 +230,7 @@ def _run(
     effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
     back = back_end(RecordSource(log), settings, solver, [ProgressBar(log, progress), *observers])
 
-    def finish(folder: RunFolder | None, undone: Sequence[int | Decision]) -> Run:
+    def finish(folder: RunFolder | None, undone: Sequence[int | LoopDecision]) -> Run:
         tree = SeedTree(seed)
         work = FrontToBack(RecordSource(log), front, back, tree, folder, with_grids(settings))
         work.step()
@@ -258,7 +258,7 @@ def finished(
     effective: dict[str, Any],
     seconds: dict[str, float],
     begin: float,
-    undo: Sequence[int | Decision],
+    undo: Sequence[int | LoopDecision],
     noticed: Sequence[Noticed],
     *,
     progress: bool,
@@ -304,14 +304,14 @@ def at_rest(work: FrontToBack) -> None:
     trim_heap()
 
 
-def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
+def again(folder: str | Path, undo: Sequence[LoopDecision], *, progress: bool = True) -> Run:
     """Make a finished run again from what its folder holds, without these loops, and write its files anew.
 
     No log is read, and no submap made.
 
     Parameters
     ----------
-    undo : sequence of Decision
+    undo : sequence of LoopDecision
         Loops that are taken out.
     progress : bool
         Show a progress bar on stderr.
@@ -456,7 +456,7 @@ def _solved(
     begin: float,
     work: FrontEndWork,
     effective: dict[str, Any],
-    undo: Sequence[int | Decision],
+    undo: Sequence[int | LoopDecision],
     draw: int,
     attempts: _Attempts,
 ) -> None:

@@ -24,7 +24,7 @@ from graphslam.evidence.views import has_dense_view
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.session_ties import SessionMap
+from graphslam.loops.inter_session_loops import SessionMap
 
 SPACING = 3.0
 """Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""

@@ -25,8 +25,8 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.inter_session_loops import InterSessionConfig, InterSessionLoops, SessionMap, TwoSessions
 from graphslam.loops.measure import Loop
-from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions
 from graphslam.solve.registry import make_solver
 
 
@@ -38,7 +38,7 @@ class Localisation:
     ----------
     why : str
         Why nothing is known; empty if it was found.
-    ties : Ties
+    ties : InterSessionLoops
         Every place that was tried, and what came of it.
     used : list of Loop
         Ties that the pose rests on.
@@ -50,7 +50,7 @@ class Localisation:
     """
 
     why: str
-    ties: Ties
+    ties: InterSessionLoops
     used: list[Loop]
     T_map_base: Array | None = None
     covariance: Array | None = None
@@ -78,7 +78,7 @@ def localise(
     run: Run | str | Path,
     source: Submap | Sequence[Submap] | SensorLog,
     *,
-    config: TieConfig | None = None,
+    config: InterSessionConfig | None = None,
     solver: str = "batch",
     progress: bool = False,
 ) -> Localisation:
@@ -93,7 +93,7 @@ def localise(
         Of dense submaps.
     source : Submap, sequence of Submap, or SensorLog
         A log goes through the front end of the run, with its options: slice it to the stretch that is to be found.
-    config : TieConfig, optional
+    config : InterSessionConfig, optional
     solver : str
     progress : bool
         Show progress bars on stderr.
@@ -125,7 +125,7 @@ def localise(
             submaps = window_submaps(opened, source)
         else:
             submaps = [source] if isinstance(source, Submap) else list(source)
-        return _localise(opened, submaps, config or TieConfig(), solver, progress)
+        return _localise(opened, submaps, config or InterSessionConfig(), solver, progress)
 
 
 def source_of(
@@ -180,7 +180,9 @@ def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
     return submaps
 
 
-def _localise(run: Run, submaps: list[Submap], config: TieConfig, solver_name: str, progress: bool) -> Localisation:
+def _localise(
+    run: Run, submaps: list[Submap], config: InterSessionConfig, solver_name: str, progress: bool
+) -> Localisation:
     known = session_of(run, "map")
     new = _query(run, known, submaps)
     two = TwoSessions(known.map, new.map)

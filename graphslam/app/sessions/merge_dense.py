@@ -22,7 +22,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, base_metrics
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.session_ties import TieConfig
+from graphslam.loops.inter_session_loops import InterSessionConfig
 from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
@@ -95,7 +95,7 @@ def merge_dense(
     *,
     by: By = "auto",
     solver: str = "batch",
-    config: TieConfig | None = None,
+    config: InterSessionConfig | None = None,
     progress: bool = False,
 ) -> MergedSubmaps:
     """Merge runs of dense submaps into one graph, and solve it as one problem.
@@ -111,7 +111,7 @@ def merge_dense(
         Of the sessions, each once.
     by : {"auto", "places", "gps"}
         ``auto``: GPS where both have it, and then places that it brings together; else places.
-    config : TieConfig, optional
+    config : InterSessionConfig, optional
         When ties by places are believed.
     progress : bool
         Show progress bars on stderr.
@@ -170,7 +170,7 @@ def _tie(
     known_node: int,
     new: DenseSession,
     by: By,
-    config: TieConfig | None,
+    config: InterSessionConfig | None,
     progress: bool,
 ) -> Attached:
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))

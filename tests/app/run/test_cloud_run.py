@@ -26,7 +26,7 @@ from graphslam.core.poses import SE3
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -93,7 +93,7 @@ class Listener(Observer):
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         self.told.append(submap.key)
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         if decision.verdict == "accepted":
             assert decision.factor_id in graph.records
             self.told.append((decision.submap_i, decision.submap_j))

@@ -19,7 +19,7 @@ from graphslam.app.run.run import Run
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.loops import loops as decisions
-from graphslam.loops.disputes import AMBIGUOUS
+from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -58,7 +58,7 @@ def disputed(log: SensorLog, folder: Path) -> Run:
     with pytest.MonkeyPatch.context() as patch:
         measure = LoopMeasurer.measure
         patch.setattr(LoopMeasurer, "measure", lambda self, c, **k: shifted(measure(self, c, **k)))
-        patch.setattr(decisions, "weigh", lambda *_: ("ambiguous", f"{AMBIGUOUS}, two groups: by the test"))
+        patch.setattr(decisions, "choose_group", lambda *_: ("ambiguous", f"{AMBIGUOUS}, two groups: by the test"))
         return run(log, frontend="segslam", seed=2, out=folder, config=OPTIONS, progress=False)
 
 

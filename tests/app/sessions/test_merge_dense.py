@@ -34,7 +34,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.session_ties import TieConfig, TwoSessions
+from graphslam.loops.inter_session_loops import InterSessionConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.base import FrontEnd
@@ -263,7 +263,7 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     """Ties that agree, all of them 9 m off: what is brought near each other by them does not match."""
     known, new = (session_of(r, name, first_key=10 * k, after=1e4 * k) for k, (r, name) in enumerate(zip(runs, "ab")))
     two = TwoSessions(known.map, new.map)
-    found = two.find(TieConfig())
+    found = two.find(InterSessionConfig())
     shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
     wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
     for ties, named in ((wrong, r"b: \d+ ties to a agree .* looks alike"), (found, "")):
@@ -273,7 +273,7 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
         solver.solve_to_optimum()
         if named:
             with pytest.raises(SolverError, match=named):
-                attach(graph, solver, known, 0, new, found=(two, ties), config=TieConfig(heard=1))
+                attach(graph, solver, known, 0, new, found=(two, ties), config=InterSessionConfig(heard=1))
         else:
             assert len(attach(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
 

@@ -26,7 +26,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
 from graphslam.core.submap import Submap
-from graphslam.loops.candidates import TIE, Candidate
+from graphslam.loops.candidates import TIE, LoopCandidate
 from graphslam.loops.places import Places
 
 Entry = tuple[int, int]
@@ -34,7 +34,7 @@ Entry = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TieConfig:
+class OverlapConfig:
     """Where ties are, and how well a map places a body."""
 
     spacing: float = 6.0
@@ -67,9 +67,9 @@ class TieConfig:
         return np.diag(s**2)
 
 
-def tie_candidates(
-    submaps: Sequence[Submap], places: Places, entries: Collection[Entry] = (), config: TieConfig | None = None
-) -> list[Candidate]:
+def overlap_candidates(
+    submaps: Sequence[Submap], places: Places, entries: Collection[Entry] = (), config: OverlapConfig | None = None
+) -> list[LoopCandidate]:
     """Places of submaps beside an earlier stretch of a map that held the body there.
 
     Parameters
@@ -82,14 +82,14 @@ def tie_candidates(
 
     Returns
     -------
-    list of Candidate
+    list of LoopCandidate
         Along the way. ``facts["entries"]`` names the entries by which the two places are in one map (none: it is the
         submap's own).
     """
-    c = TieConfig() if config is None else config
+    c = OverlapConfig() if config is None else config
     number = {s.key: k for k, s in enumerate(submaps)}
     seen = _frames(submaps, number, set(entries))
-    out: list[Candidate] = []
+    out: list[LoopCandidate] = []
     for k in range(len(submaps)):
         mine = places.of_submap(k)
         last = -math.inf
@@ -103,7 +103,7 @@ def tie_candidates(
             i, T, by = found
             last = way
             out.append(
-                Candidate(
+                LoopCandidate(
                     i=i, j=j, source=TIE, T_ij=T, covariance=c.covariance(group_of(T)), gain=math.nan, score=1.0,
                     facts={"entries": [list(e) for e in by]},
                 )
@@ -111,7 +111,7 @@ def tie_candidates(
     return out
 
 
-def ties_entries(gates: Mapping[str, Any]) -> set[Entry]:
+def overlap_entries(gates: Mapping[str, Any]) -> set[Entry]:
     """The entries that a tie needs, from the figures of its loop; of another loop none."""
     return {(int(a), int(b)) for a, b in gates.get("entries", ())}
 
@@ -141,7 +141,7 @@ def _went_on(s: Submap, target: int) -> bool:
     return bool(s.report.get("entered") == "match")
 
 
-def _beside(places: Places, j: int, seen: _Seen, c: TieConfig) -> tuple[int, Array, tuple[Entry, ...]] | None:
+def _beside(places: Places, j: int, seen: _Seen, c: OverlapConfig) -> tuple[int, Array, tuple[Entry, ...]] | None:
     """The nearest earlier place of a map to place ``j`` there: (place, ``T_ij``, by which entries)."""
     T_j = places.T_base_node[j]
     g = group_of(T_j)

@@ -31,7 +31,7 @@ GRAIN = 0.5 / math.sqrt(500)
 """Least σ of the angle of a share: that of counting in 500 points."""
 
 
-def log_ratio(right: Array, moved: Array, first: Array, second: Array) -> float:
+def overlap_log_likelihood_ratio(right: Array, moved: Array, first: Array, second: Array) -> float:
     """Logarithm of how much likelier the shares of contradiction are if the first of two solutions is right.
 
     Parameters
@@ -52,7 +52,7 @@ def log_ratio(right: Array, moved: Array, first: Array, second: Array) -> float:
     return float(np.sum(good(first) - bad(first) - good(second) + bad(second)))
 
 
-def of_pairs(loops: Sequence[Loop], shares: Array) -> Array:
+def disagreement_shares(loops: Sequence[Loop], shares: Array) -> Array:
     """Mean share of each pair of submaps: its places see the same walls, and are one piece of evidence."""
     _, row = np.unique(np.sort([x.submaps for x in loops], axis=1), axis=0, return_inverse=True)
     return np.asarray(np.bincount(row.ravel(), weights=shares) / np.bincount(row.ravel()))

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.geometry import Array
-from graphslam.loops.witness import ERROR
+from graphslam.loops.map_overlap_test import ERROR
 
 DOUBT = 4.0
 """A side is believed if the other's χ² is greater by so much: odds of e² to 1."""
@@ -42,7 +42,7 @@ SETTLED = ("dispute", AMBIGUOUS)
 Outcome = Literal["stays", "changes", "ambiguous"]
 
 
-def disputes(
+def find_conflicting_groups(
     D2: Array, inside: int, ends: npt.NDArray[np.int64], clash: float, least: int = 2
 ) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
     """Sides that contradict each other.
@@ -78,7 +78,7 @@ def disputes(
     return found
 
 
-def weigh(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outcome, str]:
+def choose_group(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outcome, str]:
     """Which of two sides is believed, and why in words.
 
     Parameters
@@ -86,8 +86,9 @@ def weigh(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outcome, st
     inside, outside : (a,), (b,)
         χ² of the loops of the side in the graph and of the other, against the graph without either.
     maps : float
-        Log of how much likelier the maps are with the other side (:func:`graphslam.loops.witness.log_ratio`). Against
-        one loop alone nothing else speaks.
+        Log of how much likelier the maps are with the other side
+        (:func:`graphslam.loops.map_overlap_test.overlap_log_likelihood_ratio`). Against one loop alone nothing else
+        speaks.
     """
     own, other = float(np.median(inside)), float(np.median(outside))
     score = own - other + MAJORITY * (len(outside) - len(inside))

@@ -28,7 +28,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
-from graphslam.loops.candidates import Candidate, thinned
+from graphslam.loops.candidates import LoopCandidate, thin_candidates
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import Ints, Places
 from graphslam.registration.pair_config import PairConfig
@@ -44,7 +44,7 @@ _APART = 1000.0  # sessions lie so far apart along the common way [m]: no two of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TieConfig:
+class InterSessionConfig:
     """When ties between two sessions are believed."""
 
     top: int = 3
@@ -131,7 +131,7 @@ class SessionMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ties:
+class InterSessionLoops:
     """What was tried to tie one session to another, and what came of it.
 
     Parameters
@@ -219,13 +219,13 @@ class TwoSessions:
         m = n + len(self.new.submaps)
         return {*combinations(range(n), 2), *combinations(range(n, m), 2)}
 
-    def candidates(self, config: TieConfig) -> list[Candidate]:
+    def candidates(self, config: InterSessionConfig) -> list[LoopCandidate]:
         """Places of the new session that look like places of the map."""
         appearance = AppearanceConfig(top=config.top, least=config.alike, lead=0.0, stretch=config.stretch)
         both = concatenate_descriptors([self.known.descriptors, self.new.descriptors])
         return appearance_candidates(self.places, both, appearance, exclude=self.within)[: config.keep]
 
-    def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
+    def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
         """Registered; ``i`` and ``j`` are nodes of the chain of both."""
         found = self.measurer.measure(candidates, progress=progress)
         node = self.places.node
@@ -239,7 +239,7 @@ class TwoSessions:
             seen.add((x.i, x.j))
         return loops
 
-    def agree(self, loops: Sequence[Loop], config: TieConfig) -> Ties:
+    def agree(self, loops: Sequence[Loop], config: InterSessionConfig) -> InterSessionLoops:
         """The largest set of measured ties that agree with each other, and whether it is to be believed.
 
         Parameters
@@ -249,7 +249,7 @@ class TwoSessions:
 
         Returns
         -------
-        Ties
+        InterSessionLoops
             Its nodes ``j`` are those of the new session's own chain.
         """
         good = np.array([k for k, x in enumerate(loops) if not x.why], dtype=np.int64)
@@ -277,11 +277,11 @@ class TwoSessions:
         elif rival > config.rival * n:
             why = f"{counts}, but {rival} others agree on another pose: this could be two places"
         own = [replace(x, j=x.j - self.offset) for x in loops]
-        return Ties(loops=tuple(own), accepted=accepted, reasons=tuple(reasons), why=why, rival=rival)
+        return InterSessionLoops(loops=tuple(own), accepted=accepted, reasons=tuple(reasons), why=why, rival=rival)
 
-    def find(self, config: TieConfig | None = None, *, progress: bool = False) -> Ties:
+    def find(self, config: InterSessionConfig | None = None, *, progress: bool = False) -> InterSessionLoops:
         """Candidates by appearance, registered, agreed upon."""
-        c = TieConfig() if config is None else config
+        c = InterSessionConfig() if config is None else config
         return self.agree(self.measure(self.candidates(c), progress=progress), c)
 
     def thinned(self, loops: Sequence[Loop], stretch: float) -> list[Loop]:
@@ -290,7 +290,7 @@ class TwoSessions:
         Parameters
         ----------
         loops : sequence of Loop
-            Of :class:`Ties`.
+            Of :class:`InterSessionLoops`.
         stretch : float
             [m]
         """
@@ -298,7 +298,7 @@ class TwoSessions:
             return []
         target = self.known.places.submap[[x.i for x in loops]]
         way = self.new.places.way[[x.j for x in loops]]
-        chosen = thinned(target, way, np.array([x.score for x in loops]), stretch, len(loops))
+        chosen = thin_candidates(target, way, np.array([x.score for x in loops]), stretch, len(loops))
         return [loops[k] for k in sorted(chosen)]
 
     def _rows(self, loops: Sequence[Loop]) -> Ints:
@@ -318,7 +318,7 @@ class TwoSessions:
         return D
 
 
-def start_of(ties: Sequence[Loop], known: Array, new: Array) -> Array:
+def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
     """Where a session begins in the map by the middlemost of its ties: the start value of a solver.
 
     Parameters

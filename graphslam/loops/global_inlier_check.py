@@ -19,7 +19,7 @@ from graphslam.solve.network.robust import truncated_least_squares
 LEVEL = 0.9999
 
 
-def settled_loops(
+def truncated_least_squares_inliers(
     increments: Array,
     covariances: Array,
     loops: tuple[npt.NDArray[np.int64], Array, Array],
