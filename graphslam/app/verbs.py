@@ -36,7 +36,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.join import registry as joining
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 from graphslam_frontends.odometry.make_steps import make_steps
@@ -226,7 +226,7 @@ def refine_path(
             wanted=f"{cut.times[0]:.3f} to {cut.times[-1]:.3f} s",
         )
     with one_blas_thread():
-        return refine(Scans.of(cut), start.interpolate(cut.times), config)
+        return refine_by_scans(Scans.of(cut), start.interpolate(cut.times), config)
 
 
 def compare(

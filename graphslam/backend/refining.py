@@ -25,8 +25,8 @@ from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import moving_points, without_moving
 from graphslam.maps.refined import base_frames, refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.guides import FAR, apart
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
+from graphslam.refine.revisit_constraints import FAR, tangent_lengths
 from graphslam.refine.scans import Scans
 
 logger = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ def refine_run(
     path = m.trajectory
     try:
         start = path.interpolate(np.clip(scans.times, path.times[0], path.times[-1]))
-        found = refine(scans, start, config, gps=gps, progress=progress)
+        found = refine_by_scans(scans, start, config, gps=gps, progress=progress)
         if not found.better:
             text = (
                 "The path was not refined by its scans: they agree less at the refined path "
@@ -174,7 +174,7 @@ def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, f
         return []
     g, T = group_of(m.node_poses), np.array([r.T_ij for r in ends])
     i, j = np.array([(r.i, r.j) for r in ends]).T
-    off, turned = apart(g.log(g.between(T, g.between(m.node_poses[i], m.node_poses[j]))), g)
+    off, turned = tangent_lengths(g.log(g.between(T, g.between(m.node_poses[i], m.node_poses[j]))), g)
     wrong = np.flatnonzero((off > FAR[0]) | (turned > FAR[1]))
     wrong = wrong[np.argsort(-off[wrong], kind="stable")]
     return [(int(i[k]), int(j[k]), float(off[k]), float(turned[k])) for k in wrong]

@@ -27,7 +27,7 @@ from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.refined import heading_error
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
@@ -121,7 +121,7 @@ class RefinementTrial(GraphTrial):
             np.clip(scans.times, self.steps.times[0], self.steps.times[-1])
         )
         wall, cpu = perf_counter(), process_time()
-        found = refine(scans, start, self.study.refine)
+        found = refine_by_scans(scans, start, self.study.refine)
         yield Measurement(kind, "seconds_refine", perf_counter() - wall, timing=True)
         yield Measurement(kind, "cpu_share", (process_time() - cpu) / float(scans.times[-1]), timing=True)
         before = judge.path_errors(Trajectory(scans.times, start), true)

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
-from graphslam.refine.motion import Terms
-from graphslam.refine.problem import Solved
-from graphslam.refine.surfaces import NEIGHBOURS, Cloud
+from graphslam.refine.motion import MotionTerms
+from graphslam.refine.problem import LinearisedProblem
+from graphslam.refine.surfaces import NEIGHBOURS, ScanReturns
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -34,7 +34,7 @@ ACCEPTED = 16.8
 
 
 @dataclass(frozen=True, slots=True)
-class Guides:
+class RevisitConstraints:
     """Relative poses of passes in the start.
 
     Parameters
@@ -51,7 +51,7 @@ class Guides:
     def __len__(self) -> int:
         return len(self.steps)
 
-    def terms(self, path: Array, weights: Array) -> Terms:
+    def terms(self, path: Array, weights: Array) -> MotionTerms:
         """Factors at a path, weighted ``(m,)``."""
         g = group_of(path)
         a, b = self.steps.T
@@ -60,7 +60,7 @@ class Guides:
         Jr = np.linalg.inv(g.right_jacobian(e))
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr], axis=2)
         W = np.sqrt(weights)[:, None] / _sigmas(g)
-        return Terms(W * e, W[..., None] * J, self.steps, (g.dof, g.dof), "guides")
+        return MotionTerms(W * e, W[..., None] * J, self.steps, (g.dof, g.dof), "guides")
 
     def squared(self, path: Array) -> Array:
         """χ² of each ``(m,)``."""
@@ -73,10 +73,10 @@ class Guides:
         """Which are wrong by more than a path is ever bent within what it knows: more than a scan could bridge."""
         g = group_of(path)
         a, b = self.steps.T
-        off, turned = apart(g.log(g.between(self.poses, g.between(path[a], path[b]))), g)
+        off, turned = tangent_lengths(g.log(g.between(self.poses, g.between(path[a], path[b]))), g)
         return np.asarray((off > FAR[0]) | (turned > FAR[1]), dtype=np.bool_)
 
-    def distances(self, path: Array, solved: Solved, width: int) -> Array:
+    def distances(self, path: Array, solved: LinearisedProblem, width: int) -> Array:
         """Mahalanobis distances ``(m,)``, squared, of the guides from a path whose covariance is known.
 
         The covariance of scans of neighbours alone promises up to :data:`DOUBT` times too much.
@@ -95,7 +95,7 @@ class Guides:
         return out
 
 
-def apart(e: Array, g: Group) -> tuple[Array, Array]:
+def tangent_lengths(e: Array, g: Group) -> tuple[Array, Array]:
     """Way [m] and turn [rad] of tangents ``(m, d)``, each ``(m,)``."""
     turn = np.delete(e, np.r_[g.position], axis=1)
     return np.linalg.norm(e[:, g.position], axis=1), np.linalg.norm(turn, axis=1)
@@ -107,7 +107,7 @@ def _sigmas(g: Group) -> Array:
     return s
 
 
-def find_guides(cloud: Cloud, start: Array, reach: float) -> Guides:
+def find_revisit_constraints(cloud: ScanReturns, start: Array, reach: float) -> RevisitConstraints:
     """The nearest chunk of every other pass within ``reach`` [m] of each chunk, at the start ``(n, 7|3)``."""
     d, C = cloud.points.shape[1], cloud.chunks
     first = np.searchsorted(cloud.chunk, np.arange(C))
@@ -118,7 +118,7 @@ def find_guides(cloud: Cloud, start: Array, reach: float) -> Guides:
     pairs = np.sort(pairs, axis=1)
     pairs = pairs[pairs[:, 1] - pairs[:, 0] > NEIGHBOURS]
     if not len(pairs):
-        return Guides(np.zeros((0, 2), np.int64), np.zeros((0, start.shape[1])))
+        return RevisitConstraints(np.zeros((0, 2), np.int64), np.zeros((0, start.shape[1])))
     distance = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))
     pairs, distance = pairs[order], distance[order]
@@ -129,4 +129,4 @@ def find_guides(cloud: Cloud, start: Array, reach: float) -> Guides:
     chosen = best[np.unique(group[best], return_index=True)[1]]
     steps = middle[pairs[chosen]]
     g = group_of(start)
-    return Guides(steps, g.between(start[steps[:, 0]], start[steps[:, 1]]))
+    return RevisitConstraints(steps, g.between(start[steps[:, 0]], start[steps[:, 1]]))
