@@ -79,7 +79,7 @@ class Estimate:
         elif not self.gain > GAIN:
             why = f"it gains {max(self.gain, 0.0):.1f} nats over noise alone, and more than {GAIN:g} are asked for"
         elif abs(self.value - self.other) > AGREE * math.hypot(self.sigma, self.other_sigma):
-            why = f"windows of another length say {in_words(self.name, self.other, self.other_sigma)}"
+            why = f"windows of another length say {estimate_text(self.name, self.other, self.other_sigma)}"
         return replace(self, why_not=why)
 
 
@@ -178,7 +178,7 @@ class Calibration:
                 Finding("", "calibrated", text) if taken == "all" else Finding("look", "calibration-refused", text)
             )
         for e in self.estimates:
-            said = in_words(e.name, e.value, e.sigma)
+            said = estimate_text(e.name, e.value, e.sigma)
             if e.applied:
                 text = f"Calibrated from {self.data}: {said}: {MENDED[e.name]} (gain {e.gain:.0f} nats)."
                 out.append(Finding("", "calibrated", text))
@@ -189,7 +189,7 @@ class Calibration:
         if chance:
             out.append(Finding("", "calibrated", f"No lasting error was found of {' or '.join(chance)}."))
         if self.noise:
-            text = f"Noise from {self.data}: {noise_in_words(self.noise)}{', not used' * (taken == 'nothing')}."
+            text = f"Noise from {self.data}: {noise_text(self.noise)}{', not used' * (taken == 'nothing')}."
             if self.corrections.widen_only:
                 text += " Where the log states a larger one, that one counts."
             out.append(Finding("", "calibrated", text))
@@ -197,9 +197,9 @@ class Calibration:
 
     def contradictions(self) -> list[str]:
         """What is too large for an error of sensors that work, in words; then nothing of the calibration is used."""
-        out = [in_words(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
+        out = [estimate_text(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
         large = {k: v for k, v in self.noise.items() if v > LARGEST_NOISE.get(k, math.inf)}
-        return out + ([f"noise {noise_in_words(large)}"] if large else [])
+        return out + ([f"noise {noise_text(large)}"] if large else [])
 
     def config(self) -> dict[str, Any]:
         """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""
@@ -247,7 +247,7 @@ MENDED = {
 }
 
 
-def in_words(name: str, value: float, sigma: float) -> str:
+def estimate_text(name: str, value: float, sigma: float) -> str:
     """A constant with its σ as a sentence without an end."""
     deg = np.rad2deg
     if name == "yaw_bias":
@@ -273,7 +273,7 @@ def in_words(name: str, value: float, sigma: float) -> str:
     return f"{name} {value:.4g} ± {sigma:.2g}"
 
 
-def noise_in_words(noise: dict[str, float]) -> str:
+def noise_text(noise: dict[str, float]) -> str:
     """Standard deviations as a list."""
     units = {
         "along_metre": ("along the way", "m/√m"),
@@ -291,7 +291,7 @@ def noise_in_words(noise: dict[str, float]) -> str:
     return ", ".join(found)
 
 
-def rounded(x: float) -> float:
+def round_digits(x: float) -> float:
     """Five digits: what is written is what is used, on every machine."""
     return float(f"{x:.5g}")
 

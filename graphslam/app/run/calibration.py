@@ -14,10 +14,10 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import calibrate_streams
-from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibrated
-from graphslam.calibrate.estimate import NAMES, SURE, Calibration, in_words
-from graphslam.calibrate.sighted import FULL, QUICK, Effort, calibrate_sightings
-from graphslam.calibrate.windows import Seen
+from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections
+from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
+from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_sightings
+from graphslam.calibrate.windows import SightingLog
 from graphslam.core.config import merge_options
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
@@ -57,7 +57,7 @@ def prepared(
     """
     if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "Noise and lasting errors are those given in calibrate.given.")]
-        return calibrated(log, config.given), config, said, None
+        return apply_corrections(log, config.given), config, said, None
     if config.use == "none" or not looks_at(front):
         return log, config, [], None
     if config.use == "auto" and own:
@@ -66,7 +66,7 @@ def prepared(
     try:
         found = calibration(log, front, effort, seed=seed)
         given = chosen(found.corrections, front, options)
-        return calibrated(log, given), replace(config, given=given), found.findings(), found
+        return apply_corrections(log, given), replace(config, given=given), found.findings(), found
     except GraphSlamError as error:
         said = [Finding("", "calibrated", f"Noise could not be told from the log: {error}. Its defaults are used.")]
         return log, config, said, None
@@ -150,7 +150,7 @@ def front_kind(front: FrontEnd) -> str | None:
     return "scans" if "steps" in hints else None
 
 
-def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 0) -> Calibration:
+def calibration(log: SensorLog, front: FrontEnd, effort: CalibrationBudget, *, seed: int = 0) -> Calibration:
     """What the log says of its noise, of the streams that the front end reads."""
     kind = front_kind(front)
     if kind is None:
@@ -215,14 +215,14 @@ def named_causes(
     if not chi2_per_dof > max(two_sided(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
         return []
     try:
-        found = calibrate_sightings(Seen.of(log, name, log[name]), QUICK)
+        found = calibrate_sightings(SightingLog.of(log, name, log[name]), QUICK)
     except GraphSlamError:
         return []
     own = ("range_scale", "range_offset") if ranges_corrected else ()
     out = []
     for e in found.estimates:
         if e.applied and e.name not in own:
-            text = f"A cause of the disagreement: {in_words(e.name, e.value, e.sigma)} (gain {e.gain:.0f} nats). "
+            text = f"A cause of the disagreement: {estimate_text(e.name, e.value, e.sigma)} (gain {e.gain:.0f} nats). "
             text += "To do: --set calibrate.use=always, or `graphslam calibrate`; a scale on covariances is no cure."
             out.append(Finding("bad", "calibration", text))
     return out
@@ -244,7 +244,7 @@ def lasting_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
     if not facts:
         return []
-    said = [in_words(r["name"], r["value"], r["sigma"]) for r in sure]
+    said = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
     rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
     text = (
         "Constant errors of wheels and sensor were estimated with the map, and its covariances hold what is not told "
@@ -255,7 +255,9 @@ def lasting_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     text += f". Not told from zero: {', '.join(rest)}." if rest else "."
     out = [Finding("", "lasting", text)]
     if wild:
-        text = f"{'; '.join(in_words(r['name'], r['value'], r['sigma']) for r in wild)}: far more than a sensor that "
+        text = (
+            f"{'; '.join(estimate_text(r['name'], r['value'], r['sigma']) for r in wild)}: far more than a sensor that "
+        )
         text += "works errs. To do: check its unit, its sign and its mounting; `graphslam data check`."
         out.append(Finding("bad", "lasting", text))
     return out

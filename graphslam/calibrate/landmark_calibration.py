@@ -12,10 +12,10 @@ import numpy as np
 
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.corrections import Corrections
-from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, rounded
-from graphslam.calibrate.foretold import foretold
-from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, Window, rebuilt
-from graphslam.calibrate.windows import Seen, stretches
+from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
+from graphslam.calibrate.prediction_check import predict_withheld_sightings
+from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, SmoothingWindow, rebuild_window
+from graphslam.calibrate.windows import SightingLog, window_scans
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
@@ -36,7 +36,7 @@ PERHAPS = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Effort:
+class CalibrationBudget:
     """How much of a log is looked at, and how hard."""
 
     windows: int | None = 20
@@ -50,12 +50,12 @@ class Effort:
     ranges alone always is."""
 
 
-QUICK = Effort()
-FULL = Effort(windows=60, poses=6000, again=True)
+QUICK = CalibrationBudget()
+FULL = CalibrationBudget(windows=60, poses=6000, again=True)
 
 
 def calibrate_sightings(
-    seen: Seen, effort: Effort = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
+    seen: SightingLog, effort: CalibrationBudget = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
 ) -> Calibration:
     """What wheels and sightings say of their own noise and lasting errors, as far as it foretells what was withheld.
 
@@ -68,28 +68,30 @@ def calibrate_sightings(
     blind = not np.any(seen.sightings.has_bearing)
     if blind:
         found, whole = _ranges_alone(held, effort, seed)
-        scans = [stretches(seen, 1e9)[0][: len(whole.windows[0].poses)]]
-        foretell = partial(foretold, held, found, scans, noise, partial(_along, whole, seen.sightings.ids))
+        scans = [window_scans(seen, 1e9)[0][: len(whole.windows[0].poses)]]
+        foretell = partial(
+            predict_withheld_sightings, held, found, scans, noise, partial(_along, whole, seen.sightings.ids)
+        )
     else:
         found = _range_and_bearing(held, effort)
-        foretell = partial(foretold, held, found, _tested(held, effort), noise)
+        foretell = partial(predict_withheld_sightings, held, found, _tested(held, effort), noise)
     prediction = None if found.contradictions() else foretell()
     if blind or effort.again:  # what was withheld is data like the rest once it has judged
         found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
     return found if prediction is None or found.contradictions() else found.judged(prediction)
 
 
-def _tested(held: Seen, effort: Effort) -> list[Ints]:
+def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:
     """Scans of long windows in which something is withheld, spread over the log."""
     s = held.sightings
     assert held.withheld is not None
     hidden = np.concatenate([[0], np.cumsum(held.withheld)])[s.offsets]
-    there = [k for k in stretches(held, LONG) if np.any(hidden[k + 1] > hidden[k])]
+    there = [k for k in window_scans(held, LONG) if np.any(hidden[k + 1] > hidden[k])]
     count = max(int(0.5 * effort.poses / max(_rate(held) * LONG, 1.0)), 3)
     return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(count, len(there))).round().astype(int))]
 
 
-def _along(whole: Smoothing, ids: Ints | None, w: Window) -> Window | None:
+def _along(whole: Smoothing, ids: Ints | None, w: SmoothingWindow) -> SmoothingWindow | None:
     """A window of ranges with its states where those of a fitted one are; None where that has none of its beacons."""
     first = whole.windows[0]
     if ids is None:
@@ -98,34 +100,34 @@ def _along(whole: Smoothing, ids: Ints | None, w: Window) -> Window | None:
     names[first.slots[:, 0]] = ids[first.rows]
     place = dict(zip(names.tolist(), first.nuisance))
     own = ids[w.rows]
-    w = rebuilt(replace(w, poses=first.poses.copy()), np.isin(own, names))
+    w = rebuild_window(replace(w, poses=first.poses.copy()), np.isin(own, names))
     for j, name in zip(w.slots[:, 0].tolist(), ids[w.rows].tolist()):
         w.nuisance[j] = place[name]
     return w if len(w.rows) else None
 
 
-def _rate(seen: Seen) -> float:
+def _rate(seen: SightingLog) -> float:
     """Scans a second."""
     return len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
 
 
-def _range_and_bearing(seen: Seen, effort: Effort, held: tuple[str, ...] = ()) -> Calibration:
+def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple[str, ...] = ()) -> Calibration:
     """``held``: constants that ran away before."""
     steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
     named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
     free = tuple(c for c in named if c not in held)
     count = _count(seen, SHORT, effort)
-    short, short_value = L.fitted(L.sighted(seen, SHORT, count, free))
+    short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
     wild = tuple(c for c in free if abs(short.constants[CONSTANTS.index(c)]) > RAN_AWAY * PRIOR[CONSTANTS.index(c)])
     if wild:
         held, free = (*held, *wild), tuple(c for c in free if c not in wild)
-        short, short_value = L.fitted(L.sighted(seen, SHORT, count, free))
+        short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
     _enough(short, seen)
     start = dict(short.sigmas), short.constants.copy()
-    long = L.sighted(seen, LONG, None if count is None else max(count // 4, 3), free)
+    long = L.smooth_sightings(seen, LONG, None if count is None else max(count // 4, 3), free)
     long.sigmas, long.constants = dict(start[0]), start[1].copy()
     clock = None
-    long, _ = L.fitted(long, trims=L.TRIMS[1:])
+    long, _ = L.fit_noise(long, trims=L.TRIMS[1:])
     _enough(long, seen)
     notes: list[Finding] = []
     if held:
@@ -135,39 +137,41 @@ def _range_and_bearing(seen: Seen, effort: Effort, held: tuple[str, ...] = ()) -
         clock = profile_clock(short, seen)
     if clock is not None and clock.applied:
         return _again(seen, clock, effort, held)
-    estimates, short, long = gates(short, short_value, long)
+    estimates, short, long = cross_check_windows(short, short_value, long)
     if clock is not None:
         estimates.append(clock)
-    noise, lasts = chosen_noise(short, long)
-    alike = alike_residuals(long)
+    noise, lasts = combine_noise(short, long)
+    alike = residual_autocorrelation(long)
     few = len(np.unique(seen.sightings.ids)) <= FEW if seen.sightings.ids is not None else False
     if lasts or alike > PERHAPS or few:
-        two, estimates = two_levels(seen, long, effort, estimates)
+        two, estimates = fit_two_level_noise(seen, long, effort, estimates)
         noise |= two
         if two or lasts or alike > ALIKE:
             notes.append(_lasting_note(short, long, alike))
     return calibration_of("sightings", estimates, noise, notes, _data(short))
 
 
-def _again(seen: Seen, clock: Estimate, effort: Effort, held: tuple[str, ...]) -> Calibration:
+def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
     """The calibration with the motion's clock put right."""
-    found = _range_and_bearing(seen.mended(Corrections(clock=rounded(clock.value))), replace(effort, clock=False), held)
+    found = _range_and_bearing(
+        seen.mended(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
+    )
     if found.contradictions():
         return found
-    corrections = replace(found.corrections, clock=rounded(clock.value))
+    corrections = replace(found.corrections, clock=round_digits(clock.value))
     return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
 
 
-def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> tuple[Calibration, Smoothing]:
+def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tuple[Calibration, Smoothing]:
     begin, end = seen.span
     until = end - begin if effort.windows is None else min(effort.poses / max(_rate(seen), 1e-9), end - begin)
-    found = L.ranged(seen, until, seed=seed)
+    found = L.smooth_ranges(seen, until, seed=seed)
     if found is None:
         raise DataError("too few ranges to calibrate with", where=seen.log.name)
     whole, half = found
-    estimates, whole, half = gates(whole, whole.objective(), half)
-    noise, lasts = chosen_noise(half, whole)
-    alike = alike_residuals(whole)
+    estimates, whole, half = cross_check_windows(whole, whole.objective(), half)
+    noise, lasts = combine_noise(half, whole)
+    alike = residual_autocorrelation(whole)
     notes = []
     ratio = next(e for e in estimates if e.name == "range_scale")
     if ratio.applied:
@@ -183,7 +187,7 @@ def _ranges_alone(seen: Seen, effort: Effort, seed: int) -> tuple[Calibration, S
     return calibration_of("ranges", estimates, noise, notes, data), whole
 
 
-def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
+def cross_check_windows(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
     """The constants of a smoothing, held against those of windows of another length; and both with none but those that
     are applied.
     """
@@ -194,7 +198,7 @@ def gates(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate],
         i = CONSTANTS.index(name)
         gain = math.nan
         if abs(s.constants[i]) > SURE * sd[i]:
-            alone, alone_value = L.without(s, name)
+            alone, alone_value = L.fit_without(s, name)
             gain = alone_value - value
             if gain < 0.0:
                 s, value, sd = alone, alone_value, np.nan_to_num(np.sqrt(np.diag(alone.covariance)), nan=0.0)
@@ -226,7 +230,7 @@ def _estimate(name: str, s: Smoothing, other: Smoothing, gain: float) -> Estimat
     return Estimate(name=name, gain=float(gain), **_values(name, s, other)).gated()
 
 
-def chosen_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], bool]:
+def combine_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], bool]:
     """The larger of two σ, the motion's as one model; and whether noise of either kind lasts."""
     pairs = [(s, _typical(s)) for s in (short, long)]
     heading = [_heading_variance(s, t) for s, t in pairs]
@@ -255,7 +259,7 @@ def _heading_variance(s: Smoothing, step: Array) -> float:
     return float(v @ step)
 
 
-def alike_residuals(s: Smoothing) -> float:
+def residual_autocorrelation(s: Smoothing) -> float:
     """Correlation of residuals of one landmark from one sighting to the next, the larger of range and bearing."""
     seen, _ = s.residuals()
     products, squares = np.zeros(2), np.zeros(2)
@@ -268,8 +272,8 @@ def alike_residuals(s: Smoothing) -> float:
     return float(np.max(products / np.maximum(squares, 1e-12)))
 
 
-def two_levels(
-    seen: Seen, long: Smoothing, effort: Effort, estimates: list[Estimate]
+def fit_two_level_noise(
+    seen: SightingLog, long: Smoothing, effort: CalibrationBudget, estimates: list[Estimate]
 ) -> tuple[dict[str, float], list[Estimate]]:
     """Noise of sightings with a constant for each landmark and visit; nothing where the log is no likelier with it.
 
@@ -279,11 +283,11 @@ def two_levels(
     count = max(int(effort.poses / max(_rate(seen) * VISITS, 1.0)), 1)
     values, fits = [], []
     for visits in (False, True):
-        s = L.sighted(seen, VISITS, count, long.free, visits=visits)
+        s = L.smooth_sightings(seen, VISITS, count, long.free, visits=visits)
         for k in long.fitted:
             s.sigmas[k] = long.sigmas[k]
         s.constants = long.constants.copy()
-        s, value = L.fitted(s, trims=(), budget=200)
+        s, value = L.fit_noise(s, trims=(), budget=200)
         values.append(value)
         fits.append(s)
     if not values[0] - values[1] > GAIN:
@@ -292,7 +296,7 @@ def two_levels(
     again = []
     for e in estimates:
         if e.applied and e.name in s.free:
-            gain = float(L.without(s, e.name)[1] - value)
+            gain = float(L.fit_without(s, e.name)[1] - value)
             e = replace(e, **_values(e.name, s, s), gain=min(gain, e.gain)).gated()
         again.append(e)
     if any(e.name in s.free and not e.applied for e in again):
@@ -315,14 +319,14 @@ def motion_noise(s: Smoothing) -> dict[str, float]:
     return {k: s.sigmas[k] for k in L.WHEELS}
 
 
-def sightings_of_a_visit(windows: Sequence[Window]) -> float:
+def sightings_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
     """Sightings of the visit that a sighting, drawn at random, belongs to."""
     n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
     n = n[n > 0]
     return float((n**2).sum() / max(n.sum(), 1))
 
 
-def profile_clock(s: Smoothing, seen: Seen) -> Estimate:
+def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
     """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
 
     Parameters
@@ -335,7 +339,7 @@ def profile_clock(s: Smoothing, seen: Seen) -> Estimate:
 
     def score(k: int) -> float:
         if k not in scores:
-            moved = L.at_shift(s, seen, k * 0.5 * period)
+            moved = L.shift_motion(s, seen, k * 0.5 * period)
             moved.settle(8)
             moved.fit(budget=60, rounds=1)
             scores[k] = moved.objective()
@@ -363,14 +367,14 @@ def profile_clock(s: Smoothing, seen: Seen) -> Estimate:
     ).gated()
 
 
-def _count(seen: Seen, seconds: float, effort: Effort) -> int | None:
+def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int | None:
     """Windows that keep the number of poses within bounds."""
     if effort.windows is None:
         return None
     return int(np.clip(effort.poses / max(_rate(seen) * seconds, 1.0), 6, effort.windows))
 
 
-def _enough(s: Smoothing, seen: Seen) -> None:
+def _enough(s: Smoothing, seen: SightingLog) -> None:
     n = sum(len(w.rows) for w in s.windows)
     if n < 50:
         raise DataError("too few sightings of landmarks that are seen twice", where=seen.log.name, got=n, wanted=50)
@@ -411,11 +415,11 @@ def _corrections(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corr
     values: dict[str, Any] = {}
     for name, value in applied.items():
         if name == "distance_scale":
-            values[name] = rounded(math.exp(value))
+            values[name] = round_digits(math.exp(value))
         elif name in ("range_scale", "turn_scale"):
-            values[name] = rounded(1.0 + value)
+            values[name] = round_digits(1.0 + value)
         else:
-            values[name] = rounded(value)
+            values[name] = round_digits(value)
     names = Corrections.__dataclass_fields__
-    values |= {k: rounded(v) for k, v in noise.items() if k in names}
+    values |= {k: round_digits(v) for k, v in noise.items() if k in names}
     return Corrections(**values)

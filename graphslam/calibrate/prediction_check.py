@@ -14,9 +14,9 @@ import numpy as np
 
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import Calibration, Prediction
-from graphslam.calibrate.landmarks import smoothing_of, trimmed
-from graphslam.calibrate.smoothing import Ints, Smoothing, Window, keep_sightings
-from graphslam.calibrate.windows import Seen, make_window
+from graphslam.calibrate.landmarks import smoothing_of, trim_outliers
+from graphslam.calibrate.smoothing import Ints, Smoothing, SmoothingWindow, keep_sightings
+from graphslam.calibrate.windows import SightingLog, make_window
 from graphslam_frontends.odometry.motion import MotionNoise
 
 TRIM = 4.0
@@ -24,18 +24,18 @@ TRIM = 4.0
 SETTLE = 12
 
 
-def foretold(
-    seen: Seen,
+def predict_withheld_sightings(
+    seen: SightingLog,
     found: Calibration,
     scans: list[Ints],
     noise: MotionNoise,
-    start: Callable[[Window], Window | None] = lambda w: w,
+    start: Callable[[SmoothingWindow], SmoothingWindow | None] = lambda w: w,
 ) -> Prediction | None:
     """How likely withheld sightings are under a calibration, over what the log states.
 
     Parameters
     ----------
-    seen : Seen
+    seen : SightingLog
         As the log has it, with what was withheld.
     found : Calibration
         Made without them.
@@ -65,7 +65,7 @@ def foretold(
         if kept is None:
             s.sigmas |= {k: max(own[k], stated[k]) for k in ("range", "bearing")}
             s.settle(SETTLE)
-            s = trimmed(s, TRIM)
+            s = trim_outliers(s, TRIM)
             kept = np.concatenate([w.rows for w in s.windows]) if s.windows else np.zeros(0, dtype=np.int64)
         else:
             s = keep_sightings(s, [np.isin(w.rows, kept) for w in s.windows])
@@ -90,7 +90,7 @@ LEAST = 20
 """Fewer withheld sightings say nothing."""
 
 
-def _stated(seen: Seen) -> dict[str, float]:
+def _stated(seen: SightingLog) -> dict[str, float]:
     """σ of the sightings as the log has them."""
     s = seen.sightings
     out = {"range": float(np.median(s.sigmas[:, 0])), "visit_range": 0.0, "visit_bearing": 0.0}
@@ -104,7 +104,9 @@ def _sigmas(c: Corrections, stated: dict[str, float]) -> dict[str, float]:
     return out | {"visit_range": c.range_visit / c.range_scale, "visit_bearing": max(c.bearing_visit, 1e-6)}
 
 
-def _smoothing(seen: Seen, scans: list[Ints], start: Callable[[Window], Window | None], *, visits: bool) -> Smoothing:
+def _smoothing(
+    seen: SightingLog, scans: list[Ints], start: Callable[[SmoothingWindow], SmoothingWindow | None], *, visits: bool
+) -> Smoothing:
     """Windows with all their sightings; nothing is estimated but their states."""
     begin, end = seen.span
     t = seen.sightings.times
