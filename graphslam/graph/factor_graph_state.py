@@ -63,7 +63,7 @@ class BetweenBlock:
         return BetweenRecord(factor_id, i, j, self.T_ij[k], self.whiteners[k], group=self.group)
 
 
-class FactorTable(MutableMapping[int, "Record"]):
+class FactorTable(MutableMapping[int, "FactorRecord"]):
     """Factors by number, with a journal of every change, so that a solver sees what is new without looking at the rest.
 
     Factors that came as arrays stay arrays; a record of one is made when somebody asks for it. A record of a kind that
