@@ -10,9 +10,9 @@ _EXPORTS = {
     "grid.rbpf_grid": "run_rbpf",
     "segslam.segslam": "run_segslam",
     "segslam.config": "HandoverConfig",
-    "segslam.front_end": "settled",
-    "segslam.submaps": "exits_of_interval settled_chain",
-    "segslam.sampling": "grow root_of_segment",
+    "segslam.front_end": "submaps_of_best_particle",
+    "segslam.submaps": "exits_of_interval common_ancestor_chain",
+    "segslam.sampling": "grow_sample root_of_segment",
     "lidar_odometry.config": "LidarOdometryConfig",
     "lidar_odometry.odometry": "LidarOdometry",
 }

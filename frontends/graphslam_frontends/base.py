@@ -13,7 +13,8 @@ from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.steps import Steps
 
 Watch: TypeAlias = Callable[[Any], None]
-"""Takes the progress of a front end, of its own kind (``segslam``: `graphslam_frontends.segslam.progress.Progress`)."""
+"""Takes the progress of a front end, of its own kind (``segslam``:
+`graphslam_frontends.segslam.progress.SegSlamProgress`)."""
 
 
 @runtime_checkable

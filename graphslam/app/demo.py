@@ -19,7 +19,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots.save import save
 from graphslam.plots.segments import plot_segments
-from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.progress import SegSlamProgress
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class DemoProgress(Observer):
     def __exit__(self, *_: object) -> None:
         self.bar.close()
 
-    def front_end_at(self, at: Progress) -> None:
+    def front_end_at(self, at: SegSlamProgress) -> None:
         """After every step of the filter."""
         if self.bar.total is None:
             self.bar.total = at.steps
@@ -99,7 +99,7 @@ class DemoProgress(Observer):
             self.bar.set_description("segments → graph → fused map")
         self.bar.set_postfix_str(where, refresh=last)
 
-    def draw(self, at: Progress) -> None:
+    def draw(self, at: SegSlamProgress) -> None:
         """The picture, in place of the one before."""
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         paths = at.paths()

@@ -40,7 +40,7 @@ from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
 __all__ = [
@@ -217,7 +217,7 @@ def refine_path(
     if steps is None:
         steps = recommended(log, "segslam").get("frontend", {}).get("steps", {})
     cut = make_steps(log, steps if isinstance(steps, StepConfig) else build_config(StepConfig, dict(steps), "steps"))
-    start = chain(cut.odometry) if path is None else path
+    start = chain_odometry(cut.odometry) if path is None else path
     if start.times[0] > cut.times[0] or start.times[-1] < cut.times[-1]:
         raise DataError(
             "the path does not cover the scans",

@@ -35,12 +35,12 @@ from graphslam.maps.minimum_entropy import Candidate
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.config import HandoverConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segmap import SegMap
 from graphslam_frontends.segslam.segment import KINDS, MATCH
-from graphslam_frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, sampled_chain, submaps_of_segments
 
 
 def built(
@@ -203,7 +203,7 @@ def topologies(result: SegSlamResult) -> list[tuple[int, float, Ints]]:
     """Different topologies that particles tell: the heaviest particle of each, its support, its chain; by support."""
     groups: dict[Topology, list[tuple[float, int, Ints]]] = {}
     for p in np.argsort(-result.weights, kind="stable").tolist():
-        chain = settled_chain(result.segmap, int(result.closed[p]))
+        chain = common_ancestor_chain(result.segmap, int(result.closed[p]))
         groups.setdefault(topology(result.segmap, chain), []).append((float(result.weights[p]), p, chain))
     found = [(members[0][1], sum(w for w, *_ in members), members[0][2]) for members in groups.values()]
     return sorted(found, key=lambda x: (-x[1], x[0]))
@@ -316,7 +316,7 @@ def hypotheses_of(
         chains.append((-1, sum(w for _, w, c in found if topology(segmap, c) == topology(segmap, chain)), chain))
     told = []
     for particle, support, chain in chains:
-        submaps = settle(
+        submaps = submaps_of_segments(
             segmap, chain, drift_by_path(segmap, chain, drift, result.steps), handover, uses=result.steps.uses
         )
         told.append(Hypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps)))

@@ -14,7 +14,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
-from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoned_increments, motion_stream
 
 LONGEST = 1.0
 """A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
@@ -85,7 +85,7 @@ class SightingLog:
             The motion's clock is ahead of that of the sightings by it [s].
         """
         t = np.asarray(stamps) + shift
-        odometry, _ = dead_reckoning(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
+        odometry, _ = dead_reckoned_increments(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
         out = np.zeros((len(t), 8))
         if self.stated is not None:
             out[1:, 5:] = np.diagonal(odometry.covariances[1:], axis1=1, axis2=2)

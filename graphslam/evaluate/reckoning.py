@@ -35,7 +35,9 @@ def dead_reckoning(log: SensorLog, path: Trajectory | Array) -> Trajectory | Non
         return None
     if isinstance(stream, Odometry) and stream.increments.shape[1] == 7:
         return _reckoned_in_space(stream, times, path)
-    steps = motion.dead_reckoning(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[0].increments
+    steps = motion.dead_reckoned_increments(log, times, motion.MotionNoise(speed=0.0, steering=0.0, yaw_rate=0.0))[
+        0
+    ].increments
     group = group_of(steps)
     poses = np.tile(group.identity, (len(steps), 1))
     for k in range(1, len(steps)):

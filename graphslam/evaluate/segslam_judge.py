@@ -17,16 +17,22 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.entropy import Clarity, clarity_of, placements
 from graphslam.sim.route import Route
-from graphslam_frontends.grid.filter_drift import FilterDrift
-from graphslam_frontends.grid.motion import move, tilted
+from graphslam_frontends.grid.filter_error_model import FilterDrift
+from graphslam_frontends.grid.motion import move_poses, with_roll_pitch
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import HandoverConfig
-from graphslam_frontends.segslam.covariance import Nees, exit_nees
-from graphslam_frontends.segslam.paths import concatenate
+from graphslam_frontends.segslam.covariance import ExitNees, exit_nees
+from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.result import SegSlamResult
-from graphslam_frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
+from graphslam_frontends.segslam.sampling import draw_weights, grow_sample, nearest_step, root_of_segment
 from graphslam_frontends.segslam.segmap import MATCH, SegMap
-from graphslam_frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
+from graphslam_frontends.segslam.submaps import (
+    Drift,
+    common_ancestor_chain,
+    drift_by_errors,
+    drift_by_path,
+    submaps_of_segments,
+)
 
 Ints = npt.NDArray[np.int64]
 
@@ -244,13 +250,13 @@ def path_at(result: SegSlamResult, step: int, number: int = 0) -> Trajectory:
     What the filter believes of earlier places depends on where it looks from (A6): at a revisit it is asked there.
     """
     segmap = result.segmap
-    chain = settled_chain(segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
     t = segmap.table
     inside = chain[(t.start[chain] < step) & (t.end[chain] >= step)]
     at = int(inside[0]) if len(inside) else int(chain[0])
     rng = result.seed.child("visit", step, number).generator()
-    sample = grow(segmap, root_of_segment(segmap, at), rng, weights=draw_weights(segmap))
-    return concatenate(segmap, sample)
+    sample = grow_sample(segmap, root_of_segment(segmap, at), rng, weights=draw_weights(segmap))
+    return concatenate_segments(segmap, sample)
 
 
 def legs(route: Route, arc: Array, shortest: float = 10.0) -> list[tuple[int, int]]:
@@ -291,18 +297,18 @@ class ExitErrors:
     ----------
     lengths : (m,)
         Of the segments [m].
-    default, matched, stated : Nees
+    default, matched, stated : ExitNees
         Particles and drift model; the paper's moment matching; particles and the drift that the motion's noise states
         (as ``default`` where the steps do not know it).
-    blocks : mapping of str to Nees
+    blocks : mapping of str to ExitNees
         ``default`` by block: ``heading``, ``plan``, and in space ``height``.
     """
 
     lengths: Array
-    default: Nees
-    matched: Nees
-    stated: Nees
-    blocks: Mapping[str, Nees]
+    default: ExitNees
+    matched: ExitNees
+    stated: ExitNees
+    blocks: Mapping[str, ExitNees]
 
 
 def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> ExitErrors:
@@ -315,11 +321,11 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     """
     segmap, steps = result.segmap, result.steps
     g = segmap.group
-    chain = settled_chain(segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
     by_path = drift_by_path(segmap, chain, drift, steps)
     stated: Drift = by_path if steps.errors is None else drift_by_errors(steps.errors, gravity=segmap.gravity)
     made = [
-        settle(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
+        submaps_of_segments(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
         for d, m in ((by_path, False), (by_path, True), (stated, False))
     ]
     t = segmap.table
@@ -328,7 +334,7 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     # roll and pitch of level frames are exact by definition
     components = (2, 3, 4, 5) if segmap.gravity else None
 
-    def score(made: Sequence[Submap], components: Sequence[int] | None) -> Nees:
+    def score(made: Sequence[Submap], components: Sequence[int] | None) -> ExitNees:
         poses, covariances = (np.array([getattr(s, f"exit_{what}") for s in made]) for what in ("pose", "covariance"))
         return exit_nees(poses, covariances, true, components=components)
 
@@ -339,7 +345,7 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     return ExitErrors(lengths, scores[0], scores[1], scores[2], by_block)
 
 
-def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
+def end_errors(submap: Submap, truth: Array) -> dict[str, ExitNees]:
     """Where a submap of a whole log ends, in space: all four components that are not gravity's (``""``), and by block.
 
     Parameters
@@ -399,6 +405,6 @@ def dead_reckoned(steps: Steps) -> Trajectory:
     poses = np.array(steps.odometry.increments)
     poses[0] = group_of(poses).identity
     for k in range(len(poses)):
-        at = poses[:1] if k == 0 else move(poses[k - 1 : k], steps.odometry.increments[k], None)
-        poses[k] = at[0] if steps.tilt is None else tilted(at, steps.tilt[k : k + 1])[0]
+        at = poses[:1] if k == 0 else move_poses(poses[k - 1 : k], steps.odometry.increments[k], None)
+        poses[k] = at[0] if steps.tilt is None else with_roll_pitch(at, steps.tilt[k : k + 1])[0]
     return Trajectory(steps.times, poses)

@@ -13,8 +13,8 @@ from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, VelocityControls
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 Ints = npt.NDArray[np.int64]
 
@@ -193,10 +193,10 @@ def _path(log: SensorLog, times: Array, speed: float, turn: float) -> Array | No
         elif isinstance(s, SteeringControls):
             streams[name] = replace(s, speed=speed * s.speed, steering=turn * s.steering)
     try:
-        odometry = dead_reckoning(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0]
+        odometry = dead_reckoned_increments(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0]
     except GraphSlamError:
         return None
-    return chain(odometry).poses if odometry.increments.shape[1] == 3 else None
+    return chain_odometry(odometry).poses if odometry.increments.shape[1] == 3 else None
 
 
 def _unrest(first: Array, second: Array, steps: Array, h: Hypothesis) -> float:

@@ -1,7 +1,7 @@
 """Do wheels and sightings fit one map, and if not, what would mend it? The tests on the sums of a landmark front end.
 
 The front ends put sums over short windows into the reports of their submaps
-(:mod:`graphslam_frontends.landmarks.systematic`); windows are independent, so those of all submaps add up. Two tests:
+(:mod:`graphslam_frontends.landmarks.bias_score`); windows are independent, so those of all submaps add up. Two tests:
 
 - χ² of the residuals over their degrees of freedom, bounds at 99.9 %;
 - each error of calibration by itself, ``ĉ = g / S`` with σ² = 1/S. The noise of recorded logs is not white, and then
@@ -116,7 +116,7 @@ KINDS = {
         "check the zero and the sign of the steering",
     ),
 }
-"""In the order of `graphslam_frontends.landmarks.systematic.PARAMETERS`."""
+"""In the order of `graphslam_frontends.landmarks.bias_score.PARAMETERS`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -162,7 +162,8 @@ def trust(rows: Sequence[Evidence], *, fixes: bool, nonlinearity: float = 0.0) -
 def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
     """Squared shift by which curvature moves the optima of submaps from their means, per unknown.
 
-    See :meth:`graphslam_frontends.landmarks.summarise.Smoothed.nonlinearity`; 0 where no submap's report says it.
+    See :meth:`graphslam_frontends.landmarks.summarise.SmoothingResult.nonlinearity`; 0 where no submap's report says
+    it.
     """
     said = [(float(r["nonlinearity"]), float(r["unknowns"])) for r in reports if "nonlinearity" in r]
     return sum(v * n for v, n in said) / sum(n for _, n in said) if said else 0.0

@@ -10,7 +10,7 @@ map places a body.
 In simulated buildings such pairs were off by 0.07 m along, 0.03 to 0.05 m across, 0.02 to 0.03 m in height, and 0.01
 rad (RMS of 92 within segments and 87 between them), whatever the way between the two. Ties are evidence that was in
 the path already (declared ``shared-scan``): only submaps whose exits state drift as if no ground had been seen twice,
-as those of :mod:`graphslam_frontends.grid.filter_drift` do, may be given them.
+as those of :mod:`graphslam_frontends.grid.filter_error_model` do, may be given them.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.added import added, grid_of, own_evidence
 from graphslam_frontends.segslam.segmap import NEW, SegMap
-from graphslam_frontends.segslam.submaps import base_of
+from graphslam_frontends.segslam.submaps import segment_base
 
 
 def own_evidence_of(
@@ -50,7 +50,7 @@ def own_evidence_of(
             continue
         grid, T_map = segmap.map_of(i)
         found = added(grid, segmap.map_of(source)[0])
-        T_base_map = g.inverse(g.compose(T_map, base_of(segmap, segmap[i].T_entry)))
+        T_base_map = g.inverse(g.compose(T_map, segment_base(segmap, segmap[i].T_entry)))
         moved = grid.empty()
         moved.merge(found.grid, T_base_map)
         out[s.key] = moved

@@ -47,7 +47,7 @@ from graphslam.refine.surfaces import (
     match_surfaces,
 )
 from graphslam.registration.plane_kernels import PlanePairs
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
@@ -344,7 +344,7 @@ class _Refiner:
         self.all_passes(self.config.distances)
         other = None
         assert self.surfaces is not None
-        odometry = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        odometry = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
         self.reckoned = self.agreement_along(odometry)
         contradicted = np.any(~taken & guides.far(self.poses))
         if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
@@ -393,7 +393,7 @@ class _Refiner:
         The path at which the scans agree better is kept.
         """
         first = self.attempt()
-        self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        self.poses = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
         self.states = self.first_states()
         self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
         self.cloud = self.problem.cloud = self.raw

@@ -16,7 +16,7 @@ from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.progress import SegSlamProgress
 from graphslam_frontends.segslam.segslam import run_segslam
 from tests.app.cli.test_cli import graphslam, refused
 
@@ -48,7 +48,7 @@ def test_watching_changes_nothing_and_sees_the_chain() -> None:
     steps = make_steps(log, config.steps)
     seen: list[tuple[int, int, list[np.ndarray]]] = []
 
-    def watch(at: Progress) -> None:
+    def watch(at: SegSlamProgress) -> None:
         seen.append((at.step, at.segments, at.paths() if at.step % 40 == 0 or at.step == at.steps else []))
 
     watched = run_segslam(steps, config.filter, config.segslam, SeedTree(1), watch=watch)

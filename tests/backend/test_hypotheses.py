@@ -20,11 +20,11 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.maps.alternatives import Alternative, choose
 from graphslam.maps.pieces import DivisionConfig
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segmap import MATCH, NEW
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import sampled_chain, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, sampled_chain
 
 COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
 CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)
@@ -72,7 +72,7 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
         assert all(a[1] == b[0] for a, b in pairwise(told))  # each goes on where the one before ended
         same = [
             k for k in range(8)
-            if topology(divided.segmap, settled_chain(divided.segmap, int(divided.closed[k]))) == told
+            if topology(divided.segmap, common_ancestor_chain(divided.segmap, int(divided.closed[k]))) == told
         ]  # fmt: skip
         assert support == pytest.approx(divided.weights[same].sum())
         assert p == max(same, key=lambda k: divided.weights[k])

@@ -37,9 +37,9 @@ from graphslam.loops.map_overlap_test import Witness
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import ChainRelativePoses, Places, loop_places
 from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
 from tests.reference.loop_network import LoopNetwork
 from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops
 
@@ -60,8 +60,8 @@ def submaps_of(world: str, seed: int, cache: Path | None) -> tuple[list[Submap],
     filter = replace(config.segslam_filter, particles=5)
     segmap = run_segslam(trial.steps, filter, blind, SeedTree(seed).child("filter", "segslam")).segmap
     last = int(segmap.alive[np.argmax(segmap.table.end[segmap.alive])])
-    chain = settled_chain(segmap, last)
-    submaps = settle(segmap, chain, drift_by_path(segmap, chain, FilterDrift()), blind.handover)
+    chain = common_ancestor_chain(segmap, last)
+    submaps = submaps_of_segments(segmap, chain, drift_by_path(segmap, chain, FilterDrift()), blind.handover)
     if folder is not None:
         write_submaps(folder, submaps)
         arrays = {"format": FORMAT, "times": trial.steps.times, "poses": trial.truth}

@@ -49,7 +49,7 @@ from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, settled
+from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, submaps_of_best_particle
 from graphslam_frontends.segslam.segslam import run_segslam
 
 ALL_POINTS = 1_000_000
@@ -87,7 +87,7 @@ def submaps_of(s: Scene, steps: Steps) -> list[Submap]:
     """The settled chain of one particle."""
     filter = dataclasses.replace(s.config.filter, particles=1)
     result = run_segslam(steps, filter, s.config.segslam, SeedTree(9))
-    return settled(result, s.config.drift, s.config.segslam)
+    return submaps_of_best_particle(result, s.config.drift, s.config.segslam)
 
 
 def bodies_of(submaps: Sequence[Submap], steps: Steps) -> Any:

@@ -24,9 +24,9 @@ from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import align_se3, se3_transform
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.scan_window.exits import relative_covariance
 from graphslam_frontends.scan_window.front_end import ScanWindowFrontEndConfig
-from graphslam_frontends.scan_window.tracker import track
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
+from graphslam_frontends.scan_window.tracker import track_steps
 
 LENGTH = 30.0
 """Way of the pieces whose exits are judged [m]."""
@@ -53,7 +53,7 @@ def odometry(steps: Steps, config: ScanWindowFrontEndConfig) -> list[float]:
     piece = np.floor(steps.path_length / LENGTH)
     starts = [0, *(np.flatnonzero(np.diff(piece) > 0) + 1).tolist()]
     begin = time.process_time()
-    made = track(steps, config.window, starts)
+    made = track_steps(steps, config.window, starts)
     cpu = (time.process_time() - begin) / len(steps)
     g, errors, nees = group_of(truth), [], []
     for a, b in zip(starts, [*starts[1:], len(steps) - 1]):

@@ -33,7 +33,7 @@ from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
@@ -127,9 +127,9 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
     recorded = float(steps.times[-1] - steps.times[0])
     closed = name in CLOSED and not quick
     raw = make_steps(log, dataclasses.replace(config.steps, match_scans=False, yaw_per_metre=0.0))
-    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain(raw.odometry), 0.0)}
+    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain_odometry(raw.odometry), 0.0)}
     if config.steps.match_scans:
-        paths["mended"] = (chain(steps.odometry), 0.0)
+        paths["mended"] = (chain_odometry(steps.odometry), 0.0)
     begin = time.process_time()
     rbpf = run_rbpf(steps, config.filter, SeedTree(seed))
     paths["rbpf-grid"] = (rbpf.trajectory(), time.process_time() - begin)

@@ -10,7 +10,7 @@ from graphslam.app.worlds import simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.systematic import KINDS, Systematic, sums, systematic_findings
-from graphslam_frontends.landmarks.systematic import PARAMETERS
+from graphslam_frontends.landmarks.bias_score import PARAMETERS
 from tests.faults import inject_landmarks as inject
 
 

@@ -83,7 +83,7 @@ from graphslam.io.victoria_park_published import (
 )
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.lasting import LEAST
+from graphslam_frontends.odometry.bias_sigmas import LEAST
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap, write_ros1, write_ros2
 

@@ -140,9 +140,9 @@ def ring(
     times = 0.4 * np.arange(n)
     tilt = None
     if dim == 3 and tilt_sigma > 0:
-        from graphslam_frontends.grid.motion import tilts
+        from graphslam_frontends.grid.motion import roll_pitch_of
 
-        tilt = tilts(truth) + tilt_sigma * rng.normal(size=(n, 2))
+        tilt = roll_pitch_of(truth) + tilt_sigma * rng.normal(size=(n, 2))
     return Steps(
         times=times,
         odometry=Odometry(times=times, increments=increments, covariances=np.tile(np.diag(sigma**2), (n, 1, 1))),

@@ -18,10 +18,10 @@ from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.front_end import settled
+from graphslam_frontends.segslam.front_end import submaps_of_best_particle
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain
 from tests.benchmarks.bench_maps import insert, scene, submaps_of
 from tests.reference.small_maps import same_map
 
@@ -91,12 +91,12 @@ def reentered() -> tuple[SegSlamResult, list[Submap]]:
     s = scene("court")
     steps = make_steps(s.log, s.config.steps)
     result = run_segslam(steps, replace(s.config.filter, particles=5), s.config.segslam, SeedTree(0))
-    return result, settled(result, s.config.drift, s.config.segslam)
+    return result, submaps_of_best_particle(result, s.config.drift, s.config.segslam)
 
 
 def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegSlamResult, list[Submap]]) -> None:
     result, submaps = reentered
-    chain = settled_chain(result.segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(result.segmap, int(result.closed[result.best]))
     exact = own_evidence_of(result.segmap, chain, submaps)
     entered = [m for m in submaps if m.report["entered"] != "new"]
     assert entered

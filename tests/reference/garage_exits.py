@@ -91,13 +91,13 @@ def segment_ends(result: object, truth: Array) -> Iterator[tuple[Array, Array, A
     """Path, error and spread of every settled segment."""
     from graphslam.core.poses import remove_roll_pitch
     from graphslam_frontends.segslam.covariance import exit_covariance
-    from graphslam_frontends.segslam.submaps import base_of, exits_of_interval, settled_chain
+    from graphslam_frontends.segslam.submaps import common_ancestor_chain, exits_of_interval, segment_base
 
     m = result.segmap  # type: ignore[attr-defined]
     g = m.group
-    for index in settled_chain(m, int(result.closed[result.best])):  # type: ignore[attr-defined]
+    for index in common_ancestor_chain(m, int(result.closed[result.best])):  # type: ignore[attr-defined]
         s = m[int(index)]
-        about = g.between(base_of(m, s.T_entry), base_of(m, s.T_exit))
+        about = g.between(segment_base(m, s.T_entry), segment_base(m, s.T_exit))
         true = g.between(*(remove_roll_pitch(truth[k]) for k in s.interval))
         ends, weights = exits_of_interval(m, s.interval)
         spread = exit_covariance(ends, about, s.length, lambda _: np.eye(6), weights=weights).particles

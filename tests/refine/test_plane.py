@@ -16,7 +16,7 @@ from graphslam.refine.refine import refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import ScanReturns
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 from tests.calibrate.room import drive, scan
 
@@ -132,7 +132,7 @@ def corridor(seed, *, rest=0.0):
     log = SensorLog(name="corridor", streams={"odometry": odometry, "scans": scans})
     steps = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
     true = way[np.searchsorted(t, steps.times)]
-    return steps, chain(steps.odometry).poses, se2_between(np.broadcast_to(true[0], true.shape), true)
+    return steps, chain_odometry(steps.odometry).poses, se2_between(np.broadcast_to(true[0], true.shape), true)
 
 
 def test_a_corridor_is_uncertain_along_itself() -> None:

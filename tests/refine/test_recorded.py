@@ -16,7 +16,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.refine.refine import Refinement
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
 FREEHAND = {"period": None, "max_range": 30.0, "most_points": 400, "odometry_tilt_sigma": 0.005}
@@ -54,7 +54,7 @@ def test_relations_of_a_planar_log_are_better_than_those_of_its_odometry(
     building: SensorLog, refined: Refinement
 ) -> None:
     steps = make_steps(building, build_config(StepConfig, recommended(building, "segslam")["frontend"]["steps"]))
-    before = relations(chain(steps.odometry), building["reference"])
+    before = relations(chain_odometry(steps.odometry), building["reference"])
     after = relations(path_of(refined), building["reference"])
     assert after["translation_mean"] < before["translation_mean"]
     assert refined.agreement[1] > refined.agreement[0]
@@ -90,8 +90,8 @@ def test_scans_of_a_lidar_pack_agree_no_less_than_along_its_odometry(name: str, 
 @pytest.mark.data
 def test_a_path_that_is_off_is_brought_back(data_dir: Path) -> None:
     log = part("lidar3d-hku1", 30.0, data_dir)
-    start = chain(log["odometry"])
-    bent = chain(make_steps(log, build_config(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
+    start = chain_odometry(log["odometry"])
+    bent = chain_odometry(make_steps(log, build_config(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
     before = relations(bent, log["reference"])
     found = gs.refine_path(log, bent, steps={**FREEHAND, "yaw_bias": 0.01})
     after = relations(path_of(found), log["reference"])

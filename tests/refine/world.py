@@ -14,7 +14,7 @@ from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 
 @lru_cache(maxsize=32)
@@ -27,4 +27,4 @@ def court_scans(seed: int, **changes: float) -> tuple[Scans, Array, Array]:
     truth = steps.truth.interpolate(steps.times)
     g = group_of(truth)
     truth = g.between(np.broadcast_to(remove_roll_pitch(truth[0]), truth.shape), truth)
-    return Scans.of(steps), chain(steps.odometry).poses, truth
+    return Scans.of(steps), chain_odometry(steps.odometry).poses, truth

@@ -110,7 +110,7 @@ def motion_stream_name(log: SensorLog | RecordSource) -> str | None:
     return next((name for name in found if name is not None), None)
 
 
-def dead_reckoning(
+def dead_reckoned_increments(
     log: SensorLog, times: npt.ArrayLike, noise: MotionNoise, *, hold: float = 0.0
 ) -> tuple[Odometry, str]:
     """Increments between consecutive ``times`` from the log's motion stream, and that stream's name.

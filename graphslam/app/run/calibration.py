@@ -26,7 +26,7 @@ from graphslam.core.records import LandmarkObservations, SteeringControls
 from graphslam.evaluate.without_truth import two_sided
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam_frontends.base import FrontEnd
-from graphslam_frontends.landmarks.config import LastingConfig, RbpfEkfConfig
+from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
 from graphslam_frontends.landmarks.prepare import landmark_stream
 from graphslam_frontends.odometry.motion import motion_stream
 
@@ -181,7 +181,7 @@ def suited(
     return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
 
 
-def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
+def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> SensorBiasConfig:
     """Which constant errors a log of landmarks may have.
 
     A vehicle that steers turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
@@ -194,7 +194,7 @@ def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
     blind = not np.any(seen.has_bearing)
     ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0, "mount": 0.0} if blind else {}
     place = {} if blind or np.any(seen.T_base_sensor[:2] != 0.0) else {"mount": UNSAID}
-    return LastingConfig(**turn, **ranges, **place)
+    return SensorBiasConfig(**turn, **ranges, **place)
 
 
 def named_causes(

@@ -25,7 +25,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.evaluate.trajectory_error import ate
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 UNKNOWN = "unknown"
 """Name of a recorded log here: no preset is made for it."""
@@ -86,7 +86,7 @@ def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odomet
         xi[:, g.heading] += turn
         increments = g.exp(xi)
     else:
-        attitude = chain(odometry).poses
+        attitude = chain_odometry(odometry).poses
         attitude[:, :3] = 0.0
         level = se3_transform(se3_inverse(attitude), np.broadcast_to([0.0, 0.0, 1.0], (len(xi), 3)))
         extra = np.zeros_like(xi)
@@ -180,7 +180,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
     result = run(log, frontend=frontend, solver="batch", config=options, seed=seed, progress=False)
     said = {f.code for f in findings_of_json(result.report["verdict"])}
     path = result.map.trajectory
-    input_path = chain(next(s for s in log.streams.values() if isinstance(s, Odometry)))
+    input_path = chain_odometry(next(s for s in log.streams.values() if isinstance(s, Odometry)))
     of_run, of_input = (path_errors(p, log["reference"]) for p in (path, input_path))
     for key, value in of_run.items():
         yield Measurement(name, key, value)

@@ -33,7 +33,7 @@ from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.solve.network.full_batch import full_batch
 from graphslam_frontends.landmarks.ekf_slam import ekf_snapshots
-from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
 from graphslam_frontends.landmarks.snapshot import Snapshot
 
@@ -213,7 +213,7 @@ class _Trial:
     def _full_batch(self, submaps: list[Submap], best: SubmapEstimate) -> Iterator[Measurement]:
         """All scan poses at once, from the submaps' optimum."""
         front_end = make_front_end("rbpf-ekf", self._options("rbpf-ekf", {}))
-        data = prepare(self.log, front_end.config, DropCounter())
+        data = prepare_log(self.log, front_end.config, DropCounter())
         start = np.concatenate(
             [
                 se2_compose(base, s.trajectory.poses[-n:])

@@ -34,7 +34,7 @@ from graphslam.sim.crawler_config import crawler_preset
 from graphslam.solve.batch import BatchSolver
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.result import SegSlamResult
-from graphslam_frontends.segslam.submaps import base_of
+from graphslam_frontends.segslam.submaps import segment_base
 
 ROBOTS = {
     "range_sigma": (0.01, 0.05),
@@ -103,7 +103,7 @@ class RefinementTrial(GraphTrial):
         yield from self.graph_figures("loops", result, built)
         yield Measurement("loops", "failed", 0.0)
         start = built.solution.trajectory().interpolate(self.steps.times)
-        base = base_of(result.segmap, self.truth[0])
+        base = segment_base(result.segmap, self.truth[0])
         scans = Scans.of(self.steps)
         yield from self.refined("refined", scans, start, base, entropy="entropy" in self.config.figures)
         for count in self.study.wrong:

@@ -30,7 +30,7 @@ from graphslam.app.studies.segslam_mine import SEGSLAM as MINE
 from graphslam.app.studies.segslam_trial import LEVEL, QUICK, Figure, GridTrialConfig
 from graphslam.app.studies.worlds_study import draw_runs
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy")
 _GARAGE = GridTrialConfig(

@@ -25,12 +25,12 @@ from graphslam.app.studies.segslam_garage import path_figure
 from graphslam.app.studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
 from graphslam.plots.association import plot_runs
 from graphslam.plots.save import save
-from graphslam_frontends.segslam.config import SegSlamConfig, WinnowConfig
+from graphslam_frontends.segslam.config import SegmentCandidateConfig, SegSlamConfig
 
 _FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
 # Galleries do not lie above each other, so that heights may drift: at 6 mrad of gravity 2.4 m on the first loop.
-SEGSLAM = SegSlamConfig(winnowing=WinnowConfig(height_per_metre=7e-3))
+SEGSLAM = SegSlamConfig(winnowing=SegmentCandidateConfig(height_per_metre=7e-3))
 _MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
 WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
 QUICK_WORLDS = {

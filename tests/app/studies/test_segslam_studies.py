@@ -22,7 +22,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, remove_roll_pitch
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate import segslam_judge as judge
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult

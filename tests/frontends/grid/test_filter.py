@@ -59,9 +59,9 @@ def test_one_particle_takes_roll_and_pitch_from_gravity() -> None:
     steps = ring(1, 3, length=8.0, beams=40)
     assert steps.tilt is not None
     path = run_rbpf(steps, replace(CONFIG, particles=1), SeedTree(0)).ancestry.path(0)
-    from graphslam_frontends.grid.motion import tilts
+    from graphslam_frontends.grid.motion import roll_pitch_of
 
-    assert tilts(path) == pytest.approx(steps.tilt, abs=1e-12)
+    assert roll_pitch_of(path) == pytest.approx(steps.tilt, abs=1e-12)
     # the frame of the map stands level: the robot drove on one level, and stays there
     assert np.abs(path[:, 2] - path[0, 2]).max() < 0.1
     assert remove_roll_pitch(path[0]) == pytest.approx([0, 0, CONFIG.lift * CONFIG.voxel_size, 0, 0, 0, 1])

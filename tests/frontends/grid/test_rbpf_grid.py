@@ -19,9 +19,9 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter_drift import Passed
+from graphslam_frontends.grid.filter_error_model import ErrorPassThrough
 from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
-from graphslam_frontends.odometry.scan_use import reckoned_covariance
+from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring, true_end
 
@@ -125,10 +125,10 @@ def test_submap_is_the_best_particles_with_an_honest_exit(run: tuple[Steps, Rbpf
 def test_the_exit_takes_along_what_the_filter_passes_on_of_dead_reckoning(run: tuple[Steps, RbpfResult]) -> None:
     steps, result = run
     n = len(steps)
-    plain, passed = rbpf_submap(result, drift, steps=steps), Passed(heading=0.5, position=0.7)
+    plain, passed = rbpf_submap(result, drift, steps=steps), ErrorPassThrough(heading=0.5, position=0.7)
     submap = rbpf_submap(result, drift, steps=steps, passed=passed)
     tilt = None if steps.tilt is None else steps.tilt_sigma
-    reckoned = reckoned_covariance(steps, 0, n - 1, level_end=False)
+    reckoned = dead_reckoning_covariance(steps, 0, n - 1, level_end=False)
     wanted = passed.covariance(reckoned, float(steps.path_length[-1]), len(result.particles), tilt=tilt)
     assert np.trace(wanted) > 0
     assert submap.exit_covariance - plain.exit_covariance == pytest.approx(wanted, rel=1e-6, abs=1e-12)

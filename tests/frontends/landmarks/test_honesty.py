@@ -14,7 +14,7 @@ from graphslam.core.random import SeedTree
 from graphslam.evaluate.metrics import Metrics, flag_counts, front_end_metrics
 from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
-from graphslam_frontends.landmarks.honesty import flag, pool, variance_bounds
+from graphslam_frontends.landmarks.moment_consistency import consistency_flag, pool_gaussians, variance_bounds
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.odometry.motion import MotionNoise
 
@@ -29,7 +29,7 @@ def test_pool_is_unbiased_for_estimates_of_one_posterior():
         x = rng.multivariate_normal([1.0, 2.0, np.pi], C, (k, n))
         x[..., 2] = wrap_angle(x[..., 2])
         gs = [Gaussian(np.r_[s[:, :2].mean(0), np.pi + wrap_angle(s[:, 2] - np.pi).mean()], C, (2,)) for s in x]
-        g = pool([Gaussian(np.r_[a.mean[:2], wrap_angle(a.mean[2])], C, (2,)) for a in gs])
+        g = pool_gaussians([Gaussian(np.r_[a.mean[:2], wrap_angle(a.mean[2])], C, (2,)) for a in gs])
         assert abs(wrap_angle(g.mean[2] - np.pi)) < 0.5  # averaged on the circle
         totals.append(g.covariance)
     expected = C * (1 + (1 + 1 / k) / n)
@@ -162,7 +162,7 @@ def test_watching_changes_nothing_that_is_handed_over():
     ],
 )  # fmt: skip
 def test_flag_names_its_reasons(figures, particles, expected):
-    assert flag(figures, particles) == expected
+    assert consistency_flag(figures, particles) == expected
 
 
 def test_flagged_maps_are_counted(maps):

@@ -12,7 +12,7 @@ from graphslam.sim.lidar import LidarConfig, drawn_lidar, simulate_lidar
 from graphslam.sim.raycast import RayCaster
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
-from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 
 
 def _lidar(seed):

@@ -19,7 +19,7 @@ from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.io.carmen import read_carmen
 from graphslam.io.catalog import load
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.segslam import run_segslam
 
@@ -67,7 +67,7 @@ def test_the_beginning_of_intel_is_mapped_better_than_by_its_odometry(intel: Sen
     assert len(reference) > 30
     pairs = random_pairs(len(reference), 500, np.random.default_rng(0))
     own = relation_error(path, reference, pairs).as_row()
-    raw = relation_error(chain(intel["odometry"]), reference, pairs).as_row()
+    raw = relation_error(chain_odometry(intel["odometry"]), reference, pairs).as_row()
     assert own["translation_mean"] < 0.5 * raw["translation_mean"]
     assert own["translation_mean"] < 1.0  # 0.5 to 0.8 over six seeds; the odometry 6.5
     assert own["rotation_mean_deg"] < 0.5 * raw["rotation_mean_deg"]
@@ -84,7 +84,7 @@ def test_hku1_closes_its_loop_in_spite_of_a_yaw_bias(data_dir: Path) -> None:
     config = settings(log)
     assert config.steps.yaw_bias == 0.005
     steps = make_steps(log, config.steps)
-    raw = chain(steps.odometry).poses
+    raw = chain_odometry(steps.odometry).poses
     assert np.linalg.norm(raw[-1, :3]) > 5.0
     result = run_segslam(steps, config.filter, config.segslam, SeedTree(1))
     assert any(a.matched for a in result.attempts)

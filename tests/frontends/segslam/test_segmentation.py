@@ -12,7 +12,13 @@ from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
-from graphslam_frontends.segslam.segmentation import Segmenter, few, gather_window, motion_error, predictive_score
+from graphslam_frontends.segslam.segmentation import (
+    Segmenter,
+    gather_window,
+    motion_error,
+    predictive_score,
+    representative_particles,
+)
 
 NAN = math.nan
 UP = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -266,7 +272,7 @@ def test_se3_windows_score_in_three_dimensions() -> None:
 def test_few_particles_speak_for_all() -> None:
     rng = np.random.default_rng(3)
     w = rng.dirichlet(np.full(40, 0.3))
-    rows, shares = few(w, 8)
+    rows, shares = representative_particles(w, 8)
     assert len(rows) <= 8
     assert shares.sum() == pytest.approx(1.0)
     assert np.all(np.diff(rows) > 0)
@@ -274,9 +280,9 @@ def test_few_particles_speak_for_all() -> None:
     assert np.all(np.abs(shares - w[rows]) <= 2.0 / 8)
     x = np.sort(rng.normal(size=40))  # what changes slowly from one to the next is told well
     assert abs(shares @ x[rows] - w @ x) < 0.5 * x.std()
-    everybody, same = few(w, 40)
+    everybody, same = representative_particles(w, 40)
     np.testing.assert_array_equal(everybody, np.arange(40))
     np.testing.assert_array_equal(same, w)
-    alone, all_of_it = few(np.array([0.0, 1.0, 0.0]), 2)
+    alone, all_of_it = representative_particles(np.array([0.0, 1.0, 0.0]), 2)
     assert alone.tolist() == [1]
     assert all_of_it.tolist() == [1.0]

@@ -32,8 +32,8 @@ from graphslam.core.geometry import (
     se2_transform,
     wrap_angle,
 )
-from graphslam_frontends.landmarks.prepare import Prepared
-from graphslam_frontends.landmarks.smoothing_kernels import Evidence, smooth_kernel
+from graphslam_frontends.landmarks.prepare import PreparedLog
+from graphslam_frontends.landmarks.smoothing_kernels import SmoothingMeasurements, smooth_kernel
 
 Ints = npt.NDArray[np.int64]
 PARAMETERS = (
@@ -54,8 +54,8 @@ white in it, and that the normal equations stay small."""
 LEAST_SCANS = 5
 
 
-def systematic(
-    data: Prepared, first: int, last: int, rows: Ints, landmark: Ints, poses: Array, places: Array
+def bias_score_test(
+    data: PreparedLog, first: int, last: int, rows: Ints, landmark: Ints, poses: Array, places: Array
 ) -> dict[str, Any]:
     """Sums over the windows of a submap, as its report holds them.
 
@@ -102,7 +102,7 @@ def systematic(
 
 
 def _window(
-    data: Prepared, a: int, b: int, rows: Ints, pose: Ints, landmark: Ints, poses: Array, places: Array
+    data: PreparedLog, a: int, b: int, rows: Ints, pose: Ints, landmark: Ints, poses: Array, places: Array
 ) -> tuple[float, int, Array, Array] | None:
     """χ², dof, score and information of one window; None where nothing in it is redundant."""
     names, index, seen = np.unique(landmark, return_inverse=True, return_counts=True)
@@ -124,7 +124,7 @@ def _window(
     sensor = np.ascontiguousarray(data.observations.T_base_sensor, dtype=np.float64)
     try:
         W = np.linalg.inv(Q)
-        smooth_kernel(x, l, Evidence(u, W, pose, index, z, np.ones(len(z)), sensor), 20, 1e-6)
+        smooth_kernel(x, l, SmoothingMeasurements(u, W, pose, index, z, np.ones(len(z)), sensor), 20, 1e-6)
     except np.linalg.LinAlgError:
         return None
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(l))):

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.evidence.contents import box_query
-from graphslam_frontends.segslam.config import WinnowConfig
+from graphslam_frontends.segslam.config import SegmentCandidateConfig
 from graphslam_frontends.segslam.sampling import OPEN, MapSample
 from graphslam_frontends.segslam.segmap import SegMap
 
@@ -21,7 +21,7 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidates:
+class SegmentCandidates:
     """Segments worth matching, nearest first (in σ), each ``(c, …)``.
 
     Parameters
@@ -51,7 +51,7 @@ class Candidates:
 
 
 @dataclass(slots=True)
-class Winnowed:
+class CandidateSelection:
     """How many segments fell at which sieve."""
 
     recent: int = 0
@@ -92,7 +92,7 @@ class _Places:
 
 
 def _places(
-    segmap: SegMap, sample: MapSample, step: int, config: WinnowConfig, exclude: frozenset[int] | set[int]
+    segmap: SegMap, sample: MapSample, step: int, config: SegmentCandidateConfig, exclude: frozenset[int] | set[int]
 ) -> tuple[_Places | None, int]:
     """What does not depend on the particle, and how many segments ended too recently."""
     t = segmap.table
@@ -115,16 +115,16 @@ def _places(
     return _Places(place, index, np.concatenate(paths), owner, first, way, config.drift(way)), recent
 
 
-def winnow(
+def select_candidates(
     segmap: SegMap,
     sample: MapSample,
     T_root_body: ArrayLike,
     step: int,
-    config: WinnowConfig,
+    config: SegmentCandidateConfig,
     *,
     exclude: frozenset[int] | set[int] = frozenset(),
-    tally: Winnowed | None = None,
-) -> list[Candidates]:
+    tally: CandidateSelection | None = None,
+) -> list[SegmentCandidates]:
     """Candidates, at one step, of particles that share a map sample.
 
     Parameters
@@ -137,11 +137,11 @@ def winnow(
         The step of now.
     exclude : set of int
         Segments that are not asked for, such as the one whose map the particles work in already.
-    tally : Winnowed, optional
+    tally : CandidateSelection, optional
         Counts are added.
     """
     T = np.asarray(T_root_body, dtype=np.float64)
-    tally = Winnowed() if tally is None else tally
+    tally = CandidateSelection() if tally is None else tally
     # 1. temporal separation
     places, recent = _places(segmap, sample, step, config, exclude)
     tally.recent += recent * len(T)
@@ -176,9 +176,9 @@ def _known(
     nearest: Ints,
     flat: Array,
     measure: Array,
-    config: WinnowConfig,
-    tally: Winnowed,
-) -> Candidates:
+    config: SegmentCandidateConfig,
+    tally: CandidateSelection,
+) -> SegmentCandidates:
     """3. does the map know the place? Of one particle, nearest first, until there are enough."""
     g = segmap.group
     near = np.isfinite(measure)
@@ -206,7 +206,7 @@ def _known(
     if not chosen:
         return _none(segmap)
     at = nearest[chosen]
-    return Candidates(
+    return SegmentCandidates(
         segments=places.index[chosen],
         T_map_body=np.stack(poses),
         distance=flat[at],
@@ -216,9 +216,9 @@ def _known(
     )
 
 
-def _none(segmap: SegMap) -> Candidates:
+def _none(segmap: SegMap) -> SegmentCandidates:
     z = np.zeros(0)
-    return Candidates(
+    return SegmentCandidates(
         segments=z.astype(np.int64), T_map_body=np.zeros((0, segmap.group.size)), distance=z, travelled=z, sigma=z,
         known=z.astype(np.int64),
     )  # fmt: skip

@@ -22,8 +22,8 @@ from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.gates import failed_match_gates, height_between, shift_between, tilt_between
 from graphslam.registration.register import Registration
 from graphslam_frontends.segslam.config import ChoiceConfig
-from graphslam_frontends.segslam.localisation import Localisation
-from graphslam_frontends.segslam.segmap import MATCH, Entry
+from graphslam_frontends.segslam.localisation import ScanLocalisation
+from graphslam_frontends.segslam.segmap import MATCH, SegmentEntry
 
 NULL = -1
 """The draw's answer for no match."""
@@ -45,7 +45,7 @@ class Proposal:
         σ of the path-length model at that place [m].
     rise : float
         What heights may have drifted by over the way from there to the body [m].
-    localisation : Localisation or None
+    localisation : ScanLocalisation or None
         What the throw-away particle filter says of it.
     """
 
@@ -54,7 +54,7 @@ class Proposal:
     T_prior: Array
     sigma: float
     rise: float = 0.0
-    localisation: Localisation | None = None
+    localisation: ScanLocalisation | None = None
 
     @property
     def T(self) -> Array:
@@ -83,7 +83,7 @@ class Proposal:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judgement:
+class MatchPosterior:
     """What became of the proposals of one particle.
 
     Parameters
@@ -127,10 +127,10 @@ class Judgement:
         # rounding of the sum must not choose one without weight
         return k if k < len(self.proposals) and self.weights[k] > 0 else NULL
 
-    def entry(self, k: int, config: ChoiceConfig) -> Entry:
+    def entry(self, k: int, config: ChoiceConfig) -> SegmentEntry:
         """How a particle that drew proposal ``k`` enters the older segment."""
         p = self.proposals[k]
-        return Entry(
+        return SegmentEntry(
             T_entry=p.T,
             kind=MATCH,
             source=p.segment,
@@ -139,9 +139,9 @@ class Judgement:
         )
 
 
-def judge(
+def match_posterior(
     proposals: Sequence[Proposal], config: ChoiceConfig, registration: RegistrationConfig | None = None
-) -> Judgement:
+) -> MatchPosterior:
     """Gate and weigh the proposals of one particle at one time (A9).
 
     Gates: those of the registration (fitness, degeneracy, tilt), a finite result, height and shift against the
@@ -155,19 +155,19 @@ def judge(
         Whose gates are asked; default the standard ones.
     """
     rules = RegistrationConfig() if registration is None else registration
-    margins = second_modes(proposals, config.mode_distance)
+    margins = proposal_margins(proposals, config.mode_distance)
     why, weights = [], np.zeros(len(proposals))
     for k, p in enumerate(proposals):
         fails = _fails(p, float(margins[k]), config, rules)
         why.append("; ".join(fails))
         if not fails:
             weights[k] = math.exp(_log_weight(p, config))
-    return Judgement(
+    return MatchPosterior(
         proposals=tuple(proposals), why=tuple(why), weights=weights, margins=margins, null=config.null_weight
     )
 
 
-def second_modes(proposals: Sequence[Proposal], apart: float) -> Array:
+def proposal_margins(proposals: Sequence[Proposal], apart: float) -> Array:
     """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``; see
     :func:`graphslam.registration.gates.match_margins`."""
     return gates.match_margins([p.registration for p in proposals], [p.segment for p in proposals], apart)

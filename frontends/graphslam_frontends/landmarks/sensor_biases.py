@@ -12,17 +12,17 @@ import numpy as np
 
 from graphslam.core.geometry import Array, rotation2, se2_between
 from graphslam.core.sensor_biases import CONSTANTS, SensorBiases
-from graphslam_frontends.landmarks.config import LastingConfig
-from graphslam_frontends.landmarks.fix_points import Way
-from graphslam_frontends.landmarks.smoothing_kernels import responses
-from graphslam_frontends.landmarks.summarise import Smoothed
+from graphslam_frontends.landmarks.config import SensorBiasConfig
+from graphslam_frontends.landmarks.fix_points import FixPlacement
+from graphslam_frontends.landmarks.smoothing_kernels import bias_sensitivities
+from graphslam_frontends.landmarks.summarise import SmoothingResult
 
 MOVING = 1e-6
 """An increment of the odometry that is shorter and turns less is rest [m, rad]."""
 
 
-def lasting_errors(
-    config: LastingConfig, smoothed: Smoothed, seconds: Array, way: Way | None, *, base: bool
+def estimate_sensor_biases(
+    config: SensorBiasConfig, smoothed: SmoothingResult, seconds: Array, way: FixPlacement | None, *, base: bool
 ) -> SensorBiases:
     """What a smoothed submap is with constant errors, and what it says of them.
 
@@ -30,7 +30,7 @@ def lasting_errors(
     ----------
     seconds : (T,)
         Of each increment of the odometry.
-    way : Way or None
+    way : FixPlacement or None
         Points of the path at fixes.
     base : bool
         The trajectory begins with the base, which does not move.
@@ -65,7 +65,7 @@ def lasting_errors(
         ahead, near = off / ranges[:, None], np.maximum(ranges, np.sqrt(ob[:, 2]))
         seen[:, 0, 4], seen[:, 0, 5] = ahead[:, 0], ahead[:, 1]
         seen[:, 1, 4], seen[:, 1, 5] = -ahead[:, 1] / near, ahead[:, 0] / near
-    moved, shifted, score, information = responses(smoothed.poses, smoothed.landmarks, evidence, along, seen)
+    moved, shifted, score, information = bias_sensitivities(smoothed.poses, smoothed.landmarks, evidence, along, seen)
     exit_moved = moved[-1].copy()
     exit_moved[:2] = rotation2(smoothed.poses[-1, 2]) @ exit_moved[:2]  # right tangent → plain vector of eq. 15
     points, before = np.zeros((0, len(CONSTANTS))), np.concatenate([np.zeros((1, 3, len(CONSTANTS))), moved])

@@ -17,7 +17,12 @@ from scipy import stats
 from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, moment_match
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.summarise import REGULARISER, Association, Smoothed, moment_matched
+from graphslam_frontends.landmarks.summarise import (
+    REGULARISER,
+    LandmarkAssociation,
+    SmoothingResult,
+    gaussian_of_particles,
+)
 
 FALSE_ALARM = 0.01
 """Share of the submaps of honest filters that each test of the flag may blame."""
@@ -51,7 +56,7 @@ class ParticleGaussians:
 
 
 def particle_gaussians(
-    filters: Sequence[ParticleSet], association: Association, smoothed: Smoothed, *, inflate: bool
+    filters: Sequence[ParticleSet], association: LandmarkAssociation, smoothed: SmoothingResult, *, inflate: bool
 ) -> ParticleGaussians:
     """Moments of the particles of one submap, alone and pooled.
 
@@ -59,34 +64,36 @@ def particle_gaussians(
     ----------
     filters : sequence of ParticleSet
         The first one decided; the others saw the same scans with random numbers of their own.
-    association : Association
+    association : LandmarkAssociation
         Of the standard particle of the first.
-    smoothed : Smoothed
+    smoothed : SmoothingResult
         Says which landmarks are left.
     inflate : bool
-        See :func:`graphslam_frontends.landmarks.summarise.moment_matched`; only the first filter's own moments are
-        inflated.
+        See :func:`graphslam_frontends.landmarks.summarise.gaussian_of_particles`; only the first filter's own moments
+        are inflated.
     """
     keep = smoothed.landmark_kept
     used = keep[association.landmark]
     rank = np.cumsum(keep) - 1
-    same = Association(association.slots[keep], association.observation[used], rank[association.landmark[used]])
+    same = LandmarkAssociation(association.slots[keep], association.observation[used], rank[association.landmark[used]])
     moments, dropped = _moments(filters[0], same, inflate)
     if len(filters) < 2:
         return ParticleGaussians(moments, dropped, None, 0)
     each = [_moments(p, same, False)[0] for p in filters]
     there = [g for g in each if g is not None]
-    return ParticleGaussians(moments, dropped, pool(there) if len(there) > 1 else None, len(each) - len(there))
+    return ParticleGaussians(
+        moments, dropped, pool_gaussians(there) if len(there) > 1 else None, len(each) - len(there)
+    )
 
 
-def _moments(particles: ParticleSet, association: Association, inflate: bool) -> tuple[Gaussian | None, int]:
+def _moments(particles: ParticleSet, association: LandmarkAssociation, inflate: bool) -> tuple[Gaussian | None, int]:
     try:
-        return moment_matched(particles, association, inflate=inflate)
+        return gaussian_of_particles(particles, association, inflate=inflate)
     except CovarianceError:  # every particle was dropped
         return None, len(particles.pose)
 
 
-def pool(gaussians: Sequence[Gaussian]) -> Gaussian:
+def pool_gaussians(gaussians: Sequence[Gaussian]) -> Gaussian:
     """One Gaussian of K independent estimates of the same posterior: within + (1 + 1/K) between.
 
     The mean of their covariances, and the unbiased scatter of their means with a 1/K share for the error of the pooled
@@ -105,7 +112,7 @@ def pool(gaussians: Sequence[Gaussian]) -> Gaussian:
     return replace(scatter, covariance=within + (1.0 + 1.0 / k) * between)
 
 
-def distance(prefix: str, particle: Gaussian | None, smoothed: Gaussian) -> dict[str, Any]:
+def gaussian_discrepancy(prefix: str, particle: Gaussian | None, smoothed: Gaussian) -> dict[str, Any]:
     """How far a Gaussian made of particles is from the smoothed one, as ``prefix_…`` figures; None where it is missing.
 
     ``d2_per_dof``: Mahalanobis distance² of the means under the particles' covariance, over the dimension; ``kl``:
@@ -121,14 +128,14 @@ def distance(prefix: str, particle: Gaussian | None, smoothed: Gaussian) -> dict
     }
 
 
-def flag(report: dict[str, Any], particles: int) -> list[str]:
+def consistency_flag(report: dict[str, Any], particles: int) -> list[str]:
     """Why a map is not to be taken at its particles' word; empty if it may be.
 
     Parameters
     ----------
     report : dict
-        With the figures of :func:`distance`, ``min_ess``, ``effective_ancestors``, ``handover``, and ``chi2`` with
-        ``dof`` of the smoothing.
+        With the figures of :func:`gaussian_discrepancy`, ``min_ess``, ``effective_ancestors``, ``handover``, and
+        ``chi2`` with ``dof`` of the smoothing.
     particles : int
         A set smaller than :data:`LEAST_ESS` cannot reach it and is not blamed for that alone.
     """

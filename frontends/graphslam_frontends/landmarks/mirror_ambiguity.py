@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, se2_transform
-from graphslam_frontends.landmarks.config import DelayedStart
-from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate
-from graphslam_frontends.landmarks.summarise import Smoothed, smooth
+from graphslam_frontends.landmarks.config import DelayedInitialisation
+from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate_kernel
+from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
@@ -27,8 +27,8 @@ _APART = 1.0  # a rival this near [m] is the landmark itself
 
 
 @dataclass(frozen=True, slots=True)
-class SubmapProblem:
-    """What :func:`graphslam_frontends.landmarks.summarise.smooth` smooths, beside the start.
+class SmoothingProblem:
+    """What :func:`graphslam_frontends.landmarks.summarise.smooth_submap` smooths, beside the start.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ class SubmapProblem:
     trim: float
     min_hits: int
 
-    def smooth(self, poses: Array, landmarks: Array) -> Smoothed:
+    def smooth(self, poses: Array, landmarks: Array) -> SmoothingResult:
         """Smooth from a start ``(T, 3)``, ``(L, 2)``."""
-        return smooth(
+        return smooth_submap(
             poses,
             landmarks,
             self.increments,
@@ -62,7 +62,7 @@ class SubmapProblem:
             min_hits=self.min_hits,
         )
 
-    def restricted(self, observations: Bools, landmarks: Bools) -> SubmapProblem:
+    def restricted(self, observations: Bools, landmarks: Bools) -> SmoothingProblem:
         """The same with some observations and landmarks, all of them inliers."""
         rank = np.cumsum(landmarks) - 1
         keep = observations & landmarks[self.ob_landmark]
@@ -77,12 +77,12 @@ class SubmapProblem:
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
+class ResolvedMirrors:
     """A submap without rivals.
 
     Parameters
     ----------
-    smoothed : Smoothed
+    smoothed : SmoothingResult
         Over the problem's own observations and landmarks.
     swapped : int
         Landmarks that were better explained by their mirror image.
@@ -92,26 +92,28 @@ class Settled:
         Landmarks left out because the free path leaves them too uncertain for a Gaussian.
     """
 
-    smoothed: Smoothed
+    smoothed: SmoothingResult
     swapped: int
     ambiguous: int
     vague: int
 
 
-def settle_rivals(problem: SubmapProblem, first: Smoothed, config: DelayedStart) -> Settled:
+def resolve_mirror_ambiguity(
+    problem: SmoothingProblem, first: SmoothingResult, config: DelayedInitialisation
+) -> ResolvedMirrors:
     """Try every rival of every landmark that was seen without bearings.
 
     Parameters
     ----------
-    first : Smoothed
+    first : SmoothingResult
         Its smoothing from the filter's start.
-    config : DelayedStart
+    config : DelayedInitialisation
         A landmark must beat its rivals by its ``margin``, and be known to its ``spread``.
     """
     blind = np.ones(len(first.landmark_kept), dtype=np.bool_)
     np.logical_and.at(blind, problem.ob_landmark, np.isinf(problem.observations[:, 3]))
     if not np.any(blind & first.landmark_kept):
-        return Settled(first, 0, 0, 0)
+        return ResolvedMirrors(first, 0, 0, 0)
     current, swapped = first, 0
     for _ in range(_ROUNDS):
         current, ambiguous, swaps = _round(problem, current, blind, config.margin)
@@ -120,17 +122,17 @@ def settle_rivals(problem: SubmapProblem, first: Smoothed, config: DelayedStart)
             break
     vague = _vague(problem, current, blind, config.spread) & ~ambiguous
     if not np.any(ambiguous | vague):
-        return Settled(current, swapped, 0, 0)
+        return ResolvedMirrors(current, swapped, 0, 0)
     without = current.landmark_kept & ~(ambiguous | vague)
     kept = current.kept & without[problem.ob_landmark]
     small = problem.restricted(kept, without)
     start = _positions(current)[without[current.landmark_kept]]
     last = small.smooth(current.poses, start)
     last = replace(last, kept=kept, landmark_kept=without)
-    return Settled(last, swapped, int(ambiguous.sum()), int(vague.sum()))
+    return ResolvedMirrors(last, swapped, int(ambiguous.sum()), int(vague.sum()))
 
 
-def _vague(problem: SubmapProblem, current: Smoothed, blind: Bools, spread: float) -> Bools:
+def _vague(problem: SmoothingProblem, current: SmoothingResult, blind: Bools, spread: float) -> Bools:
     """Landmarks whose largest σ exceeds ``spread`` of their mean range, seen both from the base and from the exit.
 
     The two views share no drift: a landmark that was seen at the beginning is sharp from the base, one at the end from
@@ -153,11 +155,13 @@ def _vague(problem: SubmapProblem, current: Smoothed, blind: Bools, spread: floa
     return out
 
 
-def _positions(smoothed: Smoothed) -> Array:
+def _positions(smoothed: SmoothingResult) -> Array:
     return smoothed.gaussian.mean[3:].reshape(-1, 2)
 
 
-def _round(problem: SubmapProblem, current: Smoothed, blind: Bools, margin: float) -> tuple[Smoothed, Bools, int]:
+def _round(
+    problem: SmoothingProblem, current: SmoothingResult, blind: Bools, margin: float
+) -> tuple[SmoothingResult, Bools, int]:
     """One look at all landmarks: the smoothing with the better ones, which ones are ambiguous, number of swaps."""
     inner = problem.restricted(current.kept, current.landmark_kept)
     poses, landmarks, chi2 = current.poses, _positions(current), current.chi2
@@ -193,7 +197,7 @@ def _round(problem: SubmapProblem, current: Smoothed, blind: Bools, margin: floa
     return replace(solved, kept=kept, landmark_kept=landmark_kept), ambiguous & landmark_kept, swaps
 
 
-def _rivals(problem: SubmapProblem, poses: Array, landmark: Array, j: int) -> Iterator[Array]:
+def _rivals(problem: SmoothingProblem, poses: Array, landmark: Array, j: int) -> Iterator[Array]:
     """Other places that explain the ranges of landmark j as the path stands."""
     rows = problem.ob_landmark == j
     anchors = np.ascontiguousarray(se2_transform(poses[problem.ob_pose[rows]], problem.sensor[:2]))
@@ -201,7 +205,7 @@ def _rivals(problem: SubmapProblem, poses: Array, landmark: Array, j: int) -> It
     starts = circle_starts(anchors, ranges, np.inf)
     minima = np.empty((len(starts), 3))
     fit, used = np.empty(FIT_LENGTH), np.zeros(len(ranges), dtype=np.bool_)
-    found = trilaterate(anchors, ranges, variances, np.inf, starts, fit, used, minima)
+    found = trilaterate_kernel(anchors, ranges, variances, np.inf, starts, fit, used, minima)
     for x, y, _ in minima[:found]:
         if np.hypot(x - landmark[0], y - landmark[1]) > _APART:
             yield np.array([x, y])

@@ -26,7 +26,7 @@ STATES = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LastingErrors:
+class DeadReckoningErrorModel:
     """σ of the errors that outlive a step, at the first record of the path, and how they walk."""
 
     gyro_bias: float
@@ -65,7 +65,7 @@ class LastingErrors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reckoned:
+class DeadReckonedPath:
     """A dead-reckoned path at given times.
 
     Parameters
@@ -91,7 +91,7 @@ class Reckoned:
     poses: Array
     path: Trajectory
     tilt: Array
-    lasting: LastingErrors
+    lasting: DeadReckoningErrorModel
     transitions: Array
     noises: Array
     floor: Array
@@ -128,8 +128,8 @@ class Reckoned:
             F[:STATES, :STATES] = self.transitions[k]
             P = F @ P @ F.T
             P[:STATES, :STATES] += self.noises[k]
-        a = level(self.poses[start]) if level_start else self.poses[start]
-        b = level(self.poses[end]) if level_end else self.poses[end]
+        a = level_by_euler(self.poses[start]) if level_start else self.poses[start]
+        b = level_by_euler(self.poses[end]) if level_end else self.poses[end]
         G = tangent_of_state(a[None], b[None], level_start=level_start, level_end=level_end)[0]
         C = G @ P @ G.T + np.diag(self.floor**2)
         return se3.se3_between(a, b), 0.5 * (C + C.T)
@@ -154,7 +154,7 @@ def euler_quat(roll: Array, pitch: Array, heading: Array) -> Array:
     return se3.quat_normalize(se3.quat_multiply(se3.quat_multiply(z, y), x))
 
 
-def level(poses: Array) -> Array:
+def level_by_euler(poses: Array) -> Array:
     """Poses ``(..., 7)`` with position and heading kept, roll and pitch removed."""
     p = np.asarray(poses, dtype=np.float64)
     heading = euler(p)[..., 2]

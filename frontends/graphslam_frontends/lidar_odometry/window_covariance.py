@@ -21,7 +21,7 @@ SCANS = 10
 """… or so many scans."""
 
 
-class JointErrors:
+class WindowCovariance:
     """Joint covariance of the errors of the poses of a window, right tangents.
 
     Slot 0 is the pose of now, slot 1 that where the submap began, the others those of the window, oldest first.

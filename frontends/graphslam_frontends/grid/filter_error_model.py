@@ -28,7 +28,7 @@ _NODES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Passed:
+class ErrorPassThrough:
     """How much of the errors of dead reckoning a filter passes on.
 
     A scan holds a pose to the map of the last metres, and that map was drawn along the same path: errors leak into it.
@@ -113,7 +113,7 @@ class FilterDrift:
     """Gravity is told with an error that lasts: σ of the height after a way of one metre [m/m]."""
     tilt: float = 0.006
     """σ of roll and pitch, whatever the length [rad]."""
-    passed: Passed = field(default_factory=Passed)
+    passed: ErrorPassThrough = field(default_factory=ErrorPassThrough)
     """What comes on top where it is known how far off dead reckoning is."""
 
     def __post_init__(self) -> None:
@@ -182,7 +182,7 @@ class FilterDrift:
         return C if reckoned is None else C + self.passed.covariance(reckoned, length, particles, tilt=told_tilt)
 
 
-def between_knots(knots: npt.NDArray[np.int64], covariances: Array, poses: Array, along: Array) -> Array:
+def interpolate_covariances(knots: npt.NDArray[np.int64], covariances: Array, poses: Array, along: Array) -> Array:
     """Covariances ``(n, d, d)`` at all poses of a path from those at some, linear in the way, right tangents.
 
     In the axes of the base, where neighbours differ by drift alone and not by the turn of the body.

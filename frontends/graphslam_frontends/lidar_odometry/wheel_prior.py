@@ -26,7 +26,7 @@ NOISE = (2e-3, 0.01)
 """What scans themselves are off by [rad], [m]: to miss no more is no fault."""
 
 
-class Reckoned:
+class WheelMotionPrior:
     """Tells motions by odometry, and how far they may be off.
 
     Parameters

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from graphslam_frontends.odometry.reckoned import Reckoned
+from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath
 from graphslam_frontends.odometry.recorded import RecordedErrors
 from graphslam_frontends.odometry.steps import Steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LastingSigmas:
+class BiasSigmas:
     """Prior σ of the errors that outlive a step."""
 
     yaw_bias: float
@@ -31,22 +31,22 @@ class LastingSigmas:
     """Of wheels in the plane: share of the turns, the distance between them being known no better."""
 
 
-LEAST = LastingSigmas(
+LEAST = BiasSigmas(
     yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3, bend=0.03, turn=0.03
 )
 """What no robot is known better to than from its own scans: consumer gyros, wheels under load, brackets, clocks."""
 
 
-def lasting_sigmas(steps: Steps) -> LastingSigmas:
+def bias_sigmas(steps: Steps) -> BiasSigmas:
     """Prior σ of the lasting errors of steps: those that their motion states, never less than :data:`LEAST`."""
     e, least = steps.errors, LEAST
     bias, walk, scale, tilt = 0.0, 0.0, 0.0, steps.tilt_sigma
-    if isinstance(e, Reckoned):
+    if isinstance(e, DeadReckonedPath):
         bias, walk, scale = e.lasting.gyro_bias, e.lasting.gyro_walk, e.lasting.wheel_scale
         tilt = e.lasting.attitude_bias
     elif isinstance(e, RecordedErrors):
         bias, scale = e.yaw_bias, e.scale
-    return LastingSigmas(
+    return BiasSigmas(
         yaw_bias=max(bias, least.yaw_bias),
         yaw_walk=walk or least.yaw_walk,  # a walk that is greater than stated is found and widened
         scale=max(scale, least.scale),
