@@ -30,10 +30,10 @@ $(BASE): pyproject.toml
 	@$(PIP) --editable .
 	@touch $(BASE)
 
-# What the tests compare with, and the notebooks.
-$(STAMP): $(BASE)
+# What the tests compare with, the notebooks, and the studies.
+$(STAMP): $(BASE) notebooks/studies/pyproject.toml
 	@echo "installing what the tests and the notebooks need into $(VENV) (another 2 GB: Open3D, Rerun, JupyterLab)"
-	@$(PIP) --editable '.[$(EXTRAS)]'
+	@$(PIP) --editable '.[$(EXTRAS)]' --editable notebooks/studies
 	@touch $(STAMP)
 
 demo: $(BASE)

@@ -22,9 +22,9 @@ from graphslam.app.run.pipeline import solve_again
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Later, Run
 from graphslam.app.run.source import load_log_source
-from graphslam.app.studies.definition import find_study as find_study
-from graphslam.app.studies.study import open_study as open_study
-from graphslam.app.studies.study import study as study
+from graphslam.app.studies import find_study as find_study
+from graphslam.app.studies import open_study as open_study
+from graphslam.app.studies import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate

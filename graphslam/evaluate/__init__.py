@@ -5,13 +5,10 @@ from graphslam.core.lazy_exports import lazy_exports
 _EXPORTS = {
     "consistency": "Consistency",
     "submap_consistency": "submap_nees submaps_consistency",
-    "montecarlo": "trial_seed",
     "association": "match_observations",
     "gps": "gps_residuals in_gps_frame",
     "gps_floor": "fix_segments revisit_disagreement segment_table",
     "reckoning": "dead_reckoning",
     "trajectory_error": "ate fit_alignment",
-    "gap": "gap_along gap_by_tree polish_history pose_consistency_along",
-    "segslam_judge": "dead_reckoned exit_errors fused_grid match_errors path_errors relative",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

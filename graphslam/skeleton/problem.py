@@ -59,7 +59,7 @@ class SkeletonProblem:
 
     Examples
     --------
-    >>> from graphslam.sim.laps import LapsConfig, draw_laps
+    >>> from graphslam_studies.sim.laps import LapsConfig, draw_laps
     >>> problem = draw_laps(LapsConfig(poses=1200)).problem()
     >>> problem.poses, problem.measurements
     (1200, 119550)

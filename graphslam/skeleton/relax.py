@@ -235,7 +235,7 @@ def relax_skeleton(
 
     Examples
     --------
-    >>> from graphslam.sim.laps import LapsConfig, draw_laps
+    >>> from graphslam_studies.sim.laps import LapsConfig, draw_laps
     >>> found = gs.relax_skeleton(draw_laps(LapsConfig(poses=1200)).problem())
     >>> found.converged, round(found.chi2, 2)
     ('poses', 1.0)

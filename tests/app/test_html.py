@@ -19,12 +19,11 @@ import pandas as pd
 import pytest
 
 import graphslam
+import graphslam_studies
 from graphslam.app.report.report import Report
 from graphslam.app.run.run import Run
 from graphslam.app.run.without_truth import WithoutTruth
 from graphslam.app.sessions.merged_map import MergedMap
-from graphslam.app.studies.folder import StudyFolder
-from graphslam.app.studies.study import Study
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import VelocityControls
 from graphslam.core.submap import Submap
@@ -40,6 +39,8 @@ from graphslam.io.cards import list_cards
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.batch import BatchSolver
+from graphslam_studies.montecarlo.folder import StudyFolder
+from graphslam_studies.montecarlo.study import Study
 
 EVIL = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&"
 NOTHING = np.zeros(0, dtype=np.int64)
@@ -48,7 +49,7 @@ NOTHING = np.zeros(0, dtype=np.int64)
 def classes() -> dict[str, type]:
     """Every class of the package that says how it looks in a notebook."""
     found = {}
-    for package in (graphslam,):
+    for package in (graphslam, graphslam_studies):
         for m in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if m.name.endswith("__main__"):
                 continue
@@ -184,7 +185,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     "graphslam.app.run.without_truth.WithoutTruth": lambda _: WithoutTruth(
         {"c": ClassConsistency(**CLASS)}, None, None
     ),
-    "graphslam.app.studies.study.Study": a_study,
+    "graphslam_studies.montecarlo.study.Study": a_study,
     "graphslam.app.sessions.merged_map.MergedMap": a_merge,
     "graphslam.app.run.run.Run": a_run,
     "graphslam.app.report.report.Report": lambda _: Report(f"<html><body>{EVIL}</body></html>", "run", {}),

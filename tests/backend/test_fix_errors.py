@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.studies.trust_worlds import lasting
 from graphslam.backend.fix_errors import GATE, LEAST, _Innovations, fit_fix_errors, spread_out
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_transform
 from graphslam.core.records import Gps
@@ -17,6 +16,7 @@ from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
+from graphslam_studies.trust_worlds import lasting
 
 STEP = np.array([0.06, 0.04, np.deg2rad(0.15)])
 """σ of the odometry in a second."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphslam.app.studies.segslam_trial import QUICK, GridTrial
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import Hypothesis, hypotheses_of, solve_hypotheses, topologies, topology
 from graphslam.core.errors import ConfigError, DataError
@@ -25,6 +24,7 @@ from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segmap import MATCH, NEW
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_frontends.segslam.submaps import common_ancestor_chain, sampled_chain
+from graphslam_studies.segslam_trial import QUICK, GridTrial
 
 COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
 CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)

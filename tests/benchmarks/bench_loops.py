@@ -19,8 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.app.studies import segslam_building, segslam_garage, segslam_mine
-from graphslam.app.studies.segslam_trial import GridTrial
 from graphslam.core import se3
 from graphslam.core.atomic import read_npz, write_npz
 from graphslam.core.geometry import Array
@@ -40,6 +38,8 @@ from graphslam.registration.place_descriptor import concatenate_descriptors, des
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
+from graphslam_studies import segslam_building, segslam_garage, segslam_mine
+from graphslam_studies.segslam_trial import GridTrial
 from tests.reference.loop_network import LoopNetwork
 from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops
 

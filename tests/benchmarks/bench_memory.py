@@ -33,7 +33,7 @@ from graphslam.core.spill_cache import SPILL_CACHE
 from graphslam.maps import run_map
 from graphslam.sim.campus_config import campus_preset
 from graphslam.sim.campus_world import campus
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [
     (pipeline, "load_log_source", "log opened"),

@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.bench_scale [--quick] [--poses 10000,100000,1000000] [--threads 1] [--gtsam 10000]
 
-The laps world (``graphslam/sim/laps.py``): twelve laps of one route, 100 measurements a pose, so 10⁴, 10⁵ and 10⁶ poses
-have 10⁶, 10⁷ and 10⁸ measurements. Each size is a process of its own that first runs a small world, so that nothing is
-compiled while the clock runs. Printed of each: time by stage; when χ²/dof was within 1 % of its end value, and when a
-step gained less than one unit of χ²; the largest move of the last step; distances to the truth; how far the softest
-modes still move (approximate); costs per measurement, and their growth from size to size (the exponent).
+The laps world (:mod:`graphslam_studies.sim.laps`): twelve laps of one route, 100 measurements a pose, so 10⁴, 10⁵ and
+10⁶ poses have 10⁶, 10⁷ and 10⁸ measurements. Each size is a process of its own that first runs a small world, so that
+nothing is compiled while the clock runs. Printed of each: time by stage; when χ²/dof was within 1 % of its end value,
+and when a step gained less than one unit of χ²; the largest move of the last step; distances to the truth; how far the
+softest modes still move (approximate); costs per measurement, and their growth from size to size (the exponent).
 
 ``--gtsam N`` solves the same network of N poses with GTSAM's Gauss-Newton, by MULTIFRONTAL_CHOLESKY and
 MULTIFRONTAL_SOLVER, each ordered by COLAMD and METIS, from dead reckoning with the landmarks at their best places, and
@@ -56,11 +56,11 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 
 def ours(poses: int, threads: int) -> dict[str, Any]:
     """Draw, collapse, relax, then the unit costs."""
-    from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.collapse import Collapse
     from graphslam.skeleton.preconditioner import Preconditioner, PreconditionerLevels
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
     from graphslam.skeleton.schur import Network, Workers, WorkRanges
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     config = RelaxConfig(threads=threads)
     for levels in (PreconditionerLevels(0, 20), PreconditionerLevels(10, 80)):
@@ -135,7 +135,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
 
 def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
     """Write a world to disk."""
-    from graphslam.sim.laps import LapsConfig, draw_laps
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     begin = time.process_time()
     tiles = draw_laps(LapsConfig(poses=poses)).to_tiles(folder)
@@ -144,11 +144,11 @@ def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
 
 def from_tiles(poses: int, folder: str, iterations: int, start: str, threads: int) -> dict[str, Any]:
     """Relax a network whose measurements stay on disk."""
-    from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.preconditioner import PreconditionerLevels
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
     from graphslam.skeleton.schur import step_poses
     from graphslam.skeleton.tile_store import Tiles
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     for levels in (PreconditionerLevels(0, 20), PreconditionerLevels(10, 80)):
         relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels))
@@ -180,10 +180,10 @@ def theirs(poses: int, solver: str, ordering: str, start: str, gigabytes: float)
     import gtsam
 
     from graphslam.core.se3 import matrix_to_quat
-    from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.landmark_kernels import Poses
     from graphslam.skeleton.schur import Network, Workers, WorkRanges
     from graphslam.skeleton.start import chain_start, forward_pass
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     problem = (world := draw_laps(LapsConfig(poses=poses))).problem()
     at = problem.dead_reckoning() if start == "odometry" else forward_pass(problem, chain_start(problem)).poses
@@ -263,8 +263,8 @@ def theirs(poses: int, solver: str, ordering: str, start: str, gigabytes: float)
 def chain_graph(poses: int, share: float) -> Any:
     """The laps' odometry, and a loop to the lap before at a share of the poses."""
     from graphslam.core.se3 import quat_to_matrix, so3_exp
-    from graphslam.sim.laps import LapsConfig, draw_laps
     from graphslam.skeleton.chain_graph import ChainGraph
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     world = draw_laps(LapsConfig(poses=poses))
     per, rng = world.shared.shape[0], np.random.default_rng(0)

@@ -26,7 +26,6 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load
 from graphslam.plots.evidence import plot_heights, plot_section
@@ -38,6 +37,7 @@ from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_studies.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",

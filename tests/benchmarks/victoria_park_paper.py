@@ -42,7 +42,7 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
 from graphslam.plots.save import save
-from graphslam.plots.study_time import plot_cumulative_time
+from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.gps_maps import plot_gps_maps
 
 Ints = npt.NDArray[np.int64]

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 import graphslam as gs
 from graphslam.app.cli import app
 from graphslam.app.cli.run import join_note
-from graphslam.app.studies.calibration_robot import draw_robot, drive
 from graphslam.calibrate.corrections import Corrections, apply_corrections
 from graphslam.calibrate.estimate import Estimate
 from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
@@ -24,6 +23,7 @@ from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.io.log_store import save_log
 from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_studies.calibration_robot import draw_robot, drive
 
 ROBOT = draw_robot(3)
 OPTIONS = {

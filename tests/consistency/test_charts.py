@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from graphslam.app.compare import map_nees
-from graphslam.app.studies.charts import ChartConfig, local_table, run_trial
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.join.registry import join_by_method
+from graphslam_studies.charts import ChartConfig, local_table, run_trial
 from tests.reference.submap_chain import submap_chain
 
 RUNS = 10

@@ -27,7 +27,7 @@ def shown() -> str:
     """All notebooks and pages."""
     cells = [c for p in ROOT.glob("notebooks/*.ipynb") for c in json.loads(p.read_text(encoding="utf-8"))["cells"]]
     text = ["".join(c["source"]) for c in cells]
-    return "\n".join(text + [p.read_text(encoding="utf-8") for p in ROOT.glob("docs/*.md")])
+    return "\n".join(text + [p.read_text(encoding="utf-8") for p in ROOT.glob("docs/**/*.md")])
 
 
 @every_room

@@ -54,7 +54,7 @@ ROWS = (
     Row("scanner", "ranges × 0.001 (kilometres)", put.ranges(lambda r: 0.001 * r), "refused", NONE_MET),
     Row("scanner", "all ranges 3 m exactly", put.every(3.0), "reported", "scans-constant"),
     Row("scanner", "all ranges 3 m with noise", put.bubble, "reported", "distance-disagrees"),
-    Row("scanner", "one scan for ever", put.stuck, "reported", "scans-repeated"),
+    Row("scanner", "the same scan always", put.stuck, "reported", "scans-repeated"),
     Row("scanner", "every scan twice", put.twice, "dropped", "scan is the one before, number for number"),
     Row("scanner", "ranges × 2", put.ranges(lambda r: 2.0 * r), "reported", "distance-disagrees|scans-unlike"),
     Row("scanner", "ranges 1 m too long", put.ranges(lambda r: r + 1.0), "reported", f"{MOUNT}|scans-unlike", (3,)),

@@ -42,8 +42,6 @@ from graphslam.app.report.report import make_report
 from graphslam.app.run import outputs
 from graphslam.app.run.files import loops_of_run
 from graphslam.app.sessions import merge_outputs
-from graphslam.app.studies import folder as study_folder
-from graphslam.app.studies.folder import StudyFolder
 from graphslam.app.worlds import simulate, write_simulated
 from graphslam.core.digest import Digest
 from graphslam.core.errors import RunFolderError
@@ -51,6 +49,8 @@ from graphslam.io.submap_store import SubmapStore, read_submaps
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam_studies.montecarlo import folder as study_folder
+from graphslam_studies.montecarlo.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDY = "tests.reference.small_study:STUDY"

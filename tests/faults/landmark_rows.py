@@ -189,8 +189,8 @@ GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
     ("bursts of outliers", _gps(_bursts), "reported", OF_FIXES),
     ("slow ramp", _gps(_ramp), "reported", OF_FIXES),
     ("lag of 1 s", _gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", OF_FIXES),
-    ("error that lasts 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", OF_FIXES),
-    ("error that lasts 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
+    ("error constant for 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", OF_FIXES),
+    ("error constant for 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
     ("only at the start", _gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
     ("off by 1 km, constantly", _gps(lambda g, _: replace(g, positions=g.positions + [800.0, -600.0])), "handled", ""),
     ("no fix at all", _gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
@@ -202,14 +202,14 @@ def _rows() -> list[Row]:
     rows: list[Row] = []
     for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
         rows += [Row("wheels", f, i, "reported", "calibration|residuals", frontend) for f, i in WHEELS]
-        rows += [Row("sightings", f, i, "reported", "calibration|residuals", frontend) for f, i in SIGHTINGS]
-        rows.append(Row("sightings", *MILLIMETRES, "reported", "sightings-not-used", frontend))
-        rows.append(Row("sightings", *KILOMETRES, "refused", HARDLY, frontend))
+        rows += [Row("landmarks", f, i, "reported", "calibration|residuals", frontend) for f, i in SIGHTINGS]
+        rows.append(Row("landmarks", *MILLIMETRES, "reported", "sightings-not-used", frontend))
+        rows.append(Row("landmarks", *KILOMETRES, "refused", HARDLY, frontend))
         ids = inject.wrong_identities(0.1)
-        rows += [Row("sightings", "10 % wrong identities", ids, "reported", "residuals", frontend)]
+        rows += [Row("landmarks", "10 % wrong identities", ids, "reported", "residuals", frontend)]
         rows += [
             Row(
-                "sightings",
+                "landmarks",
                 "none in any scan",
                 inject.sightings(_no_sighting),
                 "reported",
@@ -229,7 +229,7 @@ def _rows() -> list[Row]:
         rows.append(replace(beyond, config=short))
     for frontend, config in (("rbpf-ekf", LIKELIHOOD), ("ekf-slam", NEAREST)):
         rows += [Row("wheels", f, i, "reported", FIT, frontend, config=config) for f, i in WHEELS]
-        rows += [Row("sightings", f, i, "reported", FIT, frontend, config=config) for f, i in [*SIGHTINGS, MILLIMETRES]]
+        rows += [Row("landmarks", f, i, "reported", FIT, frontend, config=config) for f, i in [*SIGHTINGS, MILLIMETRES]]
     # by ranges alone, wheels that turn the other way give the mirror image of everything: a limit, not a row
     blind = [
         *(x for x in WHEELS if "other side" not in x[0]),
@@ -252,7 +252,7 @@ def _rows() -> list[Row]:
     rows += [
         Row(
             "GPS",
-            f"{GPS[8][0]}, half of the fixes kept back",
+            f"{GPS[8][0]}, half of the fixes withheld",
             GPS[8][1],
             "reported",
             "gps-correlated",
@@ -263,12 +263,12 @@ def _rows() -> list[Row]:
     for frontend in ("ekf-slam", "rbpf-slam"):
         rows += [Row("GPS", f, i, o, s, frontend, log="gps", config=used) for f, i, o, s in (GPS[0], GPS[1], GPS[3])]
     rows += [
-        Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT),
-        Row("sightings", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),
-        Row("sightings", "all ranges NaN", inject.sightings(_nan), "refused", "is not finite"),
-        Row("sightings", "stamps that repeat", inject.sightings(_twice), "refused", "time does not increase"),
-        Row("sightings", "log without a record", _records(0, "landmarks"), "refused", "no scan to work on"),
-        Row("sightings", "log of one scan", _records(1, "landmarks"), "handled", ""),
+        Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT),
+        Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),
+        Row("landmarks", "all ranges NaN", inject.sightings(_nan), "refused", "is not finite"),
+        Row("landmarks", "stamps that repeat", inject.sightings(_twice), "refused", "time does not increase"),
+        Row("landmarks", "log without a record", _records(0, "landmarks"), "refused", "no scan to work on"),
+        Row("landmarks", "log of one scan", _records(1, "landmarks"), "handled", ""),
         Row("wheels", "log without a record", _records(0, "controls"), "refused", "motion stream is empty"),
         Row("wheels", "log of one record", _records(1, "controls"), "refused", "a single record"),
         Row(
@@ -281,7 +281,7 @@ def _rows() -> list[Row]:
         ),
         Row(
             "settings",
-            "noise of the sightings stated four times too small",
+            "assumed noise of the observations four times too small",
             inject.clean,
             "reported",
             "residuals",

@@ -27,8 +27,6 @@ from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.files import loops_of_run, read_merged_dense
 from graphslam.app.run.outputs import open_run, refined_submaps_of
-from graphslam.app.studies.folder import StudyFolder
-from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.config import read_toml
@@ -50,7 +48,6 @@ from graphslam.core.records import (
 )
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.montecarlo import Measurement
 from graphslam.evidence.formats import load_npz
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.io.bags import read_bag
@@ -84,6 +81,9 @@ from graphslam.io.victoria_park_published import (
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
 from graphslam_frontends.odometry.bias_sigmas import LEAST
+from graphslam_studies.montecarlo.folder import StudyFolder
+from graphslam_studies.montecarlo.study import open_study
+from graphslam_studies.montecarlo.trials import Measurement
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap, write_ros1, write_ros2
 

@@ -17,12 +17,12 @@ from graphslam.app.report.report import make_report
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.loops import loops_of_run
 from graphslam.app.run.outputs import open_run
-from graphslam.app.studies.study import open_study
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
 from graphslam.io.log_folder import read_log_mesh
 from graphslam.io.log_store import load_log
 from graphslam.io.submap_store import read_submaps
+from graphslam_studies.montecarlo.study import open_study
 from tests.faults.readers import a_log_folder, log_with_mesh, run_folder, study_folder, submap_store
 
 ROOT = Path(__file__).resolve().parents[2]

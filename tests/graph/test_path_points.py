@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.front_ends import make_front_end
-from graphslam.app.studies.charts import ChartConfig, draw_log
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import rotation2, se2_compose, se2_exp, se2_transform
 from graphslam.core.log import SensorLog
@@ -27,6 +26,7 @@ from graphslam_frontends.landmarks.smoothing_kernels import (
     path_covariances,
     smoothed_covariances,
 )
+from graphslam_studies.charts import ChartConfig, draw_log
 
 FRAME = np.array([50.0, -20.0, 0.6])
 

@@ -14,14 +14,14 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryE
 from graphslam.core.geometry import Array
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.terrain.learning import fit_calibration, fit_weights, ratios_of
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
 from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_way, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
 from graphslam.maps.terrain.tables import BINS, Tables, calibrated, dampened, fixed_tables, noisy_or, read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
-from graphslam.sim.street import StreetRobot, draw_street, drive_street
+from graphslam_studies.maps.learning import fit_calibration, fit_weights, ratios_of
+from graphslam_studies.sim.street import StreetRobot, draw_street, drive_street
 from tests.reference.map_server import read_map_server
 from tests.reference.plain_terrain import plain_rows
 

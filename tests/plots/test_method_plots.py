@@ -17,7 +17,6 @@ from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.submap_consistency import true_submap
 from graphslam.join.registry import join_by_method
-from graphslam.plots.gap import FLOOR, plot_convergence, plot_gap_along, plot_tree_gap
 from graphslam.plots.method_maps import plot_method_maps
 from graphslam.plots.particles import (
     histories_left,
@@ -27,6 +26,7 @@ from graphslam.plots.particles import (
     plot_histories,
     plot_lineage,
 )
+from graphslam_studies.plots.gap import FLOOR, plot_convergence, plot_gap_along, plot_tree_gap
 
 OPTIONS = {"particles": 20, "stopping": {"scans": 20}}
 

@@ -68,9 +68,9 @@ def read(*particles: int, pieces: bool = False) -> Ends:
 
 def drive(layout: str, seed: int) -> Iterator[tuple[int, bool, Array, Array, Array]]:
     """Particles, whether a piece, path, error and spread of every end of one drive."""
-    from graphslam.app.studies.segslam_garage import WORLDS
-    from graphslam.app.studies.segslam_trial import GridTrial
     from graphslam.core.poses import remove_roll_pitch
+    from graphslam_studies.segslam_garage import WORLDS
+    from graphslam_studies.segslam_trial import GridTrial
 
     trial = GridTrial(replace(WORLDS[f"garage-{layout}"], figures=()), seed)
     for n in PARTICLES:

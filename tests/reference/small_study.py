@@ -17,9 +17,9 @@ from graphslam.app.run.pipeline import run
 from graphslam.app.worlds import simulate
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.consistency import nees, pose_error
-from graphslam.evaluate.montecarlo import Measurement, trial_seed
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.evaluate.tables import summarise
+from graphslam_studies.evaluate.tables import summarise
+from graphslam_studies.montecarlo.trials import Measurement, trial_seed
 
 # sensor noise of each world: range [m], bearing [rad]
 WORLDS = {"near": (0.2, 0.035), "fine": (0.1, 0.017)}
@@ -94,7 +94,7 @@ class SmallStudy:
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         from graphslam.plots.save import save
-        from graphslam.plots.study import plot_ci
+        from graphslam_studies.plots.study import plot_ci
 
         return [save(plot_ci(None, rows, "pose_nees"), folder / f"ci-{w}.png") for w, rows in table.groupby("world")]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.evaluate.montecarlo import Measurement
+from graphslam_studies.montecarlo.trials import Measurement
 
 
 def steady(seed: int) -> list[Measurement]:

@@ -13,11 +13,11 @@ from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.refine.refine import Refinement
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
 
 FREEHAND = {"period": None, "max_range": 30.0, "most_points": 400, "odometry_tilt_sigma": 0.005}
 """Packs of clouds with poses of lidar and IMU, as their presets have it; the yaw rate as it was recorded."""

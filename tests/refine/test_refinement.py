@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.app.studies.refinement import QUICK_WORLDS
-from graphslam.app.studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
 from graphslam.backend.refining import findings_of, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate import segslam_judge as judge
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.nodes import scans_at
 from graphslam.refine.refine import _Refiner, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
+from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.refinement import QUICK_WORLDS
+from graphslam_studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
 from tests.refine.world import court_scans
 
 SEEDS = range(40, 46)

@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from graphslam.app.studies.segslam_trial import QUICK
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.refine.scans import Scans
@@ -15,6 +14,7 @@ from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
+from graphslam_studies.segslam_trial import QUICK
 
 
 @lru_cache(maxsize=32)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.sim.laps import Laps, LapsConfig, draw_laps
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.schur import Network, Workers, WorkRanges, step_poses
+from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 from tests.reference import dense_skeleton as dense
 
 SMALL = LapsConfig(poses=96, laps=4, begin=3, reach=5, gps_every=4, spacing=0.5)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graphslam.core.errors import DataError
-from graphslam.sim.laps import Laps
 from graphslam.skeleton.collapse import Collapse, number_by_first_sighting
+from graphslam_studies.sim.laps import Laps
 
 
 def joined(n: int, pairs: list[tuple[int, int]]) -> list[int]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, IndeterminateError, SolverError
-from graphslam.sim.laps import Laps, LapsConfig, draw_laps
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
@@ -16,6 +15,7 @@ from graphslam.skeleton.reduced_network import ReducedNetwork, blocks_per_pose
 from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.schur import Network, Workers, WorkRanges
 from graphslam.skeleton.start import chain_start, forward_pass
+from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 from tests.reference import dense_skeleton as dense
 
 

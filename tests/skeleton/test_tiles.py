@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
-from graphslam.sim.laps import Laps
 from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.tile_store import Tiles, write_tiles
 from graphslam.skeleton.tiles import load_tiled_problem, write_tiled_problem
+from graphslam_studies.sim.laps import Laps
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -90,7 +90,7 @@ def test_what_needs_all_measurements_at_once_says_so(problem: SkeletonProblem, t
 WRITE = """
 import sys
 from pathlib import Path
-from graphslam.sim.laps import LapsConfig, draw_laps
+from graphslam_studies.sim.laps import LapsConfig, draw_laps
 from graphslam.skeleton import tile_store
 from graphslam.skeleton.tiles import to_disk
 

@@ -26,18 +26,32 @@ from graphslam.app.cli import map as cli_map
 from graphslam.app.cli import results as cli_results
 from graphslam.app.cli import run as cli_run
 from graphslam.app.cli import sessions as cli_sessions
-from graphslam.app.cli import study as cli_study
 from graphslam.app.cli import tools as cli_tools
 from graphslam.app.cli.terminal import log_to_stderr
 from graphslam.core.errors import GraphSlamError
+from graphslam.core.plugins import IN_STUDIES, load_plugin, plugins
 
 
 class Interrupted(Exception):
     """Ctrl-C, under a name that Typer does not know: it would leave without a word."""
 
 
+COMMANDS = "graphslam.commands"
+
+
 class Verbs(TyperGroup):
-    """The verbs; Ctrl-C in one of them reaches :func:`main`."""
+    """The verbs, and those of plug-ins; Ctrl-C in one of them reaches :func:`main`."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *plugins(COMMANDS)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        own = super().get_command(ctx, cmd_name)
+        if own is not None or cmd_name not in {*plugins(COMMANDS), *IN_STUDIES[COMMANDS]}:
+            return own
+        lone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+        lone.command(cmd_name)(load_plugin(COMMANDS, "command", cmd_name))
+        return typer.main.get_command(lone)
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -76,7 +90,6 @@ cli_join.register(app)
 cli_map.register(app)
 cli_sessions.register(app)
 cli_results.register(app)
-cli_study.register(app)
 cli_tools.register(app)
 app.add_typer(cli_data.app, name="data")
 

@@ -1,4 +1,4 @@
-"""``graphslam solve``, ``relax``, ``eval``, ``doctor``, ``terrain-tables``."""
+"""``graphslam solve``, ``relax``, ``eval``, ``doctor``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ def register(app: typer.Typer) -> None:
     app.command()(relax)
     app.command("eval")(evaluate)
     app.command()(doctor)
-    app.command("terrain-tables")(terrain_tables)
 
 
 def solve(
@@ -128,21 +127,3 @@ def doctor(as_json: bool = JSON) -> None:
     bad = [f for f in findings if f.state == "missing"]
     if bad:
         raise GraphSlamError(f"{len(bad)} required parts are missing: {', '.join(f.name for f in bad)}")
-
-
-def terrain_tables(
-    out: Path = typer.Option(..., help="File to write the tables to (.json)."),
-    drives: int = typer.Option(10, help="Number of simulated drives towards each kind of target."),
-    seed: int = typer.Option(10_000, help="Seed of the first drive; the others follow."),
-    as_json: bool = JSON,
-) -> None:
-    """Learn what scan lines say of obstacles, edges and holes, on simulated streets that no study drives through."""
-    from graphslam.app.studies.terrain_learning import write_learnt_tables
-
-    tables = write_learnt_tables(out, drives=drives, first_seed=seed, progress=not as_json)
-    value = {"out": str(out), "threshold": tables.threshold, **tables.provenance}
-    rows = [
-        {"threshold": t, "false": a, "false on flat ground": b}
-        for t, (a, b) in value["false_alarms_while_learning"].items()
-    ]
-    emit(value, f"{table(rows)}\nthreshold {tables.threshold}; written to {out}", as_json=as_json)

@@ -14,9 +14,9 @@ import pytest
 from graphslam.app.folders import generations
 from graphslam.app.folders.generations import check_same, consistent, is_empty, new_generation, outputs
 from graphslam.app.folders.lock import LOCK, locked
-from graphslam.app.studies.study import study
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import FormatError, RunFolderError
+from graphslam_studies.montecarlo.study import study
 from tests.app.cli.test_cli import graphslam
 
 PART = ".run.json.4711-0123abcd.part"

@@ -84,7 +84,7 @@ def test_without_a_head_that_turns_there_is_no_encoder(log: SensorLog) -> None:
 
 
 def recommended_steps(log: SensorLog) -> Any:
-    from graphslam.app.studies.campus import QUICK_WORLDS
+    from graphslam_studies.campus import QUICK_WORLDS
 
     return QUICK_WORLDS["quick"].front_end.steps
 

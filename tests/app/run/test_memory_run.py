@@ -17,8 +17,8 @@ from graphslam.core.spill_cache import SPILL_CACHE
 from graphslam.evidence.pool import GridPool
 from graphslam.io.submap_store import SubmapStore
 from graphslam.loops import measure
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
 from graphslam.sim.mesh_worlds import mesh_world
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 from tests.faults.kills import snapshot
 
 OPTIONS: dict[str, Any] = {

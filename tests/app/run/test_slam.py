@@ -24,8 +24,8 @@ from graphslam.core.records import Odometry
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
-from graphslam.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
 from graphslam_frontends.lidar_odometry.front_end import FIRST
+from graphslam_studies.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
 from tests.frontends.landmarks.test_preparing import in_portions
 
 QUIET = {"calibrate": {"use": "none"}}

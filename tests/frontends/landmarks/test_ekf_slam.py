@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.app.studies.charts import ChartConfig, draw_log
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, CovarianceError, GeometryError, MissingDataError
 from graphslam.core.geometry import tangent_to_vector_covariance
@@ -21,6 +20,7 @@ from graphslam_frontends.landmarks.config import StoppingConfig
 from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam_frontends.landmarks.ekf_slam import Ekf, EkfSlam, ekf_snapshots
 from graphslam_frontends.landmarks.snapshot import Snapshot
+from graphslam_studies.charts import ChartConfig, draw_log
 
 SEED = SeedTree(0)
 CUTS = StoppingConfig(scans=59)

@@ -138,8 +138,8 @@ def figures(log, lasting, seed):
 
 
 def test_constant_errors_are_found_with_the_map_and_its_covariances_know_of_them():
-    from graphslam.app.studies.calibration_robot import draw_robot
-    from graphslam.app.studies.calibration_robot import drive as drawn
+    from graphslam_studies.calibration_robot import draw_robot
+    from graphslam_studies.calibration_robot import drive as drawn
 
     scores, nees, without = [], [], []
     for seed in range(40, 56):

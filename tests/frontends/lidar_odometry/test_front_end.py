@@ -13,8 +13,8 @@ from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.io.log_store import load_log, save_log
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, LidarSubmapConfig
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 FRONT = LidarFrontEnd(LidarFrontEndConfig(submap=LidarSubmapConfig(length=2.0, points=500)))
 

@@ -14,7 +14,6 @@ from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.random import SeedTree
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
-from graphslam.sim.lidar import LidarConfig, simulate_lidar
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, start_odometry
 from graphslam_frontends.lidar_odometry.inertial import (
@@ -25,6 +24,7 @@ from graphslam_frontends.lidar_odometry.inertial import (
     fit_velocity_gravity,
     gravity_along_path,
 )
+from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 NOISE = ImuNoise(
     gyro=3e-4,

@@ -8,11 +8,11 @@ import pytest
 from graphslam.app.worlds import mesh_world
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError
-from graphslam.sim.lidar import LidarConfig, drawn_lidar, simulate_lidar
 from graphslam.sim.raycast import RayCaster
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
 from graphslam_frontends.scan_window.relative_covariance import relative_covariance
+from graphslam_studies.sim.lidar import LidarConfig, drawn_lidar, simulate_lidar
 
 
 def _lidar(seed):

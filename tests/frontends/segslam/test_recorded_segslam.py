@@ -15,13 +15,13 @@ from graphslam.app.run.front_ends import recommended
 from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.relations import covered, random_pairs, relation_error
 from graphslam.io.carmen import read_carmen
 from graphslam.io.catalog import load
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
 
 PRESETS = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",

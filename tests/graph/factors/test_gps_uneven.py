@@ -13,13 +13,13 @@ from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsBatch, GpsRecord, antenna_terms, level_datum_pose
 from graphslam.graph.factors.pseudorange import PseudorangeRecord
-from graphslam.graph.gnss import add_odometer, add_pseudoranges
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from graphslam_studies.graph.gnss import add_odometer, add_pseudoranges
+from graphslam_studies.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from tests.graph.factors.test_gps_space import DATUM, LEVER, built, fixes_along
 from tests.reference.space_chain import dense_chain
 

@@ -1,0 +1,68 @@
+"""Plug-ins: parts that other distributions bring, found by entry points, and what to install where one is missing.
+
+A distribution registers what it brings under one of these groups; names are those that a user types:
+
+* ``graphslam.studies``: Monte-Carlo studies (:func:`graphslam.study`);
+* ``graphslam.worlds``: simulated worlds (:func:`graphslam.simulate`);
+* ``graphslam.readers``: readers of data sets (:func:`graphslam.load`);
+* ``graphslam.frontends``: front ends (:func:`graphslam.run`);
+* ``graphslam.commands``: commands of ``graphslam``, functions as Typer takes them;
+* ``graphslam.verbs``: what ``graphslam.study``, ``open_study`` and ``find_study`` call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from graphslam.core.errors import GraphSlamError, MissingExtraError, UnknownNameError
+
+STUDIES = "graphslam-studies"
+INSTALL_STUDIES = "pip install ./notebooks/studies in a clone of the repository"
+
+IN_STUDIES: dict[str, tuple[str, ...]] = {
+    "graphslam.commands": ("study", "terrain-tables"),
+    "graphslam.verbs": ("find_study", "open_study", "study"),
+}
+"""What the distribution of the studies brings, by group, so that an error can say what to install."""
+
+
+def plugins(group: str) -> dict[str, EntryPoint]:
+    """Entry points of a group by name, sorted; nothing is imported."""
+    return {e.name: e for e in sorted(entry_points(group=group), key=lambda e: e.name)}
+
+
+def load_plugin(group: str, kind: str, name: str) -> Any:
+    """The object that is registered under a name.
+
+    Parameters
+    ----------
+    group : str
+    kind : str
+        What it is, for messages: ``"reader"``.
+    name : str
+
+    Raises
+    ------
+    UnknownNameError, MissingExtraError
+        It is not registered; it is part of the studies, which are not installed.
+    GraphSlamError
+        It cannot be imported.
+    """
+    found = plugins(group)
+    if name not in found:
+        raise unknown(group, kind, name, found)
+    try:
+        return found[name].load()
+    except (ImportError, AttributeError) as error:
+        raise GraphSlamError(f"{kind} {name!r} cannot be imported ({error})") from error
+
+
+def unknown(group: str, kind: str, name: str, known: Iterable[str]) -> GraphSlamError:
+    """The error for a name that is not registered: what to install, or which names there are."""
+    if name in IN_STUDIES.get(group, ()):
+        return MissingExtraError(
+            f"{kind} {name!r} is part of {STUDIES}, which is not installed", wanted=INSTALL_STUDIES
+        )
+    return UnknownNameError(kind, name, list(known))

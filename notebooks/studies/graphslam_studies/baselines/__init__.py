@@ -1,0 +1,1 @@
+"""Methods to compare with: all poses and landmarks at once, links between poses."""

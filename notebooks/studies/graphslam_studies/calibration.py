@@ -1,0 +1,105 @@
+"""The study ``calibration``: noise and lasting errors told from a log itself, and the maps made with them.
+
+Worlds: ``drawn`` robots whose wheels no default knows and whose logs state a quarter of their noise
+(``drawn-lasting``: with errors that last for seconds); ``plaza1`` with 0.31 deg/s added; the robots of MRCLAM 7 as if
+each were unknown; and scans of recorded sets to whose odometry a yaw bias, a scale and noise are added, drawn in
+each run. The recorded sets must be found (``GRAPHSLAM_DATA``).
+
+Quantities
+----------
+``…_ratio``: an estimated σ over the true one; ``…_error``: an estimated constant less the true one (rad/s, a factor, s,
+m, rad); ``path``, ``landmarks`` [m], ``nees_poses``, ``nees_landmarks`` by degree of freedom, ``join_chi2_per_dof``.
+Of scans: ``relations`` of pairs of poses drawn at random [m], ``…_input`` of the odometry that came in; ``input_told``:
+the verdict says that this is better; ``worse_untold``: it is, by a tenth of its error, and the verdict does not.
+Algorithms: ``stated``, ``calibrated``, ``oracle``, ``preset``; of scans as in
+:func:`graphslam_studies.calibration_scanned.scanned`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from graphslam_studies.calibration_scanned import Added
+from graphslam_studies.calibration_trial import CalibrationTrialConfig, run_calibration_trial
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+
+BIAS = float(np.deg2rad(0.31))
+WORLDS = {
+    "drawn": CalibrationTrialConfig(),
+    "drawn-lasting": CalibrationTrialConfig(lasting=True, seconds=300.0),
+    "plaza1": CalibrationTrialConfig(source="plaza1", added=Added(bias=BIAS), presets="plaza1.rbpf-ekf"),
+}
+WORLDS |= {
+    f"mrclam-{k}": CalibrationTrialConfig(source=f"mrclam-dataset7/robot{k}", presets="mrclam-dataset7.rbpf-ekf")
+    for k in range(1, 6)
+}
+WORLDS |= {
+    name: CalibrationTrialConfig(
+        source=name, added=None, first=600.0, presets=f"{name}.segslam", frontend="segslam", ways=ways
+    )
+    for names, ways in (
+        (("radish-intel", "radish-fr079", "radish-mit-csail"), ("preset", "calibrated")),
+        (("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall"), ("recorded", "calibrated")),
+    )
+    for name in names
+}
+"""Of the long logs the first ten minutes."""
+QUICK_WORLDS = {"drawn-quick": CalibrationTrialConfig(seconds=40.0)}
+MAPS = (
+    *("path", "landmarks", "nees_poses", "nees_landmarks", "join_chi2_per_dof"),
+    *("relations", "relations_input", "path_input", "input_told", "worse_untold", "calibration_refused"),
+)
+
+
+class CalibrationStudy(WorldsStudy[CalibrationTrialConfig]):
+    """See the module."""
+
+    run_one = staticmethod(run_calibration_trial)
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """``maps`` of each way to get the noise, ``found``: ratios and errors of the estimates, ``cpu`` [s]."""
+        out = {"maps": maps_table(table), "found": found_table(table)}
+        if not timings.empty:
+            rows = timings[timings["quantity"] == "cpu_seconds"].groupby("world")["value"].agg(["mean", "max"])
+            out["cpu"] = rows.reset_index()
+        return out
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """Honesty and errors of all runs."""
+        return draw_runs(table, {"nees_poses": "NEES/dof of poses", "path": "path error [m]"}, folder)
+
+
+def maps_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Means over the runs, a row for each world and way to get the noise."""
+    rows = table[table["quantity"].isin(MAPS) & (table["submap"] == -1) & table["value"].notna()]
+    if rows.empty:
+        return pd.DataFrame(columns=["world", "algorithm", *MAPS])
+    wide = rows.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
+    return wide.reindex(columns=[q for q in MAPS if q in wide]).reset_index()
+
+
+def found_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Of each ratio the median and the extremes, of each error the root of the mean square and the largest."""
+    out = []
+    ends = ("_ratio", "_error", "_told", "_applied", "refused")
+    names = [q for q in table["quantity"].unique() if q.endswith(ends) and q not in MAPS]
+    for (world, algorithm), rows in table.groupby(["world", "algorithm"], sort=False):
+        for name in names:
+            v = whole(rows, name)["value"].to_numpy()
+            if len(v):
+                row = {"world": world, "algorithm": algorithm, "quantity": name, "runs": len(v)}
+                row |= {"median": float(np.median(v)), "least": float(v.min()), "greatest": float(v.max())}
+                out.append(row | {"rms": float(np.sqrt(np.mean(v**2)))})
+    return pd.DataFrame(out)
+
+
+STUDY = CalibrationStudy(
+    "calibration",
+    "noise, biases and scales told from the log itself: drawn robots, and recorded logs as if they were unknown",
+    WORLDS,
+    QUICK_WORLDS,
+    trials=10,
+)

@@ -1,0 +1,202 @@
+"""One trial of the study of calibration on a recorded log of scans, to whose odometry errors are added by chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.run.calibration import calibrate_log, without_noise
+from graphslam.app.run.config import preset
+from graphslam.app.run.pipeline import run
+from graphslam.app.run.source import load_log_source
+from graphslam.calibrate.estimate import Calibration
+from graphslam.core.findings import findings_of_json
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import group_of
+from graphslam.core.random import SeedTree
+from graphslam.core.records import Odometry, VelocityControls
+from graphslam.core.se3 import se3_inverse, se3_transform
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.trajectory_error import ate
+from graphslam_frontends.odometry.recorded import chain_odometry
+from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_studies.montecarlo.trials import Measurement
+
+UNKNOWN = "unknown"
+"""Name of a recorded log here: no preset is made for it."""
+SURELY = float(np.deg2rad(0.05))
+"""σ of a yaw bias that is told to 0.1 deg/s [rad/s]."""
+PAIRS = 5000
+"""Pairs of poses whose relation is scored."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Added:
+    """Errors that are added to the motion of a recorded log."""
+
+    bias: float = 0.0
+    """Of the yaw rate, while it moves [rad/s]."""
+    scale: float = 1.0
+    """Its distances are multiplied by this."""
+    along: float = 0.0
+    """Noise of each position axis after one metre [m/√m]."""
+    heading: float = 0.0
+    """Noise of the heading after one metre [rad/√m]."""
+
+    @classmethod
+    def drawn(cls, seed: int) -> Added:
+        """Bias and scale of either sign, noise over a decade."""
+        rng = SeedTree(seed).child("calibration", "added").generator()
+        return cls(
+            bias=float(np.deg2rad(rng.uniform(0.1, 0.6)) * rng.choice([-1, 1])),
+            scale=float(1.0 + rng.uniform(0.01, 0.08) * rng.choice([-1, 1])),
+            along=float(np.exp(rng.uniform(np.log(0.01), np.log(0.1)))),
+            heading=float(np.exp(rng.uniform(np.log(0.003), np.log(0.03)))),
+        )
+
+
+def faulty(log: SensorLog, added: Added, seed: int = 0) -> SensorLog:
+    """The log with errors in its motion, under a name that no preset knows."""
+    streams = dict(log.streams)
+    for name, s in log.streams.items():
+        if isinstance(s, VelocityControls):
+            moving = (s.speed != 0.0) | (s.yaw_rate != 0.0)
+            streams[name] = replace(s, speed=s.speed * added.scale, yaw_rate=s.yaw_rate + added.bias * moving)
+        elif isinstance(s, Odometry):
+            streams[name] = _worse(s, added, SeedTree(seed).child("calibration", "noise", name).generator())
+    return replace(log, name=UNKNOWN, streams=streams)
+
+
+def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odometry:
+    """Errors of the heading are turns about the vertical of the first pose: what knows gravity does not tilt."""
+    g = group_of(odometry.increments)
+    xi = g.log(odometry.increments)
+    dt = np.concatenate([[0.0], np.diff(odometry.times)])
+    metres = np.linalg.norm(xi[:, g.position], axis=1)
+    moving = (metres > 1e-6) | (np.abs(xi[:, g.heading]) > 1e-6)
+    xi[:, g.position] *= added.scale
+    xi[:, g.position] += added.along * np.sqrt(metres)[:, None] * rng.standard_normal((len(xi), g.dim))
+    turn = added.bias * dt * moving + added.heading * np.sqrt(metres) * rng.standard_normal(len(xi))
+    if g.dim == 2:
+        xi[:, g.heading] += turn
+        increments = g.exp(xi)
+    else:
+        attitude = chain_odometry(odometry).poses
+        attitude[:, :3] = 0.0
+        level = se3_transform(se3_inverse(attitude), np.broadcast_to([0.0, 0.0, 1.0], (len(xi), 3)))
+        extra = np.zeros_like(xi)
+        extra[:, :3] = turn[:, None] * level
+        increments = g.compose(g.exp(xi), g.exp(extra))
+    increments[0] = odometry.increments[0]
+    return replace(odometry, increments=increments)
+
+
+def scanned(
+    source: str, presets: str, frontend: str, added: Added | None, first: float | None, ways: Sequence[str], seed: int
+) -> Iterator[Measurement]:
+    """What a log of scans says before and after errors were added to its odometry, and its maps.
+
+    Parameters
+    ----------
+    added : Added or None
+        None: drawn by the seed.
+    first : float or None
+        Seconds of the log that are used; None: all.
+    ways : sequence of str
+        Maps that are made: of the log as recorded by its ``preset``, and as if it were unknown (``recorded``); with the
+        errors as if it were unknown (``calibrated``), and by the preset (``stated``).
+    """
+    recorded = load_log_source(source)
+    begin = float(recorded["reference"].times[0])
+    if first is not None:
+        recorded = recorded.slice(begin, begin + first)
+    own, added = preset(presets), added or Added.drawn(seed)
+    worse = faulty(recorded, added, seed)
+    planar = any(isinstance(s, Odometry) and s.increments.shape[1] == 3 for s in recorded.streams.values())
+    for quick in (True, False) if planar else (True,):  # matches in space take minutes
+        found, spent = [], []
+        for log in (replace(recorded, name=UNKNOWN), worse):
+            clock = process_time()
+            found.append(calibrate_log(log, frontend=frontend, config=without_noise(own), seed=seed, quick=quick))
+            spent.append(process_time() - clock)
+        if quick:
+            yield Measurement("calibrated", "cpu_seconds", max(spent), timing=True)
+        yield from _told("quick" if quick else "full", found[0], found[1], added, _speed(recorded))
+    unknown, known = without_noise(own), {**own, "calibrate": {"use": "none"}}
+    log = replace(recorded, name=UNKNOWN)
+    made = {
+        "preset": (log, known),
+        "recorded": (log, unknown),
+        "calibrated": (worse, unknown),
+        "stated": (worse, known),
+    }
+    for way in ways:
+        yield from _mapped(way, *made[way], frontend, seed)
+
+
+def _told(name: str, before: Calibration, after: Calibration, added: Added, speed: float) -> Iterator[Measurement]:
+    """Errors of what was found of the additions: the difference between the two calibrations less what was added.
+
+    A yaw bias is told where it is a constant of its own in both, with a σ that leaves no doubt of 0.1 deg/s. What bias
+    and turn per metre do together at the log's own speed (``turning``) is told in any case.
+    """
+    a, b = ({e.name: e for e in found.estimates} for found in (before, after))
+    scale = float(np.exp(b["distance_scale"].value - a["distance_scale"].value))
+    yield Measurement(name, "distance_scale_error", scale / added.scale - 1.0)
+    sigma = math.hypot(a["distance_scale"].sigma, b["distance_scale"].sigma)
+    yield Measurement(name, "distance_scale_sigma_told", sigma)
+    yield Measurement(name, "distance_scale_applied", float(b["distance_scale"].applied))
+    both = [x["yaw_bias"] for x in (a, b) if "yaw_bias" in x]
+    told = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < SURELY
+    yield Measurement(name, "yaw_bias_told", float(told))
+    if told:
+        yield Measurement(name, "yaw_bias_error", both[1].value - both[0].value - added.bias)
+    rates = {"yaw_bias": 1.0, "turn_per_metre": speed}
+    turning = [sum(rate * x[n].value for n, rate in rates.items() if n in x) for x in (a, b)]
+    yield Measurement(name, "turning_error", turning[1] - turning[0] - added.bias)
+    if added.along:
+        new = max(after.noise["along_metre"] ** 2 - before.noise["along_metre"] ** 2, 0.0)
+        yield Measurement(name, "along_ratio", float(np.sqrt(new)) / added.along)
+    yield Measurement(name, "refused", float(after.prediction is not None and after.prediction.taken != "all"))
+
+
+def _speed(log: SensorLog) -> float:
+    """Of its odometry while it moves [m/s]."""
+    s = next(s for s in log.streams.values() if isinstance(s, Odometry))
+    g = group_of(s.increments)
+    metres = np.linalg.norm(g.log(s.increments[1:])[:, g.position], axis=1)
+    dt = np.diff(s.times)
+    moving = metres > 0.005 * dt
+    return float(metres[moving].sum() / max(dt[moving].sum(), 1e-9))
+
+
+def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str, seed: int) -> Iterator[Measurement]:
+    """Errors of the map of a log and of its odometry, and whether the verdict says which is better."""
+    result = run(log, frontend=frontend, solver="batch", config=options, seed=seed, progress=False)
+    said = {f.code for f in findings_of_json(result.report["verdict"])}
+    path = result.map.trajectory
+    input_path = chain_odometry(next(s for s in log.streams.values() if isinstance(s, Odometry)))
+    of_run, of_input = (path_errors(p, log["reference"]) for p in (path, input_path))
+    for key, value in of_run.items():
+        yield Measurement(name, key, value)
+        yield Measurement(name, f"{key}_input", of_input[key])
+    yield Measurement(name, "input_told", float("input-better" in said))
+    yield Measurement(name, "calibration_refused", float("calibration-refused" in said))
+    yield Measurement(
+        name, "worse_untold", float(of_run["path"] > 1.1 * of_input["path"] and "input-better" not in said)
+    )
+
+
+def path_errors(path: Trajectory, reference: Any) -> dict[str, float]:
+    """Relations of pairs drawn at random [m, deg], and ATE after an alignment [m]."""
+    part = covered(Trajectory(reference.times, reference.poses), path)
+    pairs = random_pairs(len(part), PAIRS, np.random.default_rng(0))
+    row = relation_error(path, part, pairs).as_row()
+    at = Trajectory(part.times, path.interpolate(part.times))
+    errors = {"relations": row["translation_mean"], "relations_median": row["translation_median"]}
+    return errors | {"turns": row["rotation_mean_deg"], "path": ate(at, part).statistics.rmse}

@@ -1,0 +1,145 @@
+"""One trial of the study of calibration: a log whose noise nobody states rightly, with and without calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.machine import one_blas_thread
+from graphslam.app.run.calibration import calibrate_log, without_noise
+from graphslam.app.run.config import preset
+from graphslam.app.run.pipeline import run
+from graphslam.app.run.source import load_log_source
+from graphslam.calibrate.corrections import Corrections
+from graphslam.calibrate.estimate import Calibration
+from graphslam.core.config import options_dict
+from graphslam.core.log import SensorLog
+from graphslam_studies.calibration_robot import DrawnRobot, draw_robot, drive
+from graphslam_studies.calibration_scanned import UNKNOWN, Added, faulty, scanned
+from graphslam_studies.montecarlo.trials import Measurement
+
+OPTIONS: dict[str, Any] = {
+    "frontend": {"association": "known", "particles": 20, "stopping": {"max_distance": 20.0}},
+    "backend": {"associate": False, "merge_every": 0},
+}
+FIGURES = {
+    "join_chi2_per_dof": "join_chi2_per_dof",
+    "path_rmse_aligned": "path",
+    "landmark_rmse_aligned": "landmarks",
+    "nees_aligned_poses_per_dof": "nees_poses",
+    "nees_aligned_landmarks_per_dof": "nees_landmarks",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationTrialConfig:
+    """A world."""
+
+    source: str = ""
+    """Recorded set; empty: a drawn robot."""
+    seconds: float = 120.0
+    """Of a drawn robot's drive."""
+    lasting: bool = False
+    """Do its wheels err for seconds on end?"""
+    added: Added | None = field(default_factory=Added)
+    """To the motion of a recorded log; None: drawn in each run."""
+    first: float | None = None
+    """Seconds of a log of scans that are used; None: all."""
+    ways: tuple[str, ...] = ()
+    """Maps that are made of a log of scans."""
+    presets: str = ""
+    """Preset whose map is compared, and whose way of reading the log is taken over without its noise."""
+    frontend: str = "rbpf-ekf"
+
+
+def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Measurement]:
+    """All figures of one trial."""
+    with one_blas_thread():
+        if not config.source:
+            return list(_drawn(config, seed))
+        if config.frontend == "rbpf-ekf":
+            return list(_recorded(config, seed))
+        return list(
+            scanned(config.source, config.presets, config.frontend, config.added, config.first, config.ways, seed)
+        )
+
+
+def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
+    robot = draw_robot(seed, lasting=config.lasting)
+    log = drive(robot, seed, config.seconds)
+    begin = process_time()
+    found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
+    yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
+    yield from _recovered(robot, log, found)
+    ways = {"stated": {"use": "none"}, "calibrated": found.config()}
+    ways["oracle"] = {"use": "none", "given": options_dict(true_figures(robot))}
+    for name, calibrate in ways.items():
+        yield from _mapped(name, log, {**OPTIONS, "calibrate": calibrate}, seed)
+
+
+def true_figures(r: DrawnRobot) -> Corrections:
+    """What a calibration would say that knows everything; errors that last as the white noise of the long run."""
+    long = float(np.sqrt(2.0 * r.memory))
+    return Corrections(
+        yaw_bias=r.yaw_bias,
+        distance_scale=r.distance_scale,
+        clock=r.clock,
+        range_offset=r.range_offset,
+        sensor_yaw=r.sensor_yaw,
+        along_metre=r.along_metre,
+        along_second=r.lasting_speed * long,
+        lateral_metre=r.lateral_metre,
+        heading_metre=r.heading_metre,
+        heading_radian=r.heading_radian,
+        heading_second=float(np.hypot(r.heading_second, r.lasting_rate * long)),
+        range_sigma=r.range_sigma,
+        bearing_sigma=r.bearing_sigma,
+    )
+
+
+def _recovered(robot: DrawnRobot, log: SensorLog, found: Calibration) -> Iterator[Measurement]:
+    """Ratios of σ over a typical second, and errors of the constants."""
+    true, got = true_figures(robot), found.corrections
+    xi = log["odometry"].increments
+    seconds = float(log["odometry"].times[-1] - log["odometry"].times[0])
+    metres = float(np.hypot(xi[:, 0], xi[:, 1]).sum()) / seconds
+    turned = float(np.abs(xi[:, 2]).sum()) / seconds
+
+    def along(c: Corrections) -> float:
+        return float(np.sqrt((c.along_metre or 0.0) ** 2 * metres + c.along_second**2))
+
+    def heading(c: Corrections) -> float:
+        v = c.heading_metre**2 * metres + c.heading_radian**2 * turned + c.heading_second**2
+        return float(np.sqrt(v))
+
+    yield Measurement("calibrated", "along_ratio", along(got) / along(true))
+    yield Measurement("calibrated", "heading_ratio", heading(got) / heading(true))
+    for name in ("range_sigma", "bearing_sigma"):
+        yield Measurement("calibrated", f"{name}_ratio", float(getattr(got, name) / getattr(true, name)))
+    for name in ("yaw_bias", "distance_scale", "clock", "range_offset", "sensor_yaw"):
+        yield Measurement("calibrated", f"{name}_error", float(getattr(got, name) - getattr(true, name)))
+
+
+def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], seed: int) -> Iterator[Measurement]:
+    result = run(log, frontend="rbpf-ekf", solver="batch", config=options, seed=seed, progress=False)
+    values = result.metrics.set_index("key")["value"]
+    for key, short in FIGURES.items():
+        if key in values:
+            yield Measurement(name, short, float(values[key]))
+
+
+def _recorded(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
+    """A log of landmarks as if unknown, and as its preset has it (without the errors that were added)."""
+    recorded, added = load_log_source(config.source), config.added or Added.drawn(seed)
+    log, own = faulty(recorded, added), preset(config.presets)
+    begin = process_time()
+    found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
+    yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
+    bias = next((e.value for e in found.estimates if e.name == "yaw_bias"), np.nan)
+    yield Measurement("calibrated", "yaw_bias_error", float(bias - added.bias))
+    yield from _mapped("calibrated", log, {**without_noise(own), "calibrate": found.config()}, seed)
+    yield from _mapped("preset", replace(recorded, name=UNKNOWN), {**own, "calibrate": {"use": "none"}}, seed)

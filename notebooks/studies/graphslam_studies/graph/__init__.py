@@ -1,0 +1,1 @@
+"""Graphs of satellite navigation: pseudoranges, odometer, inertial start."""

@@ -1,0 +1,81 @@
+"""The study ``segslam-mine``: loops within loops, and two galleries side by side that must not become one.
+
+Worlds: ``mine``; what lies about and every sensor error are drawn anew in each run. Algorithms: ``dead-reckoning``,
+``rbpf-20``, ``segslam-20``.
+
+Quantities, beside those of ``segslam-garage``
+----------------------------------------------
+``visit_error``, for every stretch of the way that is driven twice: where the first visit was, seen from the body at the
+end of the second, against the truth [m]; SegSLAM is asked through a map sample grown from where it was then.
+``loops``: such stretches driven in the same direction (the scanner looks ahead, so that a way back shows it other
+sides of things); ``loops_closed``: those whose error is below 1 m; ``all_closed``. ``merged_parallels``: entries that
+take one of two parallel stretches for the other. Timings: ``seconds_step_first_quarter`` and ``…_last_quarter``, mean
+time of a step; ``maps_megabytes``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+
+from graphslam.plots.save import save
+from graphslam_frontends.segslam.config import SegmentCandidateConfig, SegSlamConfig
+from graphslam_studies import segslam_report as tables
+from graphslam_studies.plots.association import plot_runs
+from graphslam_studies.segslam_garage import path_figure
+from graphslam_studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridStudy, GridTrialConfig
+
+_FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
+_ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
+# Galleries do not lie above each other, so that heights may drift: at 6 mrad of gravity 2.4 m on the first loop.
+SEGSLAM = SegSlamConfig(winnowing=SegmentCandidateConfig(height_per_metre=7e-3))
+_MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
+WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
+QUICK_WORLDS = {
+    "court-quick": replace(QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-5"), figures=_FIGURES),
+}
+
+
+class SegSlamMine(GridStudy):
+    """See the module."""
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """``loops``, ``visits`` one by one, ``matches``, ``paths``, ``nees``, ``seconds`` by part."""
+        out = {"loops": tables.loop_table(table, timings), "visits": visit_table(table)}
+        out["matches"] = tables.match_table(table)
+        out["paths"] = tables.means_table(table, ("final_error", "ate_anchored", "ate_aligned", "maps_megabytes"))
+        out["nees"] = tables.nees_table(table)
+        if not timings.empty:
+            out["seconds"] = tables.seconds_table(timings)
+        return out
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """Errors at second visits of all runs; the path of one run by segments."""
+        made = []
+        visits = table[table["quantity"] == "visit_error"]
+        if not visits.empty:
+            worst = visits.groupby(["world", "run", "algorithm"], sort=False)["value"].max().reset_index()
+            ax = plot_runs(worst, label="greatest error at a second visit [m]")
+            made.append(save(ax, folder / "visit_error.png"))
+        for world in dict.fromkeys(table["world"].astype(str)):
+            made += path_figure(table, world, folder)
+        return made
+
+
+def visit_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Median and greatest error of every second visit over the runs, and how often it was below the limit."""
+    rows = table[table["quantity"] == "visit_error"].rename(columns={"submap": "visit"})
+    groups = rows.groupby(["world", "algorithm", "visit"], sort=False)["value"]
+    out = groups.agg(["median", "max", "count"]).reset_index()
+    out["closed"] = groups.agg(lambda v: int((v <= 1.0).sum())).to_numpy()
+    return out
+
+
+STUDY = SegSlamMine(
+    "segslam-mine",
+    "1.3 km of mine with loops within loops and parallel galleries: loops closed, galleries merged, cost of a step",
+    WORLDS,
+    QUICK_WORLDS,
+)

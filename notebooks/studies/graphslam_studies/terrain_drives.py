@@ -1,0 +1,380 @@
+"""The study ``terrain-drives``: drives in closed loop. A robot plans on the map that it makes, drives, and plans anew.
+
+Every trial draws a street with one target, half of them with a passage through what reaches across, and drives through
+it with each of five maps, from the same seed of all errors:
+
+* ``bands``: a map a range band; as fast as falls can be seen, and as the known way ahead is long;
+* ``bands, no bound``: the same map, always 1 m/s;
+* ``one grid, learnt``: one grid of 0.2 m with the same learnt weights, all ranges added, with both bounds;
+* ``one grid, OctoMap``: one grid of 0.2 m, +0.85 for a hit and −0.4 for a miss, with both bounds;
+* ``one grid, equal``: the same with ±0.4.
+
+Twice a second the robot reads the lines measured so far and plans the cheapest way to a line 6 m behind the target;
+what it decides takes effect half a second later. A drive ends at the goal, at the first harm, after it stood still for
+7 s for want of a way, or after 90 s.
+
+Quantities
+----------
+``fall``, ``curb``, ``crash``, ``steep``: 1 if a circle as wide as the vehicle touched a fall, a step up, an obstacle,
+or ground that is too steep. ``arrived``; ``way``: 1 if there is one in truth; ``right``: 1 if it arrived where there is
+a way, or stood still unharmed where there is none. ``coverage``: share of the free lane 0.8–8 m ahead, within ±60°,
+that was known, mean over plans. ``speed``: mean while it had a way [m/s]. ``detour``: of those that arrived, length
+driven over that of the best way on a map of the truth; ``cost``: the same of the costs of both ways on that map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy.ndimage import binary_closing, distance_transform_edt
+
+from graphslam.core.geometry import Array
+from graphslam.core.random import SeedTree
+from graphslam.maps.terrain.lines import ScanLines, lines_of_scans
+from graphslam.maps.terrain.plan import CostConfig, CostMap, PlannedWay, cost_map, plan_way
+from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass, TerrainMap
+from graphslam.maps.terrain.tables import read_tables
+from graphslam.maps.terrain.vehicle import CELLS, Vehicle
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.sim.street import (
+    BEGIN,
+    END,
+    HALF_WIDTH,
+    HOLE,
+    OBSTACLE,
+    PASSAGE,
+    STEEP,
+    STEP,
+    TARGETS,
+    Street,
+    draw_street,
+)
+from graphslam_studies.sim.street_rover import Command, RoverState, StreetRover
+from graphslam_studies.terrain_trial import (
+    BOX,
+    SINGLE,
+    FixedGrid,
+    Mask,
+    TerrainTrialConfig,
+    labelled,
+    statements,
+)
+
+FIXED = {"one grid, OctoMap": (0.85, 0.4), "one grid, equal": (0.4, 0.4)}
+"""Maps with fixed weights: log-odds of a hit and of a miss."""
+CLOSING = 2
+"""Bands whose hazards close ways: those with cells narrower than half the vehicle."""
+HARMS = ("fall", "curb", "crash", "steep")
+PATIENCE = 7.0
+"""A drive that stood still for so long ends: three sweeps, and a plan [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveTrialConfig:
+    """What is driven through, and how."""
+
+    maps: tuple[str, ...] = ("bands", "bands, no bound", "one grid, learnt", *FIXED)
+    targets: tuple[str, ...] = tuple(TARGETS)
+    fastest: float = 1.0
+    """[m/s]"""
+    begin: float = 8.0
+    """It starts so far before the target [m]."""
+    beyond: float = 6.0
+    """The goal lies so far behind where the target begins [m]."""
+    spare: float = 0.1
+    """Added to either side of the vehicle when it plans: errors of the pose and of cells [m]."""
+    longest: float = 90.0
+    """[s]"""
+    trial: TerrainTrialConfig = field(default_factory=TerrainTrialConfig)
+
+
+@dataclass(frozen=True)
+class Course:
+    """A street to drive through, and what is true of it."""
+
+    street: Street
+    start: Array
+    goal: float
+    """Along x [m]."""
+    hazards: dict[str, Array]
+    """Distance to the nearest hazard of each kind, on cells of 0.05 m [m]."""
+    best: PlannedWay | None
+    """Way over a map of the truth."""
+    costs: CostMap
+    """Of the truth."""
+    free_lane: Mask
+    """Free cells of 0.1 m in the lane."""
+
+
+def draw_course(seed: int, config: DriveTrialConfig) -> Course:
+    """Street, start and goal of a seed."""
+    c, rng = config, SeedTree(int(seed)).child("course").generator()
+    street = draw_street(str(rng.choice(np.array(c.targets))), seed)
+    opened, side = rng.random() < 0.5, float(rng.uniform(-1.2, 1.2))
+    v, fine = c.trial.vehicle, 0.05
+    if opened and _closes(street, v):
+        street = replace(street, passage=side)
+    shape = (round((BOX[3] - BOX[1]) / fine), round((BOX[2] - BOX[0]) / fine))
+    labels = street.labels(np.array(BOX[:2]), fine, shape, step=v.climbable_step, slope=v.max_slope, height=v.height)
+    x, y = (BOX[k] + fine * (np.arange(shape[1 - k]) + 0.5) for k in (0, 1))
+    down = street.raised(x[None] + 0 * y[:, None], y[:, None] + 0 * x[None]) < -v.climbable_step
+    fall = (labels == HOLE) | ((labels == STEP) & _near(down))
+    kinds = {"fall": fall, "curb": (labels == STEP) & ~fall, "crash": labels == OBSTACLE, "steep": labels == STEEP}
+    away = {k: fine * distance_transform_edt(~m) if m.any() else np.full(shape, np.inf) for k, m in kinds.items()}
+    truth = labelled(street, c.trial)
+    inside = (np.abs(truth.y) < HALF_WIDTH)[:, None] & (truth.x > BEGIN)[None] & (truth.x < END)[None]
+    classes = np.where((truth.labels > 0) | ~inside, TerrainClass.OBSTACLE, TerrainClass.FREE).astype(np.int8)
+    wanted = replace(v, width=v.width + 2.0 * c.spare)
+    costs = cost_map(_plain_map(np.array(BOX[:2]), CELLS[0], classes), wanted)
+    start = np.array([street.target_at - c.begin, 0.0])
+    best = _plan(costs, start, street.target_at + c.beyond)
+    lane = (truth.labels == 0) & (np.abs(truth.y) < 1.7)[:, None]
+    return Course(street, start, street.target_at + c.beyond, away, best, costs, lane)
+
+
+def _closes(street: Street, v: Vehicle) -> bool:
+    """Whether a curb, stairs, a drop or a ramp reaches across the street, which the vehicle does not drive."""
+    f = street.figures
+    step = street.kind in ("curb", "stairs") and abs(f["height"]) > v.climbable_step
+    return step or (street.kind == "ramp" and abs(math.radians(f["angle"])) > v.max_slope)
+
+
+def _near(mask: Mask) -> Mask:
+    """Cells of a mask and their neighbours."""
+    return np.asarray(distance_transform_edt(~mask) < 2.0) if mask.any() else mask
+
+
+def _plain_map(origin: Array, cell: float, classes: npt.NDArray[np.int8]) -> TerrainMap:
+    """A map of classes that are certain."""
+    known = classes != TerrainClass.UNKNOWN
+    p = np.where(known, (classes > TerrainClass.ABOVE_REACH).astype(np.float64), np.nan)
+    nothing, nowhere = np.full(p.shape, np.nan), np.zeros(p.shape, np.bool_)
+    return TerrainMap(origin, cell, p, classes, nothing, nothing, np.where(known, 0, -1).astype(np.int8), nowhere)
+
+
+class Navigator:
+    """A map of the trial, and the way over it.
+
+    Parameters
+    ----------
+    name : str
+        Of the map, see the module.
+    start : (2,)
+        There the robot stands: what is under it is free.
+    """
+
+    def __init__(self, name: str, config: DriveTrialConfig, start: Array) -> None:
+        c, tables = config.trial, read_tables()
+        cells = CELLS if name.startswith("bands") else SINGLE
+        self.config, self.bound = config, "no bound" not in name
+        self.pyramid = Pyramid(BOX, tables, c.vehicle, c.sensor, cells)
+        self.weights = FIXED.get(name)
+        self.fixed = FixedGrid(self.pyramid)
+        self.vehicle: Vehicle = replace(c.vehicle, width=c.vehicle.width + 2.0 * config.spare)
+        self.start = start
+        self.sensor_bound = min(config.fastest, c.sensor.speed_bound(self.vehicle))
+        self.found: TerrainMap | None = None
+
+    def read(self, lines: ScanLines) -> None:
+        """Add lines."""
+        rows = statements(lines, self.pyramid)
+        if self.weights is None:
+            self.pyramid.add(rows)
+        else:
+            self.fixed.add(rows)
+
+    def plan(self, place: Array, goal: float) -> Command | None:
+        """Way from a place to the goal and the speed on it; None where there is none."""
+        found = self._map()
+        x, y = found.centres()
+        under = np.hypot(x[None] - self.start[0], y[:, None] - self.start[1]) < 1.5
+        fresh = under & ~found.known
+        classes = np.where(fresh, np.int8(TerrainClass.FREE), found.classes)
+        p = np.where(fresh, 0.0, found.probability)
+        found = self.found = replace(found, classes=classes, probability=p, provisional=found.provisional & ~under)
+        costs = cost_map(found, self.vehicle, CostConfig(closing_bands=CLOSING))
+        outside = (np.abs(y) > HALF_WIDTH)[:, None] | ((x < BEGIN) | (x > END))[None]
+        costs = replace(costs, cost=np.where(outside, np.inf, costs.cost))
+        way = _plan(costs, place, goal)
+        if way is None:
+            return None
+        points = _smooth(way.points, costs)
+        points = np.vstack([place, points[1:]]) if len(points) > 1 else np.vstack([place, place])
+        speed = self._speed(points, found) if self.bound else self.config.fastest
+        return Command(points, speed)
+
+    def _map(self) -> TerrainMap:
+        if self.weights is None:
+            return self.pyramid.classify()
+        verdict = self.fixed.verdict(self.weights)
+        classes = np.where(verdict.known, TerrainClass.FREE, TerrainClass.UNKNOWN).astype(np.int8)
+        classes[verdict.hazard & verdict.known] = TerrainClass.OBSTACLE
+        return _plain_map(np.array(BOX[:2]), CELLS[0], classes)
+
+    def _speed(self, way: Array, found: TerrainMap) -> float:
+        """As fast as falls are seen, and as it can stop where known ground ends or a fall is not excluded."""
+        sure = found.known & ~found.provisional
+        sure = binary_closing(sure, np.ones((3, 3), np.bool_), border_value=0) | sure
+        room = distance_transform_edt(sure) * found.cell
+        at = np.floor((way - found.origin) / found.cell).astype(np.int64)
+        open_ = room[at[:, 1], at[:, 0]] > 0.5 * self.config.trial.vehicle.width
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        ends = np.flatnonzero(~open_ & (length > found.cell))
+        seen = float(length[ends[0]]) - found.cell if len(ends) else math.inf
+        return min(self.sensor_bound, self.vehicle.safe_speed(seen))
+
+
+def _plan(costs: CostMap, place: Array, goal: float) -> PlannedWay | None:
+    """Way to the line x = ``goal``."""
+    y = costs.origin[1] + costs.cell * (np.arange(len(costs.cost)) + 0.5)
+    return plan_way(costs, place, np.column_stack([np.full(len(y), goal), y]))
+
+
+def _smooth(points: Array, costs: CostMap) -> Array:
+    """Corners of a way from cell to cell rounded, as far as that leads through no closed cell."""
+    for reach in (3, 1):
+        k = 2 * reach + 1
+        ends = np.repeat(points[:1], reach, 0), np.repeat(points[-1:], reach, 0)
+        wide = np.vstack([ends[0], points, ends[1]])
+        mean = np.column_stack([np.convolve(wide[:, a], np.full(k, 1.0 / k), mode="valid") for a in (0, 1)])
+        at = np.floor((mean - costs.origin) / costs.cell).astype(np.int64)
+        if np.all(np.isfinite(costs.cost[at[reach:, 1], at[reach:, 0]])):
+            return mean
+    return points
+
+
+def run_drive_trial(config: DriveTrialConfig, seed: int) -> Iterator[Measurement]:
+    """Drive through the street of a seed with each map; see the module for what is measured."""
+    course = draw_course(seed, config)
+    for name in config.maps:
+        yield from _drive(name, config, course, seed)
+
+
+def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterator[Measurement]:
+    v = c.trial.vehicle
+    tick = v.reaction_time
+    rover = StreetRover(course.street, seed, c.trial.robot, acceleration=v.deceleration, longest=c.longest + 5.0)
+    navigator = Navigator(name, c, course.start)
+    state = RoverState(place=course.start)
+    command = Command(np.vstack([course.start, course.start + [0.1, 0.0]]), 0.0)
+    harm, stood, driven = "", 0.0, [course.start[None]]
+    covered: list[float] = []
+    speeds: list[float] = []
+    spent, plans = 0.0, 0
+    while state.time < c.longest and not harm and state.place[0] < course.goal - 0.5 and stood < PATIENCE:
+        planned = None
+        if state.time + 1e-9 >= c.trial.robot.sweep:  # at first it stands and looks everywhere once
+            begin = process_time()
+            planned = navigator.plan(rover.after(state, command, tick).place, course.goal)
+            spent, plans = spent + process_time() - begin, plans + 1
+            covered.append(_coverage(navigator.found, course, state.place))
+        # what was decided takes effect a reaction time later: until then it goes on as before
+        there = state.place
+        state, scans, believed, places = rover.drive(state, command, tick)
+        navigator.read(lines_of_scans(scans, believed, c.trial.robot.height))
+        driven.append(places)
+        harm = harm_of(places, course, v)
+        stood = stood + tick if float(np.linalg.norm(state.place - there)) < 0.02 else 0.0
+        if planned is None:
+            command = Command(command.way, 0.0)
+        else:
+            command, state.along = planned, 0.0
+            speeds.append(state.speed)
+    track = np.concatenate(driven)
+    arrived = not harm and state.place[0] > course.goal - 0.5
+    for kind in HARMS:
+        yield Measurement(name, kind, float(harm == kind))
+    yield Measurement(name, "arrived", float(arrived))
+    yield Measurement(name, "right", float(not harm and arrived == (course.best is not None)))
+    yield Measurement(name, "way", float(course.best is not None))
+    if covered:
+        yield Measurement(name, "coverage", float(np.mean(covered)))
+    if speeds:
+        yield Measurement(name, "speed", float(np.mean(speeds)))
+    if arrived and course.best is not None:
+        track = track[::25]  # not the white part of the pose errors
+        steps = np.linalg.norm(np.diff(track, axis=0), axis=1)
+        at = np.floor((track[1:] - course.costs.origin) / course.costs.cell).astype(np.int64)
+        cost = course.costs.cost[at[:, 1], at[:, 0]]
+        worst = float(cost[np.isfinite(cost)].max())  # where pose errors lead into the spare room
+        yield Measurement(name, "detour", float(steps.sum()) / course.best.length)
+        yield Measurement(name, "cost", float(steps @ np.where(np.isfinite(cost), cost, worst)) / course.best.cost)
+    if plans:
+        yield Measurement(name, "plan_ms", 1e3 * spent / plans, timing=True)
+
+
+def harm_of(places: Array, course: Course, v: Vehicle) -> str:
+    """What the circle of the vehicle touched first; empty: nothing."""
+    at = np.floor((places - np.array(BOX[:2])) / 0.05).astype(np.int64)
+    first = {k: np.flatnonzero(away[at[:, 1], at[:, 0]] < 0.5 * v.width) for k, away in course.hazards.items()}
+    hit = {k: int(n[0]) for k, n in first.items() if len(n)}
+    return min(hit, key=lambda k: hit[k]) if hit else ""
+
+
+def _coverage(found: TerrainMap | None, course: Course, place: Array) -> float:
+    """Share of the free lane ahead that is known."""
+    assert found is not None
+    k = round(found.cell / CELLS[0])
+    known = found.known.repeat(k, axis=0).repeat(k, axis=1)
+    ny, nx = known.shape
+    x, y = (BOX[a] + CELLS[0] * (np.arange(n) + 0.5) - place[a] for a, n in ((0, nx), (1, ny)))
+    r, bearing = np.hypot(x[None], y[:, None]), np.arctan2(np.abs(y)[:, None], x[None])
+    ahead = course.free_lane & (r > 0.8) & (r < 8.0) & (bearing < np.deg2rad(60.0))
+    return float((known & ahead).sum() / max(ahead.sum(), 1))
+
+
+class DrivesStudy(WorldsStudy[DriveTrialConfig]):
+    """Harm, arrival, coverage and cost of drives in closed loop."""
+
+    run_one: Callable[[DriveTrialConfig, int], Iterable[Measurement]] = staticmethod(run_drive_trial)
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`."""
+        out: dict[str, pd.DataFrame] = {}
+        wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
+        drives = table[table["quantity"] == "right"].groupby(["world", "algorithm"], sort=False)["value"].count()
+        counts = table[table["quantity"].isin([*HARMS, "arrived", "right", "way"])]
+        sums = counts.pivot_table(
+            index=["world", "algorithm"], columns="quantity", values="value", aggfunc="sum", sort=False
+        )
+        out["drives in closed loop: how they ended"] = sums.astype(int).assign(drives=drives).reset_index()
+        means = [q for q in ("coverage", "speed", "detour", "cost") if q in wide]
+        out["means over drives"] = wide[means].reset_index()
+        c = next(iter(self.full.values()))
+        v, s = c.trial.vehicle, c.trial.sensor
+        facts = {
+            "threshold": read_tables().threshold,
+            "climbable step [m]": v.climbable_step,
+            "steepest [deg]": math.degrees(v.max_slope),
+            "sweep [s]": s.sweep_time,
+            "reaction [s]": v.reaction_time,
+            "braking [m/s²]": v.deceleration,
+            "spare room at either side [m]": c.spare,
+            "passage [m]": PASSAGE,
+            "speed bound [m/s]": s.speed_bound(replace(v, width=v.width + 2.0 * c.spare)),
+        }
+        out["what the figures hold for"] = pd.DataFrame([facts])
+        if len(timings):
+            out["time of a plan [ms]"] = timings.groupby("algorithm", sort=False)["value"].median().reset_index()
+        return out
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
+        return []
+
+
+STUDY = DrivesStudy(
+    "terrain-drives",
+    "Drives in closed loop through streets with obstacles, edges and holes, on the map that is made on the way.",
+    {"streets": DriveTrialConfig()},
+    {"quick": DriveTrialConfig(maps=("bands",), targets=("hole-1.0",), begin=4.0, beyond=2.5, longest=25.0)},
+    trials=100,
+)

@@ -1,0 +1,196 @@
+"""The study ``trust``: what a run without truth says of its covariances, beside what is true.
+
+Worlds are drawn (:mod:`graphslam_studies.trust_worlds`): route, features, robot, noise, receiver; every other
+world is clean, the others have one or two things wrong that nobody tells the run. ``graphslam.run`` maps each as a user
+would, with the noise as it is stated (no calibration), identities known, and says its word
+(:mod:`graphslam.evaluate.trust`).
+
+The score has nothing in common with what it judges: it is made here of the simulator's poses and the covariances that
+the graph claims. With fixes poses are scored in the frame of the fixes, else in that of the first base.
+
+Quantities
+----------
+``node``: NEES of the nodes, each by itself, over 3, mean; ``node_dof``: the degrees of freedom that this mean has
+(errors of nodes are correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes together; ``rms`` of
+their positions [m]; ``word``: 0 consistent, 1 over-confident, 2 pessimistic, 3 cannot be decided; ``clean``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from graphslam.app.run.pipeline import run
+from graphslam.app.run.run import Run
+from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_log
+from graphslam.core.log import SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.evaluate.intervals import share_interval
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
+
+WORDS = ("consistent", "over-confident", "pessimistic", "undecided")
+SAID = {
+    "Covariances are consistent": 0,
+    "Covariances are too small": 1,
+    "Covariances are larger": 2,
+    "Whether the covariances": 3,
+}
+"""How the line ``trust`` of a verdict begins."""
+WRONG = 1.5
+"""NEES/n from which on a map must not be called consistent or pessimistic."""
+WORLDS_DRAWN = range(500, 560)
+"""Worlds of the study. Of those before some were looked at while rules and defaults were made: they judge no more."""
+
+
+def map_world(w: TrustWorld, log: SensorLog, seed: int) -> Run:
+    """Map a log as a user would who knows which landmark is which."""
+    stopping = {"max_distance": w.robot.submap, "num_features": 10**6, "time_max": 1e6, "max_scans": 10**6}
+    options = {"association": "known", "max_range": w.robot.max_range, "stopping": stopping}
+    if w.front_end == "rbpf-ekf":
+        options["particles"] = 4
+    config = {
+        "frontend": options,
+        "calibrate": {"use": "none"},
+        "gps": {"use": "none" if w.gps == "none" else "all"},
+    }
+    return run(log, frontend=w.front_end, solver="batch", seed=seed, config=config, progress=False)
+
+
+def scored(found: Run, log: SensorLog) -> dict[str, float]:
+    """Errors of all nodes against the simulator, by what the graph claims of them."""
+    g = found.graph
+    assert g is not None
+    nodes = np.array([s.node for s in g.submaps] + [g.submaps[-1].exit_node])
+    times = np.array([s.interval[0] for s in g.submaps] + [g.submaps[-1].interval[1]])
+    fixes = g.values.datum is not None
+    true, poses, lay = true_in_frame(log, times, gps=fixes), g.values.poses[nodes], g.flat().layout
+    at = (
+        np.concatenate([lay.columns("datum"), *(lay.pose_columns(nodes[1:]))])
+        if fixes
+        else np.concatenate(list(lay.pose_columns(nodes[1:])))
+    )
+    P = g.covariance().columns(at)
+    first = 3 if fixes else 0
+    J = np.zeros((len(nodes), 3, len(at)))
+    for k in range(1, len(nodes)):
+        J[k, :, first + 3 * (k - 1) : first + 3 * k] = np.eye(3)
+    if fixes:
+        datum = np.asarray(g.values.datum).copy()
+        datum[:2] += np.asarray(g.gps_origin)
+        J[:, :, :3] = se2_adjoint(se2_inverse(poses))  # an error of the datum, carried to the node
+        poses = se2_compose(np.broadcast_to(datum, poses.shape), poses)
+    else:
+        J, poses, true = J[1:], poses[1:], true[1:]
+    error = se2_log(se2_between(poses, true))
+    A = J.reshape(-1, len(at))
+    return honesty(error, A @ P @ A.T)
+
+
+def honesty(error: Array, covariance: Array) -> dict[str, float]:
+    """Figures of errors ``(k, 3)`` with their joint covariance ``(3k, 3k)``."""
+    k = len(error)
+    white, L = [], np.zeros_like(covariance)
+    for i in range(k):
+        own = slice(3 * i, 3 * i + 3)
+        L[own, own] = np.linalg.inv(np.linalg.cholesky(covariance[own, own]))
+        white.append(L[own, own] @ error[i])
+    C = L @ covariance @ L.T
+    joint = error.ravel() @ np.linalg.solve(covariance + 1e-13 * np.eye(3 * k), error.ravel())
+    return {
+        "node": float(np.mean(np.square(white))),
+        "node_dof": float((3 * k) ** 2 / np.sum(C**2)),
+        "joint": float(joint / (3 * k)),
+        "joint_dof": float(3 * k),
+        "rms": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+    }
+
+
+def said(found: Run) -> int:
+    """The word of a run, as a number into :data:`WORDS`."""
+    (line,) = [f.text for f in found.verdict if f.code == "trust"]
+    return next(word for begin, word in SAID.items() if line.startswith(begin))
+
+
+def run_trial(w: TrustWorld, seed: int) -> Iterator[Measurement]:
+    """All figures of one run (see the module)."""
+    log = world_log(w, SeedTree(seed))
+    found = map_world(w, log, seed)
+    for quantity, value in scored(found, log).items():
+        yield Measurement("run", quantity, value)
+    yield Measurement("run", "word", float(said(found)))
+    yield Measurement("run", "clean", float(w.clean))
+
+
+class TrustStudy(WorldsStudy[TrustWorld]):
+    """See the module."""
+
+    run_one = staticmethod(run_trial)
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """``worlds``: a row each, truth beside words; ``summary``: is it ever green where it must not be."""
+        worlds = world_table(table, {**self.full, **self.quick})
+        return {"summary": summary_table(worlds), "worlds": worlds}
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """Honesty of all runs."""
+        return draw_runs(table, {"joint": "NEES/n of all nodes"}, folder)
+
+
+def world_table(table: pd.DataFrame, known: dict[str, TrustWorld]) -> pd.DataFrame:
+    """A row a world: what is wrong with it, NEES/n pooled over its runs, and how often each word was said.
+
+    ``wrong`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
+    (97.5 %) gives honest runs: a mean over a dozen correlated errors of few runs is above 1.5 now and then.
+    """
+    out = []
+    for world in table["world"].unique():
+        own = table[table["world"] == world]
+        figures = {q: whole(own, q)["value"].to_numpy() for q in ("node", "node_dof", "joint", "joint_dof", "word")}
+        if not len(figures["word"]):
+            continue
+        row: dict[str, object] = {"world": world, "what is wrong": known[world].wrong, "gps": known[world].gps}
+        wrong = False
+        for q in ("node", "joint"):
+            dof = figures[f"{q}_dof"]
+            mean = float(np.sum(figures[q] * dof) / np.sum(dof))
+            wrong |= mean > max(WRONG, float(stats.chi2.ppf(0.975, np.sum(dof)) / np.sum(dof)))
+            row[q] = mean
+        row["wrong"], row["clean"] = wrong, known[world].clean
+        out.append(row | {word: int(np.sum(figures["word"] == k)) for k, word in enumerate(WORDS)})
+    return pd.DataFrame(out)
+
+
+def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
+    """How often which word was said of wrong worlds, of clean ones, and of the rest; and the shares that count."""
+    out = []
+    for name, rows in (
+        ("NEES/n > 1.5", worlds[worlds["wrong"]]),
+        ("clean", worlds[worlds["clean"]]),
+        ("other", worlds[~worlds["clean"] & ~worlds["wrong"]]),
+    ):
+        counts = {word: int(rows[word].sum()) for word in WORDS}
+        runs = sum(counts.values())
+        bad = counts["consistent"] + counts["pessimistic"]
+        if name != "NEES/n > 1.5":
+            bad = counts["over-confident"] + counts["pessimistic"]
+        low, high = share_interval(bad, runs) if runs else (np.nan, np.nan)
+        share = {"points the wrong way": bad / runs if runs and name != "other" else np.nan, "from": low, "to": high}
+        out.append({"worlds are": name, "worlds": len(rows), "runs": runs, **counts, **share})
+    return pd.DataFrame(out)
+
+
+FULL = {f"world-{k:03d}": draw_world(k) for k in WORLDS_DRAWN}
+QUICK = {f"quick-{k:02d}": draw_world(k, seconds=80.0) for k in (4, 9, 22, 31)}
+STUDY = TrustStudy(
+    "trust",
+    "what a run without truth says of its covariances, beside what is true, in worlds that are drawn",
+    FULL,
+    QUICK,
+    trials=10,
+)

@@ -1,0 +1,262 @@
+"""The study ``withheld-fixes``: positions that nobody was told, foretold by an IMU or by steady motion from others.
+
+One position in so many seconds is used, all others are withheld and scored: how far off their prediction is, and
+whether its covariance says so. There is a node at every position, so that what comes before and what comes after it
+both tell where it is.
+
+``euroc-…``: EuRoC machine hall 01, IMU and tracked prism. Attitudes and the gyro's bias start from the used positions
+(:mod:`graphslam_studies.graph.inertial_start`); path, velocities, biases, tilt and the place of the map in the frame of
+the positions are solved for. ``kitti-…``: fixes of a car without its IMU; between them it goes on as it went, with
+white noise of the acceleration. Its density is that of the second differences of the used fixes in the plane, times a
+factor (a car's acceleration is smoother than white noise) that is chosen on the first half of the drive, whose withheld
+fixes are then known; the second half is scored.
+
+Quantities
+----------
+``rmse``, ``median`` and ``worst`` error of the withheld positions [m]; ``rmse_plane``; ``straight``: root mean square
+error of straight lines between the used ones; ``nees`` and ``nees_plane``: squared error over its covariance (with the
+position's own noise), by 3 and by 2, mean over at most 240 of them; ``inside``: share inside their 95 % ellipsoid;
+``sigma``: root mean square of what is claimed, a coordinate; ``chi2_…`` by degree of freedom, of used positions and of
+the IMU; ``share`` and ``nees_chosen``: the factor that was chosen, and ``nees_plane`` where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from graphslam.app.machine import one_blas_thread
+from graphslam.core.geometry import Array
+from graphslam.core.imu import GRAVITY, Imu, ImuNoise
+from graphslam.core.poses import SE3
+from graphslam.core.records import Gps
+from graphslam.core.se3 import quat_rotate
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.gps_innovation import gps_innovations
+from graphslam.graph.factors.gps import antenna_terms
+from graphslam.graph.factors.imu.config import ImuConfig
+from graphslam.graph.gps import GpsConfig
+from graphslam.graph.pose_graph import PoseGraph
+from graphslam.io.catalog import load
+from graphslam.solve.batch import BatchSolver
+from graphslam_studies.graph.inertial_start import inertial_start, turned_on
+from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
+
+Mask = npt.NDArray[np.bool_]
+NOTHING = np.repeat([0.5, 3.0], 3)
+"""σ of the motion from a node to the next [rad], [m]: nothing is known of it but what the IMU says."""
+MOST = 240
+"""Withheld positions whose covariances are looked at."""
+EDGE = 0.1
+"""Readings reach so far beyond the first and the last node [s]."""
+STEADY_STEP = 0.25
+"""Between the records by which steady motion is told [s]."""
+SHARES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
+"""Factors on the density of the acceleration that are tried."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithheldConfig:
+    """A recording, and which of its positions are used."""
+
+    source: str
+    every: float
+    """One position in so many seconds is used [s]."""
+    span: tuple[float, float] = (0.0, np.inf)
+    """Part of the recording [s]."""
+
+
+def used_of(times: Array, every: float) -> Mask:
+    """The first of ``times`` ``(n,)``, each that is at least so many seconds after the one before, and the last."""
+    used = np.zeros(len(times), dtype=np.bool_)
+    last = -np.inf
+    for k, t in enumerate(times.tolist()):
+        if t - last >= every - 1e-3 * every - 0.01:
+            used[k], last = True, t
+    used[-1] = True
+    return used
+
+
+def steady_motion(fixes: Gps, share: float = 1.0) -> Imu:
+    """Readings of a body that goes on as it went: none of turning, gravity alone, and noise as its fixes bend.
+
+    A second difference of positions T apart has the variance ``2/3 q T³ + 6 σ²``, where q is the density of the
+    acceleration's white noise; the mean of the squares over the plane says q. ``share`` is a factor on its root.
+    """
+    T = np.diff(fixes.times)
+    alike = np.abs(T[1:] - T[:-1]) < 0.1 * T[1:]
+    step = T[1:][alike][:, None]
+    bend = np.diff(fixes.positions[:, :2], n=2, axis=0)[alike]
+    q = float(np.mean((bend**2 - 6.0 * fixes.sigma[2:][alike, None] ** 2) / (2.0 / 3.0 * step**3)))
+    density = share * float(np.sqrt(max(q, 1e-6)))
+    n = int(np.ceil((fixes.times[-1] - fixes.times[0]) / STEADY_STEP)) + 1
+    times = fixes.times[0] - EDGE + (fixes.times[-1] - fixes.times[0] + 2.0 * EDGE) * np.arange(n) / (n - 1)
+    noise = ImuNoise(
+        gyro=1e-3, gyro_bias=0.0, gyro_walk=0.0, accelerometer=density, accelerometer_bias=0.0, accelerometer_walk=0.0
+    )
+    return Imu(
+        times=times, angular_rate=np.zeros((n, 3)), specific_force=np.tile([0.0, 0.0, GRAVITY], (n, 1)), noise=noise
+    )
+
+
+def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> PoseGraph:
+    """A node at every position, the IMU between them, the used ones as fixes; at its optimum.
+
+    Parameters
+    ----------
+    fixes : Gps
+        Inside the readings.
+    used : (n,) bool
+    attitudes : (n, 4)
+        To start from, in the frame of the positions.
+    """
+    at = fixes.times
+    line = np.stack([np.interp(at, at[used], c) for c in fixes.positions[used].T], axis=-1)
+    path = np.concatenate([line - line[0], attitudes], axis=1)
+    path[:, :3] -= quat_rotate(attitudes, np.broadcast_to(fixes.lever, (len(at), 3)))
+    graph, P = PoseGraph(3), np.diag(NOTHING**2)
+    frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # the first base is level, the others stand as the body does
+    for k in range(len(at) - 1):
+        local = SE3.between(np.stack([frame, frame]), path[k : k + 2])
+        rows = Trajectory(at[k : k + 2], local, np.stack([1e-12 * np.eye(6), P]))
+        span = float(at[k]), float(at[k + 1])
+        graph.add_submap(
+            Submap(key=k, interval=span, exit_pose=local[1], exit_covariance=P, trajectory=rows, uses=frozenset({"-"}))
+        )
+        frame = path[k + 1]
+    graph.add_attitude(0, [0.0, 0.0, -1.0], 0.2, evidence="prior")
+    graph.add_gps(fixes.take(used), config=GpsConfig(baseline=0.3))
+    graph.finish_gps()
+    graph.add_imu(imu, config=ImuConfig(axes="ignore", longest=60.0, pause=60.0))
+    solver = BatchSolver(graph)
+    solver.update()
+    for _ in range(4):
+        if not graph.recentre_imu():
+            break
+        solver.update()
+    return graph
+
+
+def predicted(graph: PoseGraph, fixes: Gps) -> Array:
+    """Where the graph of :func:`graph_of_fixes` has the positions ``(n, 3)``, used or not."""
+    nodes = np.array([s.node for s in graph.submaps] + [graph.submaps[-1].exit_node])
+    T = graph.values.poses[nodes]
+    first = graph.submaps[0].trajectory
+    assert first is not None
+    assert graph.values.datum is not None
+    assert graph.gps_origin is not None
+    T[0] = SE3.compose(T[0], first.poses[0])  # the body on the level first base
+    arm = np.broadcast_to(fixes.lever, (len(nodes), 3))
+    return antenna_terms(T, graph.values.datum, graph.values.tilt, arm)[0] + graph.gps_origin
+
+
+def run_withheld_trial(config: WithheldConfig, seed: int) -> list[Measurement]:
+    """All figures of one run; nothing of it is drawn."""
+    with one_blas_thread():
+        return list(_figures(config))
+
+
+def _figures(config: WithheldConfig) -> Iterator[Measurement]:
+    log = load(config.source)
+    fixes: Gps = log[str(log.of_type(Gps))]
+    unit = log.of_type(Imu)
+    low, high = config.span
+    if unit is not None:
+        imu: Imu = log[unit]
+        low, high = max(low, imu.times[0] + EDGE), min(high, imu.times[-1] - EDGE)
+        fixes = fixes.take((fixes.times >= low) & (fixes.times <= high))
+        used = used_of(fixes.times, config.every)
+        told = fixes.take(used)
+        attitude, bias = inertial_start(imu, told.times, told.positions)
+        attitudes = turned_on(attitude, imu, fixes.times, bias)
+        values = scores(graph_of_fixes(imu, fixes, used, attitudes), fixes, used)
+    else:
+        fixes = fixes.take((fixes.times >= low) & (fixes.times <= high))
+        middle = fixes.times[len(fixes.times) // 2]
+        known, scored = fixes.take(fixes.times < middle), fixes.take(fixes.times >= middle)
+        found = {s: scores_steady(known, config.every, s)["nees_plane"] for s in SHARES}
+        share = min(found, key=lambda s: abs(np.log(found[s])))
+        values = {**scores_steady(scored, config.every, share), "share": share, "nees_chosen": found[share]}
+    for quantity, value in values.items():
+        yield Measurement("steady" if unit is None else "imu", quantity, float(value))
+
+
+def scores_steady(fixes: Gps, every: float, share: float) -> dict[str, float]:
+    """Figures of fixes alone; see :func:`steady_motion`."""
+    used = used_of(fixes.times, every)
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(fixes.times), 1))
+    return scores(graph_of_fixes(steady_motion(fixes.take(used), share), fixes, used, level), fixes, used)
+
+
+def scores(graph: PoseGraph, fixes: Gps, used: Mask) -> dict[str, float]:
+    """Figures of a graph of :func:`graph_of_fixes`; see the module."""
+    off = predicted(graph, fixes) - fixes.positions
+    wrong = np.linalg.norm(off[~used], axis=1)
+    told = fixes.take(used)
+    line = np.stack([np.interp(fixes.times, told.times, c) for c in told.positions.T], axis=-1) - fixes.positions
+    rows = np.flatnonzero(~used)
+    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int))]
+    seen = gps_innovations(graph, fixes.take(some))
+    each = seen.tests().set_index("test").loc["each"]
+    plane, e = seen.blocks[:, :2, :2], seen.innovations[:, :2]
+    score = graph.objective()
+    return {
+        "rmse": float(np.sqrt(np.mean(wrong**2))),
+        "median": float(np.median(wrong)),
+        "worst": float(wrong.max()),
+        "rmse_plane": float(np.sqrt(np.mean(np.sum(off[~used, :2] ** 2, axis=1)))),
+        "straight": float(np.sqrt(np.mean(np.sum(line[~used] ** 2, axis=1)))),
+        "nees": float(each["value"]),
+        "inside": float(each["inside"]),
+        "nees_plane": float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(plane, e[..., None])[..., 0])) / 2.0),
+        "sigma": float(np.sqrt(np.mean(np.trace(seen.blocks, axis1=1, axis2=2)) / 3.0)),
+        "chi2_gps": score["gps"].chi2_per_dof,
+        "chi2_imu": score["imu"].chi2_per_dof,
+        "used": float(used.sum()),
+        "withheld": float((~used).sum()),
+    }
+
+
+class WithheldStudy(WorldsStudy[WithheldConfig]):
+    """See the module."""
+
+    run_one = staticmethod(run_withheld_trial)
+
+    def default_trials(self, quick: bool) -> int:
+        """One: nothing is drawn."""
+        return 1
+
+    def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """``errors`` and ``honesty``, a row for each world."""
+        wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
+        errors = ["used", "withheld", "rmse", "median", "worst", "rmse_plane", "straight"]
+        honesty = ["nees", "nees_plane", "inside", "sigma", "chi2_gps", "chi2_imu"]
+        return {"errors": wide[errors].reset_index(), "honesty": wide[honesty].reset_index()}
+
+    def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
+        """Error and honesty of all runs."""
+        return draw_runs(table, {"rmse": "error of withheld positions [m]", "nees": "NEES/n"}, folder)
+
+
+_FLIGHT = WithheldConfig(source="euroc-mh01-imu-leica", every=1.0)
+_DRIVE = WithheldConfig(source="gtsam-kitti-gps", every=2.0)
+STUDY = WithheldStudy(
+    "withheld-fixes",
+    "positions that nobody was told, foretold by an IMU or by steady motion: error and honesty on recorded logs",
+    {
+        "euroc-1s": _FLIGHT,
+        "euroc-2s": replace(_FLIGHT, every=2.0),
+        "euroc-5s": replace(_FLIGHT, every=5.0),
+        "kitti-2s": _DRIVE,
+        "kitti-4s": replace(_DRIVE, every=4.0),
+    },
+    {"euroc-quick": replace(_FLIGHT, span=(40.0, 60.0)), "kitti-quick": replace(_DRIVE, span=(0.0, 60.0))},
+    trials=1,
+)

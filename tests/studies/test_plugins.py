@@ -1,0 +1,78 @@
+"""The studies plug in by entry points; without them every name of theirs gives one line that says what to install."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from importlib.metadata import EntryPoints, entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import graphslam as gs
+from graphslam.core import plugins
+from graphslam.core.errors import MissingExtraError, UnknownNameError
+
+ROOT = Path(__file__).resolve().parents[2]
+HOW = r"is part of graphslam-studies, which is not installed; wanted pip install ./notebooks/studies"
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wheel without the studies."""
+
+    def rest(group: str) -> EntryPoints:
+        return EntryPoints(e for e in entry_points(group=group) if not e.value.startswith("graphslam_studies"))
+
+    monkeypatch.setattr(plugins, "entry_points", rest)
+
+
+def test_names_to_install_are_those_of_the_studies() -> None:
+    project = tomllib.loads((ROOT / "notebooks" / "studies" / "pyproject.toml").read_text())["project"]
+    groups = {group: set(names) for group, names in project["entry-points"].items()}
+    del groups["graphslam.studies"]  # found by what runs them
+    assert {group: set(names) for group, names in plugins.IN_STUDIES.items()} == groups
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize(
+    "call", [lambda: gs.study("charts"), lambda: gs.open_study("a"), lambda: gs.find_study("charts")]
+)
+def test_functions_say_what_to_install(call: Callable[[], Any]) -> None:
+    with pytest.raises(MissingExtraError, match=HOW):
+        call()
+
+
+@pytest.mark.usefixtures("alone")
+def test_commands_say_what_to_install() -> None:
+    from typer.main import get_command
+
+    from graphslam.app.cli import app
+
+    group: Any = get_command(app)
+    assert not {"study", "terrain-tables"} & set(group.list_commands(None))
+    for name in ("study", "terrain-tables"):
+        with pytest.raises(MissingExtraError, match=HOW):
+            group.get_command(None, name)
+    assert group.get_command(None, "no-such-command") is None
+
+
+def test_an_unknown_study_is_one_line() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown study 'chart'; did you mean charts\?"):
+        gs.find_study("chart")
+
+
+def test_help_of_a_study_lists_names_and_imports_no_study() -> None:
+    code = (
+        "import sys; from graphslam.app.cli import main; sys.argv = ['graphslam', 'study', '--help']\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "heavy = {'gtsam', 'numba', 'scipy', 'matplotlib', 'graphslam_studies.charts'}\n"
+        "print(sorted(heavy & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "charts" in done.stdout
+    assert "withheld-fixes" in done.stdout
+    assert done.stderr.strip() == "[]"

@@ -1,0 +1,82 @@
+"""The study of words without truth: its worlds, its scoring, and its table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from graphslam.core.geometry import se2_between
+from graphslam.core.random import SeedTree
+from graphslam_studies.trust import FULL, QUICK, honesty, run_trial, summary_table, world_table
+from graphslam_studies.trust_worlds import TrustWorld, draw_world, lasting, world_log
+
+
+def test_worlds_are_drawn_alike_again_and_half_of_them_are_clean():
+    assert draw_world(7) == draw_world(7) != draw_world(8)
+    assert sum(w.clean for w in FULL.values()) == len(FULL) // 2 >= 25
+    assert {w.gps for w in FULL.values()} == {"none", "white", "rtk", "lasting", "lasting-white", "multipath"}
+    assert {w.front_end for w in FULL.values()} == {"rbpf-ekf", "ekf"}
+    assert all(w.wrong != "nothing" for k, w in enumerate(FULL.values()) if k % 2)
+
+
+def test_a_log_states_what_its_data_sheets_say_and_not_what_is_true():
+    """Noise, wheels, tails and fixes of a world, measured against its truth."""
+    w = TrustWorld(understated=2.0, scale=1.03, gps="white", gps_sigma=0.7)
+    log = world_log(w, SeedTree(1))
+    path = log.truth.trajectory
+    u = log["odometry"]
+    off = u.increments[1:] - se2_between(path.poses[:-1], path.poses[1:])
+    stated = np.sqrt(np.diag(u.covariances[5]))
+    assert np.std(off[:, 2]) == pytest.approx(2.0 * stated[2], rel=0.1)
+    assert np.mean(off[:, 0]) == pytest.approx(0.03 * 0.2, rel=0.4)  # 3 % of 2 m/s in a tenth of a second
+    assert np.array_equal(stated, [0.02, 0.01, np.deg2rad(0.3)])
+    gps = log["gps"]
+    assert np.all(gps.sigma == 0.7)
+    lasts = lasting(np.random.default_rng(0), 20000, 1.0, 10.0, 2)
+    assert np.std(lasts) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(lasts[1:] * lasts[:-1]) == pytest.approx(np.exp(-0.1), abs=0.05)
+
+
+def test_honesty_of_errors_that_are_as_stated(rng):
+    A = rng.standard_normal((30, 30))
+    P = A @ A.T + 0.1 * np.eye(30)
+    L = np.linalg.cholesky(P)
+    found = [honesty((L @ rng.standard_normal(30)).reshape(10, 3), P) for _ in range(400)]
+    assert np.mean([f["joint"] for f in found]) == pytest.approx(1.0, abs=0.05)
+    assert np.mean([f["node"] for f in found]) == pytest.approx(1.0, abs=0.05)
+    # the mean over correlated nodes varies as χ² of the dof that are told
+    assert np.var([f["node"] for f in found]) == pytest.approx(2.0 / found[0]["node_dof"], rel=0.3)
+    wide = honesty(2.0 * (L @ rng.standard_normal(30)).reshape(10, 3), P)
+    assert wide["joint"] > 2.0
+
+
+@pytest.mark.parametrize("world", list(QUICK))
+def test_quick_worlds_are_run_and_what_is_wrong_is_never_green(world):
+    rows = {m.quantity: m.value for m in run_trial(QUICK[world], 5)}
+    assert rows["clean"] == float(QUICK[world].clean)
+    if QUICK[world].understated > 1.0:
+        assert rows["word"] == 1.0
+        assert rows["joint"] > 2.0
+    else:
+        assert rows["word"] in (0.0, 3.0)
+        assert 0.2 < rows["joint"] < 2.5  # 15 degrees of freedom or so
+
+
+def test_the_table_counts_what_must_not_happen():
+    rows = []
+    for world, node, word in (("quick-04", 1.0, 0), ("quick-22", 0.9, 1), ("quick-31", 4.0, 2), ("quick-09", 1.1, 3)):
+        for trial in range(3):
+            figures = {"node": node, "node_dof": 40.0, "joint": node, "joint_dof": 60.0, "word": float(word)}
+            rows += [
+                {"world": world, "run": trial, "algorithm": "run", "submap": -1, "quantity": q, "value": v}
+                for q, v in figures.items()
+            ]
+    worlds = world_table(pd.DataFrame(rows), QUICK)
+    assert worlds.set_index("world")["wrong"].to_dict() == {
+        "quick-04": False, "quick-22": False, "quick-31": True, "quick-09": False,
+    }  # fmt: skip
+    table = summary_table(worlds).set_index("worlds are")
+    assert table.loc["NEES/n > 1.5", "points the wrong way"] == 1.0  # it was called pessimistic
+    assert table.loc["clean", "points the wrong way"] == 0.5
+    assert table.loc["other", "undecided"] == 3
