@@ -37,7 +37,7 @@ from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_studies.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import consecutive_pairs, covered_part, random_pairs, relation_error
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",
@@ -56,7 +56,7 @@ def settings(log: SensorLog, particles: int | None = None) -> SegSlamFrontEndCon
 
 def relations(path: Trajectory, reference: Trajectory) -> dict[str, float]:
     """Relation errors of neighbours and of pairs at random, the same pairs for every path of one log."""
-    part = covered(reference, path)
+    part = covered_part(reference, path)
     out: dict[str, float] = {}
     for what, pairs in (
         ("consecutive", consecutive_pairs(len(part))),

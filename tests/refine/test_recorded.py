@@ -17,7 +17,7 @@ from graphslam.refine.refine import Refinement
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import covered_part, random_pairs, relation_error
 
 FREEHAND = {"period": None, "max_range": 30.0, "most_points": 400, "odometry_tilt_sigma": 0.005}
 """Packs of clouds with poses of lidar and IMU, as their presets have it; the yaw rate as it was recorded."""
@@ -31,7 +31,7 @@ def part(name: str, seconds: float, data_dir: Path) -> SensorLog:
 
 
 def relations(path: Trajectory, reference: Trajectory) -> dict[str, float]:
-    held = covered(reference, path)
+    held = covered_part(reference, path)
     return relation_error(path, held, random_pairs(len(held), 1000, np.random.default_rng(0))).as_row()
 
 

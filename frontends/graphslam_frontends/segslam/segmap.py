@@ -27,7 +27,7 @@ from graphslam_frontends.segslam.store import SegmentMaps, SegmentTable
 
 Ints = npt.NDArray[np.int64]
 
-__all__ = ["KINDS", "MATCH", "NEW", "SAME", "SegmentEntry", "SegMap", "Segment"]
+__all__ = ["KINDS", "MATCH", "NEW", "SAME", "SegMap", "Segment", "SegmentEntry"]
 
 _NOBODY: Ints = np.zeros(0, np.int64)
 

@@ -24,7 +24,7 @@ from graphslam.core.se3 import se3_inverse, se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam_frontends.odometry.recorded import chain_odometry
-from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import covered_part, random_pairs, relation_error
 from graphslam_studies.montecarlo.trials import Measurement
 
 UNKNOWN = "unknown"
@@ -194,7 +194,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
 
 def path_errors(path: Trajectory, reference: Any) -> dict[str, float]:
     """Relations of pairs drawn at random [m, deg], and ATE after an alignment [m]."""
-    part = covered(Trajectory(reference.times, reference.poses), path)
+    part = covered_part(Trajectory(reference.times, reference.poses), path)
     pairs = random_pairs(len(part), PAIRS, np.random.default_rng(0))
     row = relation_error(path, part, pairs).as_row()
     at = Trajectory(part.times, path.interpolate(part.times))
