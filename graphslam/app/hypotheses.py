@@ -42,10 +42,10 @@ from graphslam.io.submap_store import read_submaps
 from graphslam.io.tum import write_tum
 from graphslam.loops.candidates import FRONT_END
 from graphslam.loops.ledger import ledger_of_events
-from graphslam.maps.alternatives import Alternative, Choice, choose
+from graphslam.maps.alternatives import Alternative, RankedAlternatives, rank_alternatives
 from graphslam.maps.export import save_maps
-from graphslam.maps.global_map import make_map
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.maps.global_map import make_global_map
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import REACH_MARGIN, MapConfig, RunMap, make_run_map, solved_poses
@@ -63,7 +63,7 @@ class Clearest:
 
     Parameters
     ----------
-    choice : Choice
+    choice : RankedAlternatives
         The chosen one first.
     left_out : int
         Alternatives that were not solved.
@@ -75,7 +75,7 @@ class Clearest:
         What the refinement says of it.
     """
 
-    choice: Choice
+    choice: RankedAlternatives
     left_out: int
     refined: Refined | None = None
     refined_map: RunMap | None = None
@@ -117,11 +117,11 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         solution = back.finish()
         ends = [*solution.base_nodes.tolist(), int(solution.exit_nodes[-1])]
         nodes = {s.key: (solution.node_times[a:b], solution.poses[a:b]) for s, a, b in zip(run.submaps, ends, ends[1:])}
-        candidate = Candidate(made.divided.pieces, solved_poses(made.divided, nodes), name)
+        candidate = MapHypothesis(made.divided.pieces, solved_poses(made.divided, nodes), name)
         taken = sum(key == LOOP for key, _ in chosen)
         facts = {"matches": len(chosen) - taken, "loops": taken}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
-    choice = choose(alternatives, model=made.fused.grid.model, progress=progress)
+    choice = rank_alternatives(alternatives, model=made.fused.grid.model, progress=progress)
     return _refined(run, Clearest(choice, len(every) - len(choices)), run.submaps)
 
 
@@ -171,7 +171,7 @@ def clearest_of_topologies(
         progress=progress,
     )
     model = next(iter(told[0].grids.values())).model
-    found = Clearest(choose(alternatives, model=model, progress=progress), left_out)
+    found = Clearest(rank_alternatives(alternatives, model=model, progress=progress), left_out)
     return _refined(run, found, told[found.choice.best.number].submaps)
 
 
@@ -186,7 +186,7 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
         return found
     check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
     solution = found.choice.best.alternative.solution
-    solved = make_map(solution, list(submaps), {}, 1)
+    solved = make_global_map(solution, list(submaps), {}, 1)
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
         gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))

@@ -31,7 +31,7 @@ from graphslam.loops.measure import Loop
 from graphslam.loops.overlap_constraints import overlap_entries
 from graphslam.loops.rules import LoopConfig
 from graphslam.maps.alternatives import Alternative
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
@@ -363,7 +363,7 @@ def solve_hypotheses(
             nodes = {s.key: np.asarray(s.times[:-1]) for s in back.graph.submaps}
             pieces[id(h.grids)] = divide_submaps(h.submaps, config=division, grids=h.grids, nodes=nodes)
         divided = pieces[id(h.grids)]
-        candidate = Candidate(divided.pieces, divided.along(solution.trajectory()), f"hypothesis {number}")
+        candidate = MapHypothesis(divided.pieces, divided.along(solution.trajectory()), f"hypothesis {number}")
         facts = h.facts(ledger.counts().get("accepted", 0))
         out.append(Alternative(candidate.name, back.graph, solution, candidate, facts))
     return out

@@ -4,12 +4,12 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "run_map": "make_run_map nodes_by_submap solved_poses",
-    "alternatives": "Alternative choose",
-    "minimum_entropy": "Candidate",
+    "alternatives": "Alternative rank_alternatives",
+    "minimum_entropy": "MapHypothesis",
     "terrain.lines": "lines_of_scans",
-    "terrain.plan": "CostConfig cost_map plan_way",
+    "terrain.plan": "CostConfig cost_map plan_path",
     "terrain.pyramid": "Pyramid",
-    "terrain.tables": "Tables fixed_tables read_tables",
+    "terrain.tables": "TerrainWeights fixed_tables read_tables",
     "terrain.vehicle": "CELLS LineSensor Vehicle",
     "surface.layer": "SurfaceLayer",
     "surface.mesh": "position_sigma zero_set",

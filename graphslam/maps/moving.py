@@ -5,9 +5,9 @@ through. A point is on something that moved where at least two neighbours know i
 beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
 by beams to farther ground look the same. What moves away and never lets its place be seen stays.
 
-Without clouds, :func:`outvoted` asks moments instead of submaps: evidence adds up beam by beam, so a person who stands
-for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them. Where every
-moment has one vote, they do.
+Without clouds, :func:`seen_through_voxels` asks moments instead of submaps: evidence adds up beam by beam, so a person
+who stands for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them.
+Where every moment has one vote, they do.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
     return out
 
 
-class MovedThings:
+class MovedObjects:
     """The things that points are on which are known to have moved, in other scans of the same time.
 
     :func:`moving_points` knows some points of a thing, and not its foot, which looks like the ground. What belongs to
@@ -183,7 +183,7 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
     return out
 
 
-def outvoted(
+def seen_through_voxels(
     grid: EvidenceGrid, moments: Iterable[EvidenceGrid], config: MovingConfig | None = None
 ) -> tuple[Array, Mask]:
     """Occupied voxels of a map that more moments saw through than were stopped by.

@@ -19,9 +19,9 @@ from graphslam.evidence.layout import MAX_LEVELS, half_edge
 from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.maps.clouds import fused_points
 from graphslam.maps.coarse import coarse_piece
-from graphslam.maps.contradictions import NOTHING, Contradictions, contradictions
+from graphslam.maps.contradictions import NOTHING, Contradictions, find_contradictions
 from graphslam.maps.export import storeys
-from graphslam.maps.fuse import FusedMap, fuse, reach_of
+from graphslam.maps.fuse import FusedMap, fuse_pieces, reach_of
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
@@ -218,7 +218,7 @@ def make_run_map(
     model = grid.model if isinstance(grid, EvidenceGrid) else None
     at = solved_poses(divided, nodes)
     divided, coarsened = _held(divided, at)
-    fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
+    fused = fuse_pieces(divided.pieces, divided.poses, model=model, threads=config.threads)
     fuse_s = time.perf_counter() - begin
     open_entropy, open_volume = fused.entropy(), fused.known_volume()
     begin = time.perf_counter()
@@ -240,7 +240,7 @@ def make_run_map(
         points,
         knows_space,
         coarsened,
-        contradictions(divided.pieces, at, model),
+        find_contradictions(divided.pieces, at, model),
     )
 
 

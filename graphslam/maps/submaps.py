@@ -13,7 +13,7 @@ from graphslam.core.poses import SE2, SE3, group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import own_evidence
+from graphslam.maps.increment import own_evidence
 from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
 
 
@@ -76,7 +76,7 @@ def divide_submaps(
     config : DivisionConfig, optional
         Give its ``reach``: the sensor's.
     own : bool
-        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.added`).
+        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.increment`).
     grids : mapping of key to EvidenceGrid, optional
         What each submap saw itself, where that is known exactly (:mod:`graphslam.maps.segslam_evidence`).
     level_nodes : bool

@@ -19,8 +19,8 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.noise import RobustKernel
 from graphslam.loops.ledger import LoopDecision, ledger_of_events
-from graphslam.maps.alternatives import Alternative, chi2_of, choose, noise_scale
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.maps.alternatives import Alternative, chi2_of, noise_scale, rank_alternatives
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
 from tests.app.run.test_loops import there_and_back
@@ -44,7 +44,7 @@ def run() -> tuple[list[Submap], BackEnd, list[LoopDecision], DividedSubmaps]:
 def alternative(name: str, back: BackEnd, divided: DividedSubmaps) -> Alternative:
     solution = back.finish()
     poses = divided.along(solution.trajectory())
-    return Alternative(name, back.graph, solution, Candidate(divided.pieces, poses, name))
+    return Alternative(name, back.graph, solution, MapHypothesis(divided.pieces, poses, name))
 
 
 def fold(back: BackEnd, robust: RobustKernel) -> None:
@@ -92,7 +92,7 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
     folded = solve_choice(submaps, frozenset(), OPTIONS)
     fold(folded, robust)
     made.append(alternative("folded", folded, divided))
-    choice = choose(made)
+    choice = rank_alternatives(made)
     assert choice.scale == 1.0
     by_name = {j.alternative.name: j for j in choice.order}
     assert choice.order[-1] is by_name["folded"]
@@ -114,10 +114,10 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
     assert not (tmp_path / "alternatives" / "99.tum").exists()
     kept = json.loads((tmp_path / "clearest.json").read_text())
     assert (kept["left_out"], kept["why"], len(kept["candidates"])) == (3, choice.why(), len(made))
-    only = choose(made[-1:])
+    only = rank_alternatives(made[-1:])
     assert only.best.contradicted
     assert "only one" in only.why()
-    both = choose([made[-1], alternative("folded again", _folded_more(submaps, robust), divided)])
+    both = rank_alternatives([made[-1], alternative("folded again", _folded_more(submaps, robust), divided)])
     assert both.best.chi2_per_dof == min(j.chi2_per_dof for j in both.order)
     assert f"every graph contradicts itself, {both.best.alternative.name} least" in both.why()
 
@@ -186,4 +186,4 @@ def test_fixes_of_a_run_are_in_every_choice(run: tuple) -> None:
 
 def test_nothing_to_choose_from() -> None:
     with pytest.raises(DataError, match="no graphs"):
-        choose([])
+        rank_alternatives([])

@@ -17,7 +17,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.maps.alternatives import Alternative, choose
+from graphslam.maps.alternatives import Alternative, rank_alternatives
 from graphslam.maps.pieces import DivisionConfig
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.result import SegSlamResult
@@ -81,7 +81,7 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
 def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlamResult) -> None:
     told, graphs = solved(result)
     assert len(told) == len(graphs) == 2
-    choice = choose(graphs)
+    choice = rank_alternatives(graphs)
     assert [j.alternative.name for j in choice.order] == ["hypothesis 0", "hypothesis 1"]
     assert choice.best_map.entropy() == pytest.approx(choice.best.clarity.entropy)
     closed, open_chain = told
@@ -103,7 +103,7 @@ def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlam
     np.testing.assert_array_equal(again[0].solution.poses, graphs[0].solution.poses)
     one, alone = solved(result, 1)
     assert len(one) == 1
-    assert "only one" in choose(alone).why()
+    assert "only one" in rank_alternatives(alone).why()
 
 
 def test_map_samples_become_graphs_too(trial: GridTrial, result: SegSlamResult) -> None:

@@ -38,7 +38,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load
-from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import divide_submaps
 from graphslam.sim.court import court
@@ -148,20 +148,20 @@ def measure(s: Scene, turns: int) -> dict[str, float]:
     divided = divide_submaps(submaps, every=NODE_EVERY, config=reach)
     pieces, poses, bodies = divided.pieces, divided.poses, bodies_of(submaps, steps)
     loops = {"third": corrected(poses, 1 / 3), "all": corrected(poses, 1.0)}
-    work = fuse(pieces, poses, model=model)
+    work = fuse_pieces(pieces, poses, model=model)
     work.move(loops["all"])  # compiled and warm
     found: dict[str, list[float]] = {}
     for _ in range(turns):
         made, fresh = seconds(partial(make_steps, s.log, s.config.steps))
         inserted, _ = seconds(partial(insert, fresh, bodies, size, model))
-        fused, scratch = seconds(partial(fuse, pieces, poses, model=model))
+        fused, scratch = seconds(partial(fuse_pieces, pieces, poses, model=model))
         turn = {"log": made + inserted, "scans": inserted, "pieces": fused}
         for name, loop in loops.items():
             work.move(poses, tolerance=0.0)
             turn[name], change = seconds(partial(work.move, loop))
             turn[f"{name} moved"] = change.moved
             turn[f"{name} summed"] = change.summed
-            again = fuse(pieces, work.poses, model=model)
+            again = fuse_pieces(pieces, work.poses, model=model)
             if not same(work, again) or work.entropy() != again.entropy():
                 raise AssertionError(f"{s.name}: the map re-posed ({name}) is not the map from scratch")
         for name, value in turn.items():

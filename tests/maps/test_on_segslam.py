@@ -11,8 +11,8 @@ from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import own_evidence
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
+from graphslam.maps.increment import own_evidence
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
@@ -39,7 +39,7 @@ def test_at_the_chain_pieces_are_the_submaps(run: tuple[Steps, list[Submap]]) ->
     assert len(divided.pieces) > 2 * len(submaps) > 4
     rigid = divide_submaps(submaps, every=None, own=False)
     assert set(rigid.pieces) == {(m.key, 0) for m in submaps}
-    a, b = fuse(divided.pieces, divided.poses).grid, fuse(rigid.pieces, rigid.poses).grid
+    a, b = fuse_pieces(divided.pieces, divided.poses).grid, fuse_pieces(rigid.pieces, rigid.poses).grid
     # pieces of one submap have one base pose, but for rounding of nodes composed and taken apart: 1e-15 m
     assert a.known_volume() == pytest.approx(b.known_volume(), rel=1e-5)
     points = b.occupied_cloud()
@@ -57,13 +57,13 @@ def test_the_map_is_clearer_at_the_true_poses(run: tuple[Steps, list[Submap]]) -
     divided = divide_submaps(submaps, config=DivisionConfig(reach=9.0))
     assert steps.truth is not None
     true = divided.along(steps.truth)
-    fused = fuse(divided.pieces, divided.poses)
+    fused = fuse_pieces(divided.pieces, divided.poses)
     before = fused.entropy()
     change = fused.move(true)
     assert change.moved > len(divided.pieces) // 2
     after = fused.entropy()
     assert after < before
-    assert same_map(fused.grid, fuse(divided.pieces, fused.poses).grid)
+    assert same_map(fused.grid, fuse_pieces(divided.pieces, fused.poses).grid)
     # and is near what the scans themselves make at the true poses
     scans: EvidenceGrid = insert(steps, steps.truth.interpolate(steps.times), 0.2, fused.grid.model)
     assert after == pytest.approx(scans.entropy(), rel=0.05)
@@ -71,7 +71,7 @@ def test_the_map_is_clearer_at_the_true_poses(run: tuple[Steps, list[Submap]]) -
     # one rigid piece a submap leaves the bend inside: not as near
     rigid = divide_submaps(submaps, every=1e9)
     occupied = scans.occupied_cloud()
-    near = [np.mean(m.grid.occupied_at(occupied)) for m in (fused, fuse(rigid.pieces, rigid.along(steps.truth)))]
+    near = [np.mean(m.grid.occupied_at(occupied)) for m in (fused, fuse_pieces(rigid.pieces, rigid.along(steps.truth)))]
     assert near[0] > near[1]
 
 
@@ -116,7 +116,7 @@ def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegS
     off = []
     for grids in (None, told, exact):
         divided = divide_submaps(submaps, own=False, grids=grids, config=DivisionConfig(reach=9.0))
-        off.append(abs(fuse(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
+        off.append(abs(fuse_pieces(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
     assert off[2] < off[0]
     assert max(off) < 0.05 * scans.entropy()
     with pytest.raises(DataError):

@@ -217,8 +217,8 @@ def test_fused_map_is_the_map_of_a_filter_on_the_same_path(trial: GridTrial) -> 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_placements_of_a_grid_fill_a_voxel_and_a_quarter_turn(dim: int) -> None:
     group = SE3 if dim == 3 else SE2
-    np.testing.assert_array_equal(judge.placements(1, 0.2, dim), group.identity[None])
-    T = judge.placements(4, 0.2, dim)
+    np.testing.assert_array_equal(judge.grid_placements(1, 0.2, dim), group.identity[None])
+    T = judge.grid_placements(4, 0.2, dim)
     assert T.shape == (4, group.size)
     assert np.all((T[:, :dim] >= 0.0) & (T[:, :dim] < 0.2))
     np.testing.assert_allclose(heading_of(T), np.pi / 2 * np.array([0.125, 0.375, 0.625, 0.875]))
@@ -235,7 +235,7 @@ def test_clarity_is_the_mean_over_grids_that_stand_differently(trial: GridTrial)
     one = judge.clarity(steps, trial.truth, model=model)
     grid = judge.fused_grid(steps, trial.truth, model=model)
     assert (one.entropy, one.volume) == (grid.entropy(), grid.known_volume())
-    moved = [SE3.compose(np.broadcast_to(T, trial.truth.shape), trial.truth) for T in judge.placements(2, 0.2, 3)]
+    moved = [SE3.compose(np.broadcast_to(T, trial.truth.shape), trial.truth) for T in judge.grid_placements(2, 0.2, 3)]
     grids = [judge.fused_grid(steps, path, model=model) for path in moved]
     two = judge.clarity(steps, trial.truth, model=model, count=2)
     assert two.entropy == pytest.approx(np.mean([g.entropy() for g in grids]))

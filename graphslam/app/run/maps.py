@@ -14,7 +14,7 @@ from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.core.heap import trim_heap
-from graphslam.maps.coarse import drawable
+from graphslam.maps.coarse import drawable_map
 from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
 
@@ -54,7 +54,7 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
         trim_heap()
         return out
 
-    grid = drawable(run_map.fused.grid)
+    grid = drawable_map(run_map.fused.grid)
     if grid.dim == 2:
         ax = plot_section(grid, title=f"{name}: fused map")
         if truth is not None:

@@ -88,7 +88,7 @@ from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import LoopDecision
 from graphslam.maps.contradictions import Contradictions
-from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
 from graphslam.refine.scans import Scans
@@ -396,7 +396,7 @@ class _Attempt:
     @property
     def denied(self) -> bool:
         """Do passes of its map deny each other?"""
-        return self.passes is not None and self.passes.denies
+        return self.passes is not None and self.passes.is_contradictory
 
     def beats(self, other: _Attempt) -> bool:
         """Do its passes deny each other less?"""
@@ -524,7 +524,7 @@ def _judge(
     log, drops = taken.log, DropCounter()
     gps = gps_stream(log)
     hits = back.landmark_hits(submaps)
-    global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
+    global_map = make_global_map(solution, submaps, hits, settings.backend.confirmed_hits)
     out = Metrics()
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))

@@ -31,7 +31,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.stream_checks import check_streams
 from graphslam.io.growing_log import GrowingLog
 from graphslam.io.log_kinds import kind_name
-from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.solve.batch import state_of
 from graphslam.solve.solution import make_solution
 from graphslam_frontends.base import FrontEnd
@@ -186,7 +186,7 @@ class Slam:
         here = make_solution(
             self._asked["solver"], back.graph, state_of(back.graph), iterations=0, gap=None, seconds=0.0
         )
-        return make_map(here, submaps, back.landmark_hits(submaps), self._settings.backend.confirmed_hits)
+        return make_global_map(here, submaps, back.landmark_hits(submaps), self._settings.backend.confirmed_hits)
 
     @property
     def path(self) -> Trajectory:

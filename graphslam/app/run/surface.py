@@ -23,7 +23,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.surface.layer import PieceId, SurfaceLayer
-from graphslam.maps.surface.mesh import Mesh, owners, position_sigma, save_mesh, zero_set
+from graphslam.maps.surface.mesh import Mesh, position_sigma, save_mesh, vertex_owners, zero_set
 from graphslam.maps.surface.piece import Scan, SurfaceConfig
 from graphslam.maps.terrain.lines import lines_of_scans
 from graphslam.maps.terrain.pyramid import ClassGrid
@@ -192,7 +192,7 @@ def read_surface(
     if not len(mesh.triangles):
         raise DataError("the scans show no surface", where=streams, wanted="points that lie densely beside each other")
     seconds = time.process_time() - begin
-    nodes = np.array([*layer.pieces, -1])[owners(mesh, layer)]
+    nodes = np.array([*layer.pieces, -1])[vertex_owners(mesh, layer)]
     session = np.where(nodes >= 0, np.searchsorted(first, nodes, side="right") - 1, -1)
     return RunSurface(
         layer, mesh, nodes, session, position_sigma(mesh, layer, covariances), scans, streams, read_s, seconds

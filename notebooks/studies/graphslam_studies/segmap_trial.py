@@ -26,7 +26,7 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop
-from graphslam.maps.entropy import Clarity
+from graphslam.maps.entropy import MapEntropy
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.solution import Solution
 from graphslam_frontends.segslam.result import SegSlamResult
@@ -170,7 +170,7 @@ class GraphTrial(GridTrial):
         best = min(found, key=lambda b: self.clarity(b).entropy)
         return replace(best, seconds=seconds)
 
-    def clarity(self, built: BuiltGraph) -> Clarity:
+    def clarity(self, built: BuiltGraph) -> MapEntropy:
         """Of all scans along the path of a graph."""
         at = built.solution.trajectory().interpolate(self.steps.times)
         model = self.config.filter.beam_model()

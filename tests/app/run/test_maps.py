@@ -27,7 +27,7 @@ from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
 from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
 from graphslam.maps.run_map import floor_bands, make_run_map, nodes_by_submap
 from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
@@ -84,13 +84,13 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     assert finished.folder is not None
     values = read_toml(finished.folder / "config.toml")
     config = build_config(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
-    from graphslam.maps.global_map import make_map
+    from graphslam.maps.global_map import make_global_map
 
-    m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
+    m = make_global_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
     made = make_run_map(bare, m, reach=8.0)
     assert made.fused.entropy() == pytest.approx(made.open_entropy, rel=0.01)
     assert made.fused.known_volume() == pytest.approx(made.open_volume, rel=0.01)
-    scratch = fuse(made.divided.pieces, made.fused.poses, model=made.fused.grid.model)
+    scratch = fuse_pieces(made.divided.pieces, made.fused.poses, model=made.fused.grid.model)
     assert same_map(made.fused.grid, scratch.grid)
     shifted = make_run_map(bare, replace(m, node_poses=_shifted(m.node_poses)), reach=8.0)
     assert shifted.fused.entropy() != pytest.approx(made.fused.entropy(), rel=1e-6)

@@ -242,7 +242,7 @@ def test_passes_that_deny_each_other_are_given_loops(
     options.write_text(options.read_text().replace("loops = true", 'loops = "auto"'))
     # each graph has a map before its refinement and one after it
     said = iter([told(40), told(40), told(denied), told(denied)])
-    monkeypatch.setattr(run_map, "contradictions", lambda *_: next(said))
+    monkeypatch.setattr(run_map, "find_contradictions", lambda *_: next(said))
     looked: list[bool] = []
     finish = BackEnd.finish
 
@@ -360,7 +360,7 @@ def test_particles_are_drawn_anew_where_passes_still_deny_each_other(
 
     def say(*values: int) -> None:
         shares[:] = values
-        monkeypatch.setattr(run_map, "contradictions", lambda *_: told(shares.pop(0)))
+        monkeypatch.setattr(run_map, "find_contradictions", lambda *_: told(shares.pop(0)))
 
     say(40, 40, second, *([60] if second else []))
     r = made(log, folder, **options)

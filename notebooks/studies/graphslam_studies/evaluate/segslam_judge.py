@@ -15,7 +15,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.entropy import Clarity, clarity_of, placements
+from graphslam.maps.entropy import MapEntropy, grid_placements, mean_map_entropy
 from graphslam.sim.route import Route
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.motion import move_poses, with_roll_pitch
@@ -371,7 +371,7 @@ def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: Bea
 
 def clarity(
     steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None, count: int = 1
-) -> Clarity:
+) -> MapEntropy:
     """Entropy of all scans along a path ``(n, d)``, in grids that stand in ``count`` different ways.
 
     Where the voxels lie counts: a floor in the middle of its layer is clear, one between two layers is not. A filter
@@ -381,9 +381,9 @@ def clarity(
     group = group_of(path)
     grids = [
         fused_grid(steps, group.compose(np.broadcast_to(T, path.shape), path), voxel_size=voxel_size, model=model)
-        for T in placements(count, voxel_size, steps.dim)
+        for T in grid_placements(count, voxel_size, steps.dim)
     ]
-    return clarity_of(grids)
+    return mean_map_entropy(grids)
 
 
 def quarters(seconds: Array) -> tuple[float, float]:

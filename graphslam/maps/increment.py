@@ -21,7 +21,7 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.spilled_grid import spill_grid
 from graphslam.evidence.views import dense_view
-from graphslam.maps.added_kernels import subtract_bricks
+from graphslam.maps.increment_kernels import subtract_bricks
 
 COPIED = 0.9
 """A segment began with a copy of a map if it knows this share of what that map knows: 0.994 of a copy whose pose is
@@ -29,7 +29,7 @@ known, 0.82 where it was 0.2 m and half a degree off (a simulated garage). All o
 
 
 @dataclass(frozen=True, slots=True)
-class Added:
+class MapIncrement:
     """What is left of a grid without what it had from another.
 
     Parameters
@@ -50,7 +50,9 @@ class Added:
     shared: int
 
 
-def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None, *, slack: int = 0) -> Added:
+def map_increment(
+    grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None, *, slack: int = 0
+) -> MapIncrement:
     """The log-odds of ``grid`` less those of ``earlier``; voxels that did not change are unknown.
 
     What came in while a voxel was saturated cannot be seen in the difference, and is lost: the earlier map has it.
@@ -86,7 +88,7 @@ def added(grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None,
     some = (difference != UNKNOWN).any(axis=1)
     out = grid.empty()
     write_packed(out, keys[some], difference[some])
-    return Added(out, *counts.tolist())
+    return MapIncrement(out, *counts.tolist())
 
 
 def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Mapping[int, int]]:
@@ -107,7 +109,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     entered : by key
         Key of the submap whose map was taken out, of those that had one.
     """
-    whole = {s.key: grid_of(s) for s in submaps}
+    whole = {s.key: evidence_grid_of(s) for s in submaps}
     grids, entered = dict(whole), {}
     before: Submap | None = None
     for s in submaps:
@@ -121,7 +123,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
             if target not in whole or target == s.key:
                 continue
             # each was put on the lattice of its own base
-            found = added(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
+            found = map_increment(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
             share = found.shared / max(whole[target].voxel_counts().known, 1)
             if share >= best:
                 best, grids[s.key], entered[s.key] = share, spill_grid(found.grid), target
@@ -129,7 +131,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     return grids, entered
 
 
-def grid_of(submap: Submap) -> EvidenceGrid:
+def evidence_grid_of(submap: Submap) -> EvidenceGrid:
     """The evidence of a submap's dense map."""
     grid: EvidenceGrid = dense_view(submap).evidence()
     return grid

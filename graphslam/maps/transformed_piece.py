@@ -26,7 +26,7 @@ PART_BRICKS = 1 << 16
 """… and bricks [64 MB]."""
 
 
-class Posed:
+class TransformedPiece:
     """A piece at one pose; never changed, so that maps may share it. Its entries lie on the shelf of the process.
 
     Parameters
@@ -61,7 +61,7 @@ class Posed:
         return self.keys.nbytes + self.starts.nbytes + self._entries.nbytes
 
 
-class Poser:
+class PieceTransformer:
     """Puts pieces on the lattice of one world. Holds scratch memory only.
 
     Parameters
@@ -83,7 +83,7 @@ class Poser:
         self._sources = np.empty(0, np.uint32)
         self._sums = np.empty((0, BRICK_VOXELS), np.int16)
 
-    def pose(self, piece: Piece, T: Array, T_world_node: Array) -> Posed:
+    def pose(self, piece: Piece, T: Array, T_world_node: Array) -> TransformedPiece:
         """A piece at ``T`` ``(12,)``, which is T_world_base: rotation row by row, then translation [m]."""
         R, t = np.ascontiguousarray(T[:9].reshape(3, 3)), T[9:] / self.voxel_size
         keys = self._met(piece, R, t)
@@ -96,7 +96,7 @@ class Poser:
         layers = BRICK_EDGE if self.dim == 3 else 1
         sample_piece(keys, into, self.half, layers, piece.table, piece.lookup, self._entries, starts)
         some = np.diff(starts) > 0
-        return Posed(
+        return TransformedPiece(
             T_world_node, keys[some], np.append(starts[:-1][some], starts[-1]), self._entries[: starts[-1]].copy()
         )
 
@@ -123,7 +123,7 @@ class Poser:
         return keys
 
     def sums(
-        self, keys: Ints, posed: Sequence[Posed], root: int, pool: GridPool, clamp: tuple[int, int]
+        self, keys: Ints, posed: Sequence[TransformedPiece], root: int, pool: GridPool, clamp: tuple[int, int]
     ) -> Iterator[tuple[Ints, npt.NDArray[np.int16], int]]:
         """:meth:`sum` of a part of the keys after the other, none of which takes much memory."""
         ends = parts_of(keys, posed)
@@ -131,7 +131,7 @@ class Poser:
             yield self.sum(keys[first:last], posed, root, pool, clamp)
 
     def sum(
-        self, keys: Ints, posed: Sequence[Posed], root: int, pool: GridPool, clamp: tuple[int, int]
+        self, keys: Ints, posed: Sequence[TransformedPiece], root: int, pool: GridPool, clamp: tuple[int, int]
     ) -> tuple[Ints, npt.NDArray[np.int16], int]:
         """Those of the bricks ``keys`` (ascending) that are others now than in the tree ``root``, their values, and in
         how many of them nothing is known any more.
@@ -173,7 +173,7 @@ class Poser:
         return keys[np.where(empty, ~changed[:n], changed[:n])], self._sums[:n], int(empty.sum())
 
 
-def parts_of(keys: Ints, posed: Sequence[Posed]) -> list[int]:
+def parts_of(keys: Ints, posed: Sequence[TransformedPiece]) -> list[int]:
     """Where to cut ``keys`` (ascending) so that no part is too large: 0 first, the end last."""
     entries = np.zeros(len(keys))
     for p in posed:
